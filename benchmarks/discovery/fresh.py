@@ -14,7 +14,7 @@ from benchmarks.truths.measure import closure
 from nnode.app.python.report import Report
 from nnode.data.options import Faults, TableOptions
 from nnode.discover.inputs import read_inputs
-from nnode.discover.judge.confirm import Comparing, windows_of
+from nnode.discover.judge.model_comparison import ModelComparison, windows_of
 from nnode.model.effects import CATALOGUE
 from nnode.model.extend import without
 from nnode.model.system import System
@@ -52,10 +52,10 @@ def on_fresh(
         )
         sequences = read_inputs(data, Path(folder)).sequences
     base = _base(report, names)
-    comparing = Comparing(windows_of(base, sequences), base)
-    before = float(np.nanmean(comparing.squares(base)))
-    after = float(np.nanmean(comparing.squares(report.model)))
-    gap = {"before": before, "after": after, "noise_floor": comparing.floor}
+    comparison = ModelComparison(windows_of(base, sequences), base)
+    before = float(np.nanmean(comparison.squares(base)))
+    after = float(np.nanmean(comparison.squares(report.model)))
+    gap = {"before": before, "after": after, "noise_floor": comparison.floor}
     split = {"sealed": [one.name for one in sequences]}
     return {
         "fresh_before": before,

@@ -19,8 +19,8 @@ from nnode.data.options import Faults, TableOptions
 from nnode.data.sequence import Domain
 from nnode.discover.division import divide
 from nnode.discover.inputs import read_inputs
-from nnode.discover.judge.confirm import engine_of, windows_of
-from nnode.discover.name.search import settled
+from nnode.discover.judge.model_comparison import engine_of, windows_of
+from nnode.discover.name.search import converged_fit
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import Fit, refine
@@ -83,19 +83,19 @@ def peers_on_table(
     with TemporaryDirectory(prefix="nnode-peers-") as scratch:
         sequences = read_inputs(data, Path(scratch)).sequences
     division = divide(sequences, DiscoverOptions(seed=seed))
-    opened, sealed = division.open, division.sealed
-    engine = windows_of(system, [sequences[i] for i in opened], division.label[opened])
-    fit = settled(engine, copy.deepcopy(system).double())
+    exploration, confirmation = division.exploration, division.confirmation
+    engine = windows_of(system, [sequences[i] for i in exploration], division.label[exploration])
+    fit = converged_fit(engine, copy.deepcopy(system).double())
     offered = [e for e in CATALOGUE.of(cast(Domain, domain)) if not e.individual]
     found = [trace for effect in offered for trace in traces(engine, fit, effect)]
     columns = [Column(trace, i) for trace in found for i in range(trace.columns.shape[1])]
     values = np.concatenate([trace.columns for trace in found], axis=1)
     library = Library(values, -fit.residual, fit.tangents, engine.cluster)
 
-    whole = engine_of(system, [sequences[i] for i in sealed], whole=True)
-    whole.settle(fit.system, ParameterVector(fit.system).row)
+    whole = engine_of(system, [sequences[i] for i in confirmation], whole=True)
+    whole.fit_whitening(fit.system, ParameterVector(fit.system).row)
     before, floor = square_of(whole, fit.system), whole.noise_floor()
-    split = {"sealed": [sequences[i].name for i in sealed]}
+    split = {"sealed": [sequences[i].name for i in confirmation]}
     reports = {}
     for name, choose in PEERS.items():
         theta = choose(library, seed)

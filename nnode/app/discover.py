@@ -34,10 +34,10 @@ from nnode.calibrate.optimizers import AdadeltaOptions
 from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults
 from nnode.data.sequences import Sequences
-from nnode.discover.able import check_model
-from nnode.discover.found import Found
+from nnode.discover.eligibility import check_model
 from nnode.discover.inputs import Inputs, inputs_of, read_inputs, with_faulty
 from nnode.discover.options import DiscoverOptions, check_options
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report.files import (
     CHECKPOINT,
     MODEL,
@@ -188,7 +188,7 @@ def _diagnosed_table(
     return replace(first, nearest=others[0]) if others else first
 
 
-def _figure(job: Job, found: Found, which: str) -> Figure:
+def _figure(job: Job, found: DiagnosisOutcome, which: str) -> Figure:
     """A figure of a diagnosis, drawn when it is asked for."""
     from nnode.discover.report.captions import figure  # loads Matplotlib, which takes a second
 
@@ -222,7 +222,9 @@ def _job(
     return Job(model, plain_data, groups, system, inputs, options, laws, seconds)
 
 
-def _places(done: list[tuple[Job, Found]], folder: Path) -> list[tuple[Job, Found, Path]]:
+def _places(
+    done: list[tuple[Job, DiagnosisOutcome]], folder: Path
+) -> list[tuple[Job, DiagnosisOutcome, Path]]:
     """Where each diagnosis is written."""
     return [
         (job, found, place)
@@ -230,7 +232,7 @@ def _places(done: list[tuple[Job, Found]], folder: Path) -> list[tuple[Job, Foun
     ]
 
 
-def training_config(job: Job, found: Found) -> dict[str, Any]:
+def training_config(job: Job, found: DiagnosisOutcome) -> dict[str, Any]:
     """The configuration of a training that would go on with the extended model."""
     return {
         "model": extended_options(job.model, found.extended),
@@ -243,7 +245,7 @@ def training_config(job: Job, found: Found) -> dict[str, Any]:
     }
 
 
-def _drawn(job: Job, found: Found, folder: Path) -> Callable[[], dict[str, Path]]:
+def _drawn(job: Job, found: DiagnosisOutcome, folder: Path) -> Callable[[], dict[str, Path]]:
     """Draw the figures, where they are asked for; returns what writes all results, the report
     last, and gives their paths."""
     config = training_config(job, found)
@@ -294,7 +296,7 @@ def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
     ]
 
 
-def _print(found: Found, paths: Mapping[str, Path], seconds: float) -> None:
+def _print(found: DiagnosisOutcome, paths: Mapping[str, Path], seconds: float) -> None:
     d = found.diagnosis
     print(f"verdict: {d.verdict}")
     for laws in (d.laws, d.laws_again):

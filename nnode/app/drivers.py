@@ -55,7 +55,7 @@ def planned(
     given = options.drivers
     if given == NONE:
         return NONE
-    from nnode.population.drivers import known_names, obstacle  # compiled code takes a second
+    from nnode.population.drivers import full_names, obstacle  # compiled code takes a second
     from nnode.population.followers import drivers_differ
 
     if given is None:
@@ -80,7 +80,7 @@ def planned(
     if given == AUTO:
         return AUTO
     law = cast(Term, model.terms[0])
-    known_names(given, [name for name in model.physical() if name.startswith(f"{law.name}.")])
+    full_names(given, [name for name in model.physical() if name.startswith(f"{law.name}.")])
     return list(given)
 
 
@@ -234,7 +234,7 @@ def calibrated_drivers(
             short[name]: float(np.expm1(bias) if in_logs else bias)
             for name, bias, in_logs in zip(followers.names, found.bias, followers.logs, strict=True)
         },
-        observations=int(found.estimate.data.seen.sum()),
+        observations=int(found.estimate.data.observed.sum()),
         variances=int((variances.low < variances.high).sum()),
         # that of the restricted likelihood would not compare laws with other parameters
         log_likelihood=float(found.marginal.each.sum()),

@@ -12,11 +12,11 @@ from typing import Any
 
 from nnode.app.python.inputs import MODELS, model_options
 from nnode.app.training import set_threads
-from nnode.discover.compare.laws import Nearer, compare_laws, with_effects
+from nnode.discover.compare.laws import BetterLaw, compare_laws, with_effects
 from nnode.discover.diagnose import STAGES, diagnose
-from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.result import Laws
 from nnode.errors import ConfigError
 from nnode.model import System, build_model
@@ -113,7 +113,7 @@ def law_options(name: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     return {**found, **{key: asked[key] for key in SHARED if key in asked and key in found}}
 
 
-def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, Found]]:
+def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
     """The law that was asked for, then the one that comes nearest, where that is another one.
 
     Laws are compared first as they are, then with what the nearest of them lacks, then with what
@@ -158,19 +158,19 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, Found]]:
     return done
 
 
-def _lacking(job: Job, found: Found) -> list[Effect]:
+def _lacking(job: Job, found: DiagnosisOutcome) -> list[Effect]:
     """Effects that the search gave to a law."""
     own = {effect.name for effect in effects_of(job.system)}
     return [effect for effect in effects_of(found.searched) if effect.name not in own]
 
 
 def _both(
-    job: Job, nearest: Job, found: Found, hints: dict[str, System], watch: Watch
-) -> list[tuple[Job, Found]]:
+    job: Job, nearest: Job, found: DiagnosisOutcome, hints: dict[str, System], watch: Watch
+) -> list[tuple[Job, DiagnosisOutcome]]:
     """The nearest law's diagnosis, after that of the one asked for, where it is another one."""
     if nearest.name == job.name:
         return [(nearest, found)]
-    nearer = Nearer(nearest.name, found.searched)
+    nearer = BetterLaw(nearest.name, found.searched)
     return [(job, _diagnose(job, watch, nearer, hints.get(job.name))), (nearest, found)]
 
 
@@ -183,8 +183,8 @@ def _compared(job: Job, laws: dict[str, System], watch: Watch) -> tuple[Laws, di
 
 
 def _diagnose(
-    job: Job, watch: Watch, nearer: Nearer | None = None, hint: System | None = None
-) -> Found:
+    job: Job, watch: Watch, nearer: BetterLaw | None = None, hint: System | None = None
+) -> DiagnosisOutcome:
     """Run the diagnosis, and add what only its caller knows."""
     inputs, name = job.inputs, job.name
     with watch(f"diagnosis of {name}", STAGES) as stages:

@@ -1,7 +1,7 @@
 """Diagnosis: where a model is wrong, which effect is missing, and what adding it changes.
 
-The folders stand in the way that data go: what a calibrated model leaves (``residuals``, in
-``lanes`` and ``crowds`` each in its own way), what of that is chance (``statistics``), where it is
-wrong (``locate``), which effect it lacks (``name``), what may be said of it (``judge``), and the
-pages (``report``).
+The folders follow the data: the residuals of a calibrated model (``residuals``, with engines in
+``lanes`` and ``crowds``), tests and intervals (``statistics``), where the model deviates from the
+data (``locate``), the stepwise selection of effects (``name``), their confirmation and the verdict
+(``judge``), and the pages (``report``).
 """

@@ -1,4 +1,4 @@
-"""The whole diagnosis: calibrate, locate, name, add, judge; then look at what was sealed."""
+"""The whole diagnosis: calibrate, locate deviations, select effects, confirm them, report."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ import torch
 
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.able import check_model, not_offered
-from nnode.discover.compare.laws import Nearer, imitated
+from nnode.discover.compare.laws import BetterLaw, explained_by_law
 from nnode.discover.division import Division, divide
-from nnode.discover.found import Found
-from nnode.discover.judge.confirm import engine_of
-from nnode.discover.judge.sealed import Sealed
+from nnode.discover.eligibility import check_model, not_offered
+from nnode.discover.judge.confirmation import ConfirmationSet
+from nnode.discover.judge.model_comparison import engine_of
 from nnode.discover.judge.verdict import (
     absences,
     agents_absent,
@@ -29,9 +28,17 @@ from nnode.discover.judge.verdict import (
     structure,
 )
 from nnode.discover.lanes.followers import FollowersEngine
-from nnode.discover.locate.curves import curves, weighed
-from nnode.discover.name.search import Search, begun, search, settled, wider, without_steps
+from nnode.discover.locate.curves import curves, significant_curves
+from nnode.discover.name.search import (
+    Selection,
+    converged_fit,
+    initial_fit,
+    most_likely_extension,
+    search,
+    without_steps,
+)
 from nnode.discover.options import DiscoverOptions, check_options
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.residuals.engine import Engine, of_residuals, square_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.residuals.variables import Curves, Variable
@@ -45,8 +52,8 @@ from nnode.discover.result import (
     Verdict,
 )
 from nnode.discover.rules import applied, rules
-from nnode.discover.statistics.power import Way
-from nnode.discover.statistics.random_effects import individuals
+from nnode.discover.statistics.power import PowerSimulation
+from nnode.discover.statistics.random_effects import IndividualEstimate, estimate_individual
 from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
@@ -55,8 +62,8 @@ from nnode.population.followers import drivers_differ
 from nnode.population.intervals import variations
 from nnode.progress import Stages
 
-#: Effects that are described where nothing can be tested.
-LEADS = 3
+#: Number of the strongest effects that the first screen lists.
+SCREENED = 3
 
 
 #: Stages of a diagnosis, with the seconds that they take on 120 pairs of NGSIM I-80.
@@ -82,12 +89,15 @@ class _Clock:
 
 
 @dataclass
-class _Look:
-    """What was found in the open sequences.
+class _Exploration:
+    """The results of the exploration sequences.
 
     Attributes:
-        tested: whether what is simultaneous is independent, in what the search leaves.
-        first: curves in the residuals of ``base``, the calibrated model; ``located``: in words.
+        base: the calibrated model. base_curves: the curves in its residuals.
+        located: these curves in words.
+        selection: the effects that were added to it.
+        simultaneity: whether simultaneous clusters are independent, in the residuals of the
+            selected model.
     """
 
     division: Division
@@ -95,10 +105,10 @@ class _Look:
     base: Fit
     base_system: System
     variables: list[Variable]
-    first: list[Curves]
+    base_curves: list[Curves]
     located: list[Place]
-    found: Search
-    tested: Simultaneous
+    selection: Selection
+    simultaneity: Simultaneous
 
 
 def diagnose(
@@ -107,18 +117,18 @@ def diagnose(
     options: DiscoverOptions,
     *,
     stages: Stages | None = None,
-    nearer: Nearer | None = None,
+    nearer: BetterLaw | None = None,
     hint: System | None = None,
-) -> Found:
-    """Find out what a model lacks on some sequences.
+) -> DiagnosisOutcome:
+    """Diagnose which effects a model lacks on some sequences.
 
     Args:
         system: the model; it is not changed.
         sequences: without faults, at least three of them.
         options: see :class:`~nnode.discover.options.DiscoverOptions`.
         stages: shows how far the work is.
-        nearer: a law that comes nearer to these sequences; what the model lacks only because it is
-            another law is a lead, and no finding.
+        nearer: a law that fits these sequences better. An effect that this law does not need is
+            reported as not confirmed.
         hint: the model, calibrated with effects that another law lacks.
 
     Raises:
@@ -135,163 +145,198 @@ def _diagnosed(
     sequences: list[Sequence],
     options: DiscoverOptions,
     stages: Stages | None,
-    nearer: Nearer | None,
+    nearer: BetterLaw | None,
     hint: System | None,
-) -> Found:
+) -> DiagnosisOutcome:
     domain = cast(Domain, system.domain)
     names = check_options(options, domain, system.order)
     check_model(system)
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
-    known = [e for e in CATALOGUE.of(domain, system.order) if e.name in names]
+    candidates = [e for e in CATALOGUE.of(domain, system.order) if e.name in names]
     differ = drivers_differ(system, sequences)
-    refused = {e.name: reason for e in known if (reason := not_offered(e, system, differ))}
-    wanted = [effect for effect in known if effect.name not in refused]
-    effects = [effect for effect in wanted if not issubclass(effect, IndividualEffect)]
-    look = _looked_for(system, sequences, options, effects, clock, stages, hint)
-    if look.tested.together:
-        again = _looked_for(system, sequences, options, effects, clock, stages, hint, True)
-        look = replace(again, tested=look.tested)
-    division, engine, base, found = look.division, look.engine, look.base, look.found
-    base_system, searched = look.base_system, look.found.fit.system
+    refused = {e.name: reason for e in candidates if (reason := not_offered(e, system, differ))}
+    offered = [effect for effect in candidates if effect.name not in refused]
+    effects = [effect for effect in offered if not issubclass(effect, IndividualEffect)]
+    exploration = _explore(system, sequences, options, effects, clock, stages, hint)
+    if exploration.simultaneity.together:
+        regrouped = _explore(system, sequences, options, effects, clock, stages, hint, True)
+        exploration = replace(regrouped, simultaneity=exploration.simultaneity)
+    division, engine = exploration.division, exploration.engine
+    base_system, selection = exploration.base_system, exploration.selection
     notes: list[str] = [division.note] if division.note else []
     imitations: list[NamedEffect] = []
-    if nearer is not None and found.steps:
-        found, imitations = _without_imitations(look, nearer, notes)
-    numbers = _clusters(look, options, len(effects))
-    enough = numbers.open >= numbers.least
+    if nearer is not None and selection.steps:
+        selection, imitations = _without_imitations(exploration, nearer, notes)
+    numbers = _clusters(exploration, options, len(effects))
+    testable = numbers.open >= numbers.least
     stages.begin("comparing on sealed sequences")
-    sealed = Sealed(
+    confirmation = ConfirmationSet(
         engine,
         base_system,
-        [sequences[i] for i in division.open],
-        [sequences[i] for i in division.sealed],
-        division.label[division.sealed],
+        [sequences[i] for i in division.exploration],
+        [sequences[i] for i in division.confirmation],
+        division.label[division.confirmation],
         numbers.sealed,
         options.seed,
     )
-    kinds = [effect for effect in wanted if issubclass(effect, IndividualEffect)]
-    beside = [individuals(engine, found.fit, kind) for kind in kinds]
-    found, leads = sealed.confirmed(engine, found)
-    last = (
-        look.first
-        if found.fit is base
-        else weighed(engine, found.fit, curves(engine, found.fit, look.variables), rules().sure)
+    kinds = [effect for effect in offered if issubclass(effect, IndividualEffect)]
+    individual_estimates = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
+    selection, unconfirmed = confirmation.confirmed(engine, selection)
+    unexplained = _unexplained(exploration, selection)
+    assert selection.screen is not None
+    absent_effects = absences(
+        selection, PowerSimulation(selection.screen, options.alpha, numbers.sealed)
     )
-    left = [one for one in last if one.removed > rules().least]
-    assert found.screen is not None
-    absent = absences(found, Way(found.screen, options.alpha, numbers.sealed))
-    final = sealed.corrected(found)
-    if leads:  # what stands out without a lead alone may be the lead
-        without = [individuals(engine, found.fit, kind) for kind in kinds]
-        pairs = [(a, b) for a, b in zip(beside, without, strict=True) if a and b]
-        beside = [max(pair, key=lambda one: one.p_value) for pair in pairs]
-    seen = [one for one in beside if one is not None]
-    seen = [replace(one, p_value=min(1.0, one.p_value * len(seen))) for one in seen]
-    agents = [sealed.agents(one, final.system, options.alpha, bool(left), enough) for one in seen]
-    both = list(zip(seen, agents, strict=True))
-    own = [one for one, agent in both if agent.named]
-    absent += [
-        agents_absent(one, options.alpha / len(seen), enough)
-        for one, agent in both
+    corrected = confirmation.corrected(selection)
+    if unconfirmed:
+        # an unconfirmed effect that was removed could otherwise show as a difference of agents
+        refitted = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
+        pairs = [(a, b) for a, b in zip(individual_estimates, refitted, strict=True) if a and b]
+        individual_estimates = [max(pair, key=lambda estimate: estimate.p_value) for pair in pairs]
+    estimates = _bonferroni([estimate for estimate in individual_estimates if estimate is not None])
+    agents = [
+        confirmation.agents(estimate, corrected.system, options.alpha, bool(unexplained), testable)
+        for estimate in estimates
+    ]
+    tested = list(zip(estimates, agents, strict=True))
+    named_individuals = [estimate for estimate, agent in tested if agent.named]
+    absent_effects += [
+        agents_absent(estimate, options.alpha / len(estimates), testable)
+        for estimate, agent in tested
         if not agent.found
     ]
-    extended = sealed.with_numbers(engine, final, own) if found.steps or own else base_system
-    gap, each, simulated = sealed.gap(extended, own)
+    extended = base_system
+    if selection.steps or named_individuals:
+        extended = confirmation.with_agents(engine, corrected, named_individuals)
+    gap, errors, simulations = confirmation.gap(extended, named_individuals)
     clock.lap("sealed")
-    removed = 1 - square_of(engine, found.fit.system) / square_of(engine, base_system)
-    effects_found = [
-        *(named(engine, final, s, sealed.tried[s.chosen.name].p_value) for s in found.steps),
-        *(named_agents(one, a.confirmed, system.order) for one, a in both if a.named),
+    removed_share = 1 - square_of(engine, selection.fit.system) / square_of(engine, base_system)
+    tests = confirmation.tests
+    effects_named = [
+        *(named(engine, corrected, s, tests[s.chosen.name].p_value) for s in selection.steps),
+        *(
+            named_agents(estimate, agent.confirmed, system.order)
+            for estimate, agent in tested
+            if agent.named
+        ),
     ]
-    others = [pair for pair in both if pair[1].found and not pair[1].named]
-    leads_found = [
-        *leads,
+    hypotheses = [
+        *unconfirmed,
         *imitations,
-        *(named_agents(one, agent.confirmed, system.order) for one, agent in others),
+        *(
+            named_agents(estimate, agent.confirmed, system.order)
+            for estimate, agent in tested
+            if agent.found and not agent.named
+        ),
     ]
     diagnosis = Diagnosis(
         verdict=_verdict(
-            found, left, removed, bool(own), bool(leads_found), enough, bool(imitations)
+            selection,
+            unexplained,
+            removed_share,
+            bool(named_individuals),
+            bool(hypotheses),
+            testable,
+            bool(imitations),
         ),
         domain=domain,
         model="",
         clusters=numbers,
-        screen=_first(found, numbers),
-        confirmation=sealed.confirmation(agents),
-        effects=effects_found,
-        leads=leads_found,
+        screen=_first_screen(selection, numbers),
+        confirmation=confirmation.confirmation(agents),
+        effects=effects_named,
+        leads=hypotheses,
         agents=agents,
-        drivers=_drivers(engine, found.fit, notes),
+        drivers=_drivers(engine, selection.fit, notes),
         data_faults=[],
-        not_testable=[one.name for one in absent if not one.testable],
-        absences=absent,
-        places=look.located,
-        unknown=structure(left) if left else None,
+        not_testable=[absence.name for absence in absent_effects if not absence.testable],
+        absences=absent_effects,
+        places=exploration.located,
+        unknown=structure(unexplained) if unexplained else None,
         gap=gap,
         base=_shift(base_system, extended),
         split={
-            "open": [sequences[i].name for i in division.open],
-            "sealed": [sequences[i].name for i in division.sealed],
+            "open": [sequences[i].name for i in division.exploration],
+            "sealed": [sequences[i].name for i in division.confirmation],
         },
         notes=notes,
         not_offered=refused,
         seconds=clock.seconds,
-        sealed=each,
+        sealed=errors,
     )
-    return Found(
+    return DiagnosisOutcome(
         diagnosis=diagnosis,
         base=base_system,
         extended=extended,
-        searched=searched,
-        open=division.open,
-        sealed=division.sealed,
-        simulated=simulated,
+        searched=exploration.selection.fit.system,
+        exploration=division.exploration,
+        confirmation=division.confirmation,
+        simulated=simulations,
     )
 
 
+def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves]:
+    """The curves that remain significant in the residuals of a selected model."""
+    engine, remaining = exploration.engine, exploration.base_curves
+    if selection.fit is not exploration.base:
+        remaining = curves(engine, selection.fit, exploration.variables)
+        remaining = significant_curves(engine, selection.fit, remaining, rules().sure)
+    return [curve for curve in remaining if curve.removed > rules().least]
+
+
+def _bonferroni(estimates: list[IndividualEstimate]) -> list[IndividualEstimate]:
+    """The estimates with p-values that are corrected for their number."""
+    number = len(estimates)
+    return [
+        replace(estimate, p_value=min(1.0, estimate.p_value * number)) for estimate in estimates
+    ]
+
+
 def _drivers(engine: Engine, fit: Fit, notes: list[str]) -> list[Variation]:
-    """What differs between drivers and over time, under the model with all that was found.
+    """The variances between drivers and over time, under the model with all selected effects.
 
     Args:
-        notes: where pushes are as strong as they may be, this is added to them.
+        notes: a note is added to them if the standard deviation of the pushes is at its bound.
     """
     if not isinstance(engine, FollowersEngine):
         return []
-    engine.settle(fit.system, torch.from_numpy(fit.row))
+    engine.fit_whitening(fit.system, torch.from_numpy(fit.row))
     assert engine.population is not None
-    found = [Variation(name, **row) for name, row in variations(engine.population).items()]
-    push = next(one for one in found if one.name == "push")
+    drivers = [Variation(name, **row) for name, row in variations(engine.population).items()]
+    push = next(row for row in drivers if row.name == "push")
     if push.at_bound == "high":
         notes.append(
             f"Pushes of {push.estimate:.3g} {push.unit} are the strongest that are allowed: the "
             "law explains little of how speeds change, and effects may be hidden behind them. "
             "Compare other laws, or look at how the positions were measured."
         )
-    return found
+    return drivers
 
 
 def _without_imitations(
-    look: _Look, nearer: Nearer, notes: list[str]
-) -> tuple[Search, list[NamedEffect]]:
-    """Take out effects that a law which fits better does not need; they become leads.
+    exploration: _Exploration, nearer: BetterLaw, notes: list[str]
+) -> tuple[Selection, list[NamedEffect]]:
+    """Remove effects that a better-fitting law does not need; they become hypotheses.
 
     Args:
         notes: the reason is added to them.
     """
-    engine, found, division = look.engine, look.found, look.division
-    steps, p_value = imitated(engine, found, division.label[division.open], nearer)
-    imitations = [named(engine, found.fit, step, math.nan) for step in steps]
+    engine, selection, division = exploration.engine, exploration.selection, exploration.division
+    steps, p_value = explained_by_law(
+        engine, selection, division.label[division.exploration], nearer
+    )
+    imitations = [named(engine, selection.fit, step, math.nan) for step in steps]
     if steps:
         names = ", ".join(step.chosen.name for step in steps)
         notes.append(
             f"{names}: {nearer.name} does without and predicts left-out clusters better than "
             f"the model with it (one-sided p = {p_value:.2g}); a lead, no finding."
         )
-    return without_steps(engine, found, steps, look.base_system), imitations
+    return without_steps(engine, selection, steps, exploration.base_system), imitations
 
 
-def _looked_for(
+def _explore(
     system: System,
     sequences: list[Sequence],
     options: DiscoverOptions,
@@ -300,143 +345,159 @@ def _looked_for(
     stages: Stages,
     hint: System | None,
     together: bool = False,
-) -> _Look:
-    """Calibrate, locate, and search for the population's effects.
+) -> _Exploration:
+    """Calibrate, locate deviations, and select effects on the exploration sequences.
 
     Args:
-        together: what is simultaneous is one cluster.
+        together: simultaneous sequences form one cluster.
     """
     stages.begin("calibrating")
     division = divide(sequences, options, together=together)
-    chosen = [sequences[i] for i in division.open]
-    engine = engine_of(system, chosen, division.label[division.open])
-    start = begun(engine, copy.deepcopy(system).double())
-    if start is None:
+    exploration_sequences = [sequences[i] for i in division.exploration]
+    engine = engine_of(system, exploration_sequences, division.label[division.exploration])
+    initial = initial_fit(engine, copy.deepcopy(system).double())
+    if initial is None:
         raise SimulationError(
             "the model cannot be simulated on these data: it blows up from its own parameters and "
             "from those near the measured rates; start from others, or look at the data"
         )
     hints = [] if hint is None else [hint]
     if isinstance(engine, FollowersEngine):
-        likely = wider(engine, start, effects)
-        engine.settle_among([*likely, start.system])
-        hints += likely
-        base = refine(engine, start.system)
+        likely_models = most_likely_extension(engine, initial, effects)
+        engine.fit_whitening_among([*likely_models, initial.system])
+        hints += likely_models
+        base = refine(engine, initial.system)
     else:
-        base = settled(engine, start.system)
+        base = converged_fit(engine, initial.system)
     base_system = copy.deepcopy(base.system)
     clock.lap("calibrate")
     stages.begin("locating")
     variables = engine.variables() if options.structure else []
-    first = weighed(engine, base, curves(engine, base, variables), rules().sure)
-    located = places(first, _excess(engine, base))
+    base_curves = significant_curves(engine, base, curves(engine, base, variables), rules().sure)
+    located = places(base_curves, _excess(engine, base))
     clock.lap("locate")
     stages.begin("naming")
-    enough = int(engine.cluster.max()) + 1 >= _least(options, len(effects))
-    found = search(
+    testable = int(engine.cluster.max()) + 1 >= _least_clusters(options, len(effects))
+    selection = search(
         engine,
         base,
         effects,
         alpha=options.alpha,
-        most=options.max_effects if enough else 0,
+        max_effects=options.max_effects if testable else 0,
         seed=options.seed,
         variables=variables,
         levels=_levels(engine, effects),
         within=stages.within,
         hints=hints,
     )
-    # what a missing effect leaves is common to all clusters: only what the search leaves tells
-    tested = simultaneous(engine, found.fit, options.seed)
+    # a missing effect correlates the residuals of all clusters, so they are tested after selection
+    simultaneity = simultaneous(engine, selection.fit, options.seed)
     clock.lap("name")
-    return _Look(division, engine, base, base_system, variables, first, located, found, tested)
+    return _Exploration(
+        division=division,
+        engine=engine,
+        base=base,
+        base_system=base_system,
+        variables=variables,
+        base_curves=base_curves,
+        located=located,
+        selection=selection,
+        simultaneity=simultaneity,
+    )
 
 
-def _least(options: DiscoverOptions, effects: int) -> int:
-    """Open clusters that it takes to name any effect."""
+def _least_clusters(options: DiscoverOptions, effects: int) -> int:
+    """The number of exploration clusters that are needed to name any effect."""
     return least_number(options.alpha, hypotheses=max(effects, 1))
 
 
-def _clusters(look: _Look, options: DiscoverOptions, effects: int) -> Clusters:
-    """How many there are, and how many it takes."""
-    division, least = look.division, _least(options, effects)
-    least_sealed = least_number(rules().level, sided=1)
-    enough = next(
+def _clusters(exploration: _Exploration, options: DiscoverOptions, effects: int) -> Clusters:
+    """The numbers of clusters, and the numbers that are needed."""
+    division, least_exploration = exploration.division, _least_clusters(options, effects)
+    least_confirmation = least_number(rules().level, sided=1)
+    sufficient = next(
         number
         for number in count(2)
-        if least_sealed <= round(options.sealed * number) <= number - least
+        if least_confirmation <= round(options.sealed * number) <= number - least_exploration
     )
     return Clusters(
-        open=int(look.engine.cluster.max()) + 1,
-        sealed=0 if division.note else division.number(division.sealed),
-        least=least,
-        least_sealed=least_sealed,
-        enough=enough,
+        open=int(exploration.engine.cluster.max()) + 1,
+        sealed=0 if division.note else division.number(division.confirmation),
+        least=least_exploration,
+        least_sealed=least_confirmation,
+        enough=sufficient,
         why=division.why,
-        simultaneous=look.tested.plain(),
+        simultaneous=exploration.simultaneity.plain(),
         note=division.note,
     )
 
 
 def _levels(engine: Engine, effects: list[type[Effect]]) -> dict[str, np.ndarray]:
-    """Of effects that act by something fixed within recordings: the recordings ``(n,)``."""
-    every = np.arange(len(engine.sequences))
-    found = {}
+    """Recordings ``(n,)`` of the residuals, for effects of a covariate that is constant within
+    recordings."""
+    positions = np.arange(len(engine.sequences))
+    levels = {}
     for effect in effects:
-        label = level(engine.sequences, every, effect.covariate)
-        if label is not every:
-            found[effect.name] = of_residuals(label, engine.sequence)
-    return found
+        label = level(engine.sequences, positions, effect.covariate)
+        if label is not positions:
+            levels[effect.name] = of_residuals(label, engine.sequence)
+    return levels
 
 
-def _first(found: Search, numbers: Clusters) -> FirstScreen:
-    """What the first look said."""
-    best = min(found.first, key=lambda score: score.p_value, default=None)
-    leads = [
-        {"name": one.effect.name, "share": one.gain, "p_value": one.p_value, **one.amount}
-        for one in found.first[:LEADS]
+def _first_screen(selection: Selection, numbers: Clusters) -> FirstScreen:
+    """The scores of all effects against the calibrated model."""
+    best = min(selection.first, key=lambda score: score.p_value, default=None)
+    strongest = [
+        {"name": s.effect.name, "share": s.gain, "p_value": s.p_value, **s.amount}
+        for s in selection.first[:SCREENED]
     ]
     floor = 2.0 ** (1 - numbers.open)
     if best is None:
         return FirstScreen(None, "", numbers.open, floor)
-    return FirstScreen(best.p_value, best.effect.name, numbers.open, floor, leads)
+    return FirstScreen(best.p_value, best.effect.name, numbers.open, floor, strongest)
 
 
 def _excess(engine: Engine, fit: Fit) -> float:
-    """Share of the squared errors of positions that is not noise of the measurement."""
+    """Share of the squared errors of positions that is not measurement noise."""
     floor = engine.noise_floor()
     return 1.0 if np.isnan(floor) else max(1 - floor / square_of(engine, fit.system), 1e-3)
 
 
 def _verdict(
-    found: Search,
-    left: list[Curves],
+    selection: Selection,
+    unexplained: list[Curves],
     removed: float,
-    own: bool,
-    leads: bool,
-    enough: bool,
+    individuals_named: bool,
+    hypotheses: bool,
+    testable: bool,
     imitated: bool,
 ) -> Verdict:
-    """Args: ``removed``: share of the squared errors that the named effects removed; ``own``:
-    whether agents' own numbers were confirmed; ``leads``: whether something was not; ``imitated``:
-    whether something was found that a nearer law does without."""
-    if not enough:
+    """The verdict.
+
+    Args:
+        removed: share of the squared errors that the named effects removed.
+        individuals_named: whether agent-specific parameters were confirmed.
+        hypotheses: whether effects were selected but not confirmed.
+        imitated: whether effects were selected that a better-fitting law does not need.
+    """
+    if not testable:
         return "not_testable"
-    if found.steps:
-        if left and left[0].removed * (1 - removed) > rules().too_much * removed:
+    if selection.steps:
+        if unexplained and unexplained[0].removed * (1 - removed) > rules().too_much * removed:
             return "unknown"
-        return "indistinguishable" if any(step.rivals for step in found.steps) else "named"
-    if own:
+        return "indistinguishable" if any(step.rivals for step in selection.steps) else "named"
+    if individuals_named:
         return "named"
-    if left or imitated:
+    if unexplained or imitated:
         return "unknown"
-    return "unconfirmed" if leads else "none"
+    return "unconfirmed" if hypotheses else "none"
 
 
 def _shift(before: System, after: System) -> dict[str, dict[str, Any]]:
     """The base model's parameters before and after effects were added."""
-    later = after.physical()
+    extended = after.physical()
     return {
-        name: {"before": float(value), "after": float(later[name][0]), "unit": unit}
+        name: {"before": float(value), "after": float(extended[name][0]), "unit": unit}
         for name, (value, unit) in before.physical().items()
-        if name in later
+        if name in extended
     }

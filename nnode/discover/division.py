@@ -1,4 +1,4 @@
-"""Which sequences a diagnosis looks at, and which clusters it keeps for the end."""
+"""The division of sequences into an exploration and a confirmation set, by cluster."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ from nnode.errors import DataError
 
 @dataclass(frozen=True)
 class Division:
-    """Open and sealed sequences.
+    """Exploration and confirmation sequences.
 
     Attributes:
         label: ``(S,)`` cluster of each sequence.
-        open, sealed: positions of the sequences; no cluster is on both sides, unless there is one
-            alone: then a block of time is sealed, and ``note`` says so.
-        why: what makes sequences one cluster, in words.
-        note: what must be known of the sealed ones; empty: nothing.
+        exploration, confirmation: positions of the sequences. No cluster is on both sides, unless
+            there is only one: then a block of time is held back, and ``note`` says so.
+        why: the definition of a cluster, in words.
+        note: a restriction of the confirmation set; empty: none.
     """
 
     label: np.ndarray
-    open: list[int]
-    sealed: list[int]
+    exploration: list[int]
+    confirmation: list[int]
     why: str
     note: str = ""
 
     def number(self, places: list[int]) -> int:
-        """Of the clusters of some sequences."""
+        """The number of clusters of some sequences."""
         return len(np.unique(self.label[places]))
 
 
 def divide(
     sequences: list[Sequence], options: DiscoverOptions, *, together: bool = False
 ) -> Division:
-    """Seal a share of the clusters, but no more than half of the sequences.
+    """Hold back a share of the clusters, but at most half of the sequences.
 
-    The open ones are not divided further: every judgement on them is made on clusters that a
-    calibration has left out in turn.
+    The exploration set is not divided further: decisions on it use leave-one-cluster-out
+    calibrations.
 
     Args:
-        together: what is simultaneous is one cluster.
+        together: simultaneous sequences form one cluster.
 
     Raises:
-        DataError: fewer than three sequences, or none that could be sealed.
+        DataError: fewer than three sequences, or none that could be held back.
     """
     if len(sequences) < 3:
         raise DataError(
@@ -76,10 +76,10 @@ def divide(
 
 
 def _drawn(label: np.ndarray, wanted: int, rng: np.random.Generator) -> list[int]:
-    """Clusters at random, as long as at least half of the sequences are left."""
+    """Random clusters, as long as at least half of the sequences remain."""
     size = np.bincount(label)
-    held: list[int] = []
-    for one in rng.permutation(len(size)):
-        if len(held) < wanted and 2 * (size[held].sum() + size[one]) <= len(label):
-            held.append(int(one))
-    return held
+    chosen: list[int] = []
+    for candidate in rng.permutation(len(size)):
+        if len(chosen) < wanted and 2 * (size[chosen].sum() + size[candidate]) <= len(label):
+            chosen.append(int(candidate))
+    return chosen

@@ -1,4 +1,4 @@
-"""The sequences that a diagnosis works on, and the faults that it leaves out and reports."""
+"""The sequences of a diagnosis, and the faulty ones that are left out and reported."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from nnode.data.sequence import Domain, Sequence
 from nnode.discover.result import DataFault
 from nnode.errors import DataError
 
-#: Fewer sequences can be neither resampled nor divided.
+#: Smallest number of sequences that can be resampled and divided.
 LEAST = 3
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a diagnosis is given.
+    """The input data of a diagnosis.
 
     Attributes:
         domain: of the data.
@@ -33,7 +33,7 @@ class Inputs:
         data_faults: the same for the report, agents by identifier or, where there are none, by
             their number in the sequence.
         manifest: where the data come from.
-        measured: sentences about the noise of the measurement and about samples that were filled.
+        measured: sentences about the measurement noise and about filled samples.
     """
 
     domain: Domain
@@ -46,11 +46,11 @@ class Inputs:
 
 
 def read_inputs(options: DataOptions, folder: Path) -> Inputs:
-    """Read data and part what is sound from what is faulty.
+    """Read data and separate faulty sequences.
 
     Args:
         options: with ``faults=error`` faults are refused; otherwise faulty sequences are left
-            out of the diagnosis, whatever becomes of them in training.
+            out of the diagnosis, independently of their treatment in training.
         folder: where data are prepared.
 
     Raises:
@@ -61,14 +61,14 @@ def read_inputs(options: DataOptions, folder: Path) -> Inputs:
 
 
 def with_faulty(options: DataOptions) -> DataOptions:
-    """Options that read faulty sequences as well, which the report tells of."""
+    """Options that also read faulty sequences, which the report lists."""
     if options.prepared is None and options.faults is Faults.drop:
         return replace(options, faults=Faults.keep)
     return options
 
 
 def inputs_of(store: Source, options: DataOptions) -> Inputs:
-    """Part what is sound from what is faulty.
+    """Separate faulty sequences.
 
     Args:
         store: what was read, on the disk or in memory.
@@ -77,7 +77,7 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
     Raises:
         DataError: fewer than three sequences are left, or no vehicle follows another.
     """
-    names = {one.name for one in fields(Fault)}
+    names = {item.name for item in fields(Fault)}
     faults: dict[str, list[Fault]] = {}
     reported = []
     for entry in store.manifest.get("faults", []):
@@ -86,7 +86,7 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
         faults.setdefault(fault.sequence, []).append(fault)
         who = entry.get("names") or [str(i) for i in fault.agents]
         reported.append(DataFault(fault.kind, fault.sequence, who, fault.time, fault.detail))
-    # in one order, whatever that of a list: divisions into folds go by it
+    # a fixed order, because divisions into folds depend on it
     everything = sorted(store, key=lambda s: natural(s.name))
     sound = [s for s in everything if s.name not in faults]
     read = store.manifest.get("counts", {}).get("read", len(everything))
@@ -103,7 +103,7 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
 
 
 def _measured(store: Source) -> list[str]:
-    """What is known of the measurement, for the report's notes."""
+    """Notes on the measurement for the report."""
     noise, filled = noise_of(store), store.manifest.get("filled", [])
     text = f"The {noise}."
     if noise.beyond:
@@ -115,15 +115,15 @@ def _check_enough(
     sound: list[Sequence], faults: dict[str, list[Fault]], read: int, options: DataOptions
 ) -> None:
     if options.domain == "traffic" and all(s.n_agents < 2 for s in sound) and read:
-        alone = [f for found in faults.values() for f in found if f.kind == "too_short"]
-        if sound or len(alone) == sum(map(len, faults.values())):
+        too_short = [f for faults_of in faults.values() for f in faults_of if f.kind == "too_short"]
+        if sound or len(too_short) == sum(map(len, faults.values())):
             raise DataError(
                 f"data={options.name}: no vehicle follows another in any of the {read} sequences; "
                 "a diagnosis of traffic needs sequences of two or more vehicles of one lane"
             )
     if len(sound) >= LEAST:
         return
-    counts = Counter(kind for found in faults.values() for kind in {f.kind for f in found})
+    counts = Counter(kind for faults_of in faults.values() for kind in {f.kind for f in faults_of})
     why = ", ".join(f"{kind} in {n}" for kind, n in counts.most_common())
     raise DataError(
         f"data={options.name}: {len(sound)} of {read} sequences are without a fault"

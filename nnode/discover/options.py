@@ -1,4 +1,4 @@
-"""Options of the diagnosis, as a dataclass that the configuration is checked against."""
+"""Options of the diagnosis: the dataclass that validates the configuration."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 
 from nnode.data.sequence import Domain
-from nnode.discover.able import check_effect
+from nnode.discover.eligibility import check_effect
 from nnode.discover.rules import Rules
 from nnode.errors import ConfigError
 from nnode.model.effects import CATALOGUE
@@ -17,7 +17,7 @@ from nnode.model.effects.own import VARIABLE
 
 @dataclass
 class DiscoverOptions:
-    """What is looked for, how carefully, and what is made of it."""
+    """Options of the diagnosis."""
 
     sealed: float = 0.3  # share of the clusters that nothing looks at before the last step
     gap: float = 5.0  # s; sequences without identifiers that are closer in time are one cluster
@@ -38,7 +38,7 @@ class DiscoverOptions:
 
 
 def check_options(options: DiscoverOptions, domain: Domain, order: int = 1) -> list[str]:
-    """Refuse what no diagnosis can work with.
+    """Refuse invalid options.
 
     Args:
         order: of the law.
@@ -53,42 +53,42 @@ def check_options(options: DiscoverOptions, domain: Domain, order: int = 1) -> l
     for name, value in (("sealed", options.sealed), ("alpha", options.alpha)):
         if not 0 < value < 1:
             raise ConfigError(f"discover.{name}={value} must lie between 0 and 1")
-    for one in fields(Rules):
-        value, below = getattr(options.rules, one.name), math.inf if one.name == "prior" else 1.0
-        if not 0 < value < below:
+    for rule in fields(Rules):
+        value, upper = getattr(options.rules, rule.name), math.inf if rule.name == "prior" else 1.0
+        if not 0 < value < upper:
             raise ConfigError(
-                f"discover.rules.{one.name}={value} must lie above 0 and below {below:g}"
+                f"discover.rules.{rule.name}={value} must lie above 0 and below {upper:g}"
             )
     if options.max_effects < 0:
         raise ConfigError(f"discover.max_effects={options.max_effects} must be at least 0")
     if options.step is not None and not (math.isfinite(options.step) and options.step > 0):
         raise ConfigError(f"discover.step={options.step} must be a positive number of s, or null")
-    known = [effect.name for effect in CATALOGUE.of(domain, order)]
-    _known("discover.exclude", options.exclude, known, domain)
-    chosen = known
+    available = [effect.name for effect in CATALOGUE.of(domain, order)]
+    _known("discover.exclude", options.exclude, available, domain)
+    chosen = available
     if options.effects is not None:
-        _known("discover.effects", options.effects, known, domain)
-        chosen = [name for name in known if name in options.effects]
+        _known("discover.effects", options.effects, available, domain)
+        chosen = [name for name in available if name in options.effects]
     names = [name for name in chosen if name not in options.exclude]
     for name in names:
         check_effect(CATALOGUE.effects[name])
     return names
 
 
-def _known(option: str, names: Iterable[str], known: list[str], domain: Domain) -> None:
+def _known(option: str, names: Iterable[str], available: list[str], domain: Domain) -> None:
     for name in names:
-        if name in known:
+        if name in available:
             continue
-        other = CATALOGUE.effects.get(name)
-        if other is not None:
+        effect = CATALOGUE.effects.get(name)
+        if effect is not None:
             raise ConfigError(
-                f"{option}: {name} is an effect of {other.domain} models, the data and the model "
+                f"{option}: {name} is an effect of {effect.domain} models, the data and the model "
                 f"are of {domain}; leave it out"
             )
-        near = get_close_matches(name, known, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
+        matches = get_close_matches(name, available, n=1)
+        hint = f"; did you mean {matches[0]}?" if matches else ""
         raise ConfigError(
             f"{option}: there is no {domain} effect {name}, expected some of "
-            f"{', '.join(known) or 'none at all'}{hint}; files with effects of your own are named "
-            f"in {VARIABLE}"
+            f"{', '.join(available) or 'none at all'}{hint}; files with effects of your own are "
+            f"named in {VARIABLE}"
         )

@@ -1,4 +1,4 @@
-"""What a diagnosis found, in plain types: the content of ``report.json``."""
+"""The result of a diagnosis in plain types: the content of ``report.json``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Verdict = Literal["named", "none", "unknown", "indistinguishable", "unconfirmed"
 
 @dataclass
 class Coefficient:
-    """An estimate with its interval of 95 %."""
+    """An estimate with its 95 % interval."""
 
     value: float
     low: float
@@ -20,13 +20,13 @@ class Coefficient:
 
 @dataclass
 class Profile:
-    """How a leader should drive for two effects to be told apart.
+    """A speed profile of a leader that distinguishes two effects.
 
     Attributes:
         mean, swing: the speed is mean + swing sin(2 pi t / period), m/s.
         period: s.
-        lasts: s that it lasts.
-        platoons: about so many open ones tell two effects apart with a probability of 90 %.
+        lasts: duration, s.
+        platoons: approximate number of exploration platoons for a power of 90 %.
     """
 
     mean: float
@@ -43,12 +43,12 @@ class Alternative:
     Attributes:
         name: of the effect.
         loss: its held-out cost over that of the effect that was chosen.
-        p_value: of the hypothesis that it is the true one: held-out residuals with it do not lean
-            towards the model with the effect that was chosen.
-        separated_by: data that would tell the two apart.
-        clusters: about how many open clusters like these would tell them apart with a probability
-            of 90 %, if they lean as these do; None where no number would.
-        profile: of a leader behind whom the fewest platoons tell them apart; of lanes.
+        p_value: of the hypothesis that it is the true effect, by a J test on held-out residuals
+            against the model with the chosen effect.
+        separated_by: data that would distinguish the two.
+        clusters: approximate number of similar exploration clusters that distinguishes them with a
+            power of 90 %; None if no number would.
+        profile: the leader's speed profile that needs the fewest platoons; in lanes only.
     """
 
     name: str
@@ -67,10 +67,10 @@ class NamedEffect:
         name, formula, source: of the effect.
         coefficients: its parameters.
         where: where it acts, in words.
-        alternatives: effects that the data cannot tell from it.
-        p_value: of its score, with regard to all effects that were looked for.
+        alternatives: effects that the data cannot distinguish from it.
+        p_value: of its score test, corrected for all candidate effects.
         gain: held-out share of the whitened cost that it removed when it was added.
-        confirmed: one-sided p-value that sealed clusters do not lean its way.
+        confirmed: one-sided p-value of its score test on the confirmation clusters.
     """
 
     name: str
@@ -86,7 +86,7 @@ class NamedEffect:
 
 @dataclass
 class DataFault:
-    """A fault of the measurement that the diagnosis did without."""
+    """A fault of the measurement; its sequence was left out."""
 
     kind: str
     sequence: str
@@ -101,13 +101,12 @@ class Absence:
 
     Attributes:
         name: of the effect.
-        testable: False where not even the least usual strength would be named, sealed clusters
-            included, with a probability of 80 %.
-        coefficient: the strength that is limited; ``unit`` is its unit.
+        testable: whether the expected strength would be named and confirmed with a power of 80 %.
+        coefficient: the bounded strength; ``unit`` is its unit.
         detectable: smallest deviation from neutral that is named with 80 % power; of an effect
             without a strength its setting. Of an effect on an interval, for an interval of the
             usual length and of median precision, which ``reason`` names.
-        bound: it is absent to within this deviation (95 %); None where not testable.
+        bound: it is absent to within this deviation (95 %); None if not testable.
         reason: in words.
     """
 
@@ -122,15 +121,15 @@ class Absence:
 
 @dataclass
 class Place:
-    """Where simulation and measurement part, for one variable.
+    """Where the model deviates from the data, for one variable.
 
     Attributes:
         variable: gap, speed, position, ...
         unit: of the variable.
-        low, high: the interval that stands out.
-        deviation, error: mean deviation there and its standard error, m/s or m/s².
+        low, high: the interval with a significant deviation.
+        deviation, error: mean deviation in this interval and its standard error, m/s or m/s².
         share: of the excess cost.
-        p_value: with regard to all variables and intervals.
+        p_value: corrected for all variables and intervals.
         curve: binned deviations: ``at``, ``deviation``, ``error``, one number per bin.
     """
 
@@ -147,20 +146,20 @@ class Place:
 
 @dataclass
 class Gap:
-    """Mean square error of positions on the sealed sequences, m².
+    """Mean square error of positions on the confirmation sequences, m².
 
-    Where agents' own numbers were named: on the last part of each sequence, with numbers from its
-    first part.
+    If agent-specific parameters were named, it is the error on the last part of each sequence, with
+    parameters from its first part.
 
     Attributes:
-        before: of the model as it was given, calibrated on the open sequences.
+        before: of the model as it was given, calibrated on the exploration sequences.
         after: of the extended model.
-        plain, plain_after: of both, calibrated to nothing but the positions of whole open
-            sequences: plain calibrations that the effects must beat as well. NaN in crowds, and
-            where agents' own numbers were named.
+        plain, plain_after: of both models after ordinary calibrations to the positions of whole
+            exploration sequences, as a further baseline. NaN in crowds, and if agent-specific
+            parameters were named.
         noise_floor: of the measurement.
         closed: (before - after) / (before - noise_floor).
-        definition: of the error, in words; that of each sequence is the same, not yet averaged.
+        definition: of the error, in words.
     """
 
     before: float
@@ -174,16 +173,16 @@ class Gap:
 
 @dataclass
 class Clusters:
-    """What is independent of what.
+    """The independent clusters.
 
     Attributes:
-        open, sealed: numbers of clusters.
-        least: open ones that sign flips need, so that any effect can reach the level.
-        least_sealed: sealed ones that a confirmation needs.
-        enough: about how many clusters in all would do.
-        why: what makes sequences one cluster.
-        simultaneous: what was found out of clusters that were there at one time.
-        note: what must be known of the sealed ones; empty: nothing.
+        open, sealed: numbers of exploration and of confirmation clusters.
+        least: exploration clusters that sign flips need to reach the level.
+        least_sealed: confirmation clusters that a confirmation needs.
+        enough: approximate total number of clusters that would be sufficient.
+        why: the definition of a cluster, in words.
+        simultaneous: the test of simultaneous clusters, in words.
+        note: a restriction of the confirmation set; empty: none.
     """
 
     open: int
@@ -198,15 +197,15 @@ class Clusters:
 
 @dataclass
 class FirstScreen:
-    """The first look at all effects of the population.
+    """The score tests of all population effects against the calibrated model.
 
     Attributes:
-        p_value: the least one, with regard to all effects; None where there is none to look for.
-        effect: whose it is.
-        clusters: that the flips come from.
-        floor: no p-value can be below this.
+        p_value: the smallest one, corrected for all effects; None without candidates.
+        effect: the effect with this p-value.
+        clusters: number of clusters of the sign flips.
+        floor: the smallest possible p-value.
         leads: of the effects that explain most: name, share of the squared residuals explained,
-            p-value. A description where there are too few clusters.
+            p-value. With too few clusters, they are descriptive.
     """
 
     p_value: float | None
@@ -218,13 +217,12 @@ class FirstScreen:
 
 @dataclass
 class Confirmation:
-    """What the sealed clusters say.
+    """The test on the confirmation clusters.
 
     Attributes:
-        p_value: one-sided, of the last effect that was confirmed or the first that was not; None
-            where none was tried.
-        clusters: sealed ones.
-        confirmed: None where none was tried.
+        p_value: one-sided, of the effect with the weakest evidence; None if none was tested.
+        clusters: number of confirmation clusters.
+        confirmed: None if none was tested.
         reason: why not, in words.
     """
 
@@ -236,20 +234,21 @@ class Confirmation:
 
 @dataclass
 class Agents:
-    """What agents have numbers of their own for.
+    """An effect with agent-specific parameters.
 
     Attributes:
         name: of the effect.
-        strength, low, high: standard deviation of the numbers, or what follows from it, with its
-            interval of 95 %; ``unit``.
-        p_value: that nobody differs, one-sided, by cluster, corrected for what was tried.
-        lasts: s; what lasts longer than this cannot be told from a number of one's own.
-        share: of the variance by what it belongs to: recording, sequence, agent, mood.
-        lags, common: s, and what parts of an agent's time at that lag have in common.
-        later: mean square errors in the last part of the sealed sequences by who predicts, m².
-        confirmed: one-sided p-value, by cluster, that own numbers predict the last part better
-            than none, and than one number per sequence (the larger of both).
-        found: whether it stands out in the open clusters.
+        strength, low, high: standard deviation between agents, or a function of it, with its 95 %
+            interval; ``unit``.
+        p_value: one-sided, of no difference between agents, by cluster, corrected for all tests.
+        lasts: s, the longest time constant of a transient deviation that is separable from a
+            constant difference.
+        share: variance components as shares: recording, sequence, agent, mood (transient).
+        lags, common: s, and the autocovariance at these lags.
+        later: mean square errors in the last part of the confirmation sequences by model, m².
+        confirmed: one-sided p-value, by cluster, that agent-specific parameters do not predict the
+            last part better than none, or than one per sequence (the larger of both).
+        found: whether the difference is significant in the exploration clusters.
         named: whether it was confirmed as well.
         reason: why not, in words.
     """
@@ -273,16 +272,16 @@ class Agents:
 
 @dataclass
 class Variation:
-    """A standard deviation, or a time, of what a law does not explain.
+    """A standard deviation, or a correlation time, of a mixed-effects model.
 
     Attributes:
         name: a parameter that differs between drivers, in % of the typical driver's; ``push``: of
-            disturbances of the highest rate; ``push_time``: how long they last; ``measurement``:
-            of errors of positions.
-        estimate: with its interval of 95 % from ``lower`` to ``upper``, in ``unit``; NaN where the
-            data tell none.
-        at_bound: ``low`` or ``high`` where it is at the end of what is allowed.
-        shrinkage: share of a driver's variance that the data leave, median over drivers.
+            disturbances of the highest rate; ``push_time``: their correlation time;
+            ``measurement``: of errors of positions.
+        estimate: with its 95 % interval from ``lower`` to ``upper``, in ``unit``; NaN if it is not
+            estimated.
+        at_bound: ``low`` or ``high`` if it is at a bound.
+        shrinkage: posterior over prior variance of a driver's deviation, median over drivers.
     """
 
     name: str
@@ -296,13 +295,13 @@ class Variation:
 
 @dataclass
 class Structure:
-    """What is left where nothing in the catalogue passes.
+    """Unexplained structure: deviations that no effect of the catalogue explains.
 
     Attributes:
         variables: on which it depends, the strongest first.
-        gain: share of the squared errors of positions that are left that a flexible fit removes.
+        gain: share of the remaining squared errors of positions that a nonparametric fit removes.
         hint: a symbolic form, as a hint only.
-        curve: the flexible fit in the first variable: ``at``, ``deviation``.
+        curve: the nonparametric fit in the first variable: ``at``, ``deviation``.
         unit: of the first variable.
     """
 
@@ -315,13 +314,13 @@ class Structure:
 
 @dataclass
 class ComparedLaw:
-    """A base law on open clusters.
+    """A base law on the exploration clusters.
 
     Attributes:
-        parameters: that were calibrated, their number.
-        error: mean square error of positions of whole sequences in clusters that a calibration to
-            nothing else left out, m²; in crowds of the clusters that it saw.
-        behind: by what share its held-out cost lies above that of the best law, in the mean of
+        parameters: number of calibrated parameters.
+        error: mean square error of positions of whole sequences, m², in left-out clusters; in
+            crowds, in the calibration clusters.
+        behind: share by which its held-out cost exceeds that of the best law, in the mean of
             logarithms over clusters.
         p_value: one-sided, paired by cluster, that it is as good as the best law.
         values: parameter to value and unit.
@@ -341,8 +340,8 @@ class Laws:
 
     Attributes:
         refused: law to the reason why it was not compared.
-        clusters: that they were compared on.
-        effects: that every law has which has a place for them.
+        clusters: number of clusters of the comparison.
+        effects: that were added to every law to which they apply.
     """
 
     ranking: list[ComparedLaw]
@@ -352,7 +351,7 @@ class Laws:
 
     @property
     def best(self) -> str:
-        """The name of the first; empty where none was compared."""
+        """The name of the first; empty if none was compared."""
         return self.ranking[0].name if self.ranking else ""
 
 
@@ -367,7 +366,7 @@ class Diagnosis:
     screen: FirstScreen
     confirmation: Confirmation
     effects: list[NamedEffect]
-    leads: list[NamedEffect]  # found in open clusters, not confirmed by sealed ones
+    leads: list[NamedEffect]  # selected in exploration clusters, not confirmed
     agents: list[Agents]
     drivers: list[Variation]
     data_faults: list[DataFault]
@@ -377,13 +376,13 @@ class Diagnosis:
     unknown: Structure | None
     gap: Gap
     base: dict[str, dict[str, Any]]  # term.parameter: before, after, unit
-    split: dict[str, list[str]]  # open and sealed sequences, by name
+    split: dict[str, list[str]]  # exploration (open) and confirmation (sealed) sequences, by name
     notes: list[str]
     seconds: dict[str, float]
     sealed: list[dict[str, Any]] = field(default_factory=list)  # name, before, after of each
-    not_offered: dict[str, str] = field(default_factory=dict)  # effect to why the law has no place
-    laws: Laws | None = None  # base laws compared with each other
-    laws_again: Laws | None = None  # the same with the effects that the first of them lacks
+    not_offered: dict[str, str] = field(default_factory=dict)  # effect to why it does not apply
+    laws: Laws | None = None  # the comparison of base laws
+    laws_again: Laws | None = None  # the comparison with the effects that the best of them lacks
 
     def plain(self) -> dict[str, Any]:
         """Plain types for JSON."""

@@ -1,7 +1,7 @@
-"""The numbers that decide what is said, each with its reason: levels of tests, and shares.
+"""Levels and thresholds of the decisions of a diagnosis, each with its reason.
 
-They hold for the whole of a diagnosis; :func:`applied` sets them. What halving and doubling each
-does to names and false names: ``python -m benchmarks.discovery.sensitivity``.
+They apply to a whole diagnosis; :func:`applied` sets them. The sensitivity of true and false
+positives to halving and doubling each: ``python -m benchmarks.discovery.sensitivity``.
 """
 
 from __future__ import annotations
@@ -14,41 +14,43 @@ from dataclasses import dataclass
 
 @dataclass
 class Rules:
-    """Numbers that no derivation gives, beside ``discover.alpha``."""
+    """Chosen levels and thresholds, in addition to ``discover.alpha``."""
 
-    # of every test after the first screen: whether held-out and sealed clusters lean an effect's
-    # way, whether two effects are told apart, whether a curve outdoes an effect
+    # level of every test after the first screen: score tests on held-out and confirmation clusters,
+    # J tests between effects, comparisons of effects with curves
     level: float = 0.05
-    # of what would mislead most: structure without a name, and kin, which differ by little
+    # stricter level, where errors mislead most: unexplained structure, and similar effects
     sure: float = 0.01
-    least: float = 0.02  # share of the squared errors below which nothing is worth a name
-    minimal: float = 0.1  # of an effect's least usual size: taken for none, a crowd's bias is less
-    rival: float = 0.25  # of the best score's gain: effects from there on are calibrated, for time
-    near: float = 0.97  # of the best held-out gain: from there on the simpler effect is as good
-    # what is left, relative to what names removed: from there on they do not explain the data
+    least: float = 0.02  # smallest share of the squared errors that is worth naming
+    minimal: float = 0.1  # negligible share of an effect's minimum size; a crowd's bias is smaller
+    rival: float = (
+        0.25  # share of the best score's gain from which effects are calibrated, for time
+    )
+    near: float = 0.97  # share of the best held-out gain from which a simpler effect is as good
+    # largest ratio of unexplained structure to what the named effects removed
     too_much: float = 0.5
-    # of an effect's trace: with less inside its plausible range it speaks for something else; a
-    # strong effect's linear estimate may overshoot
+    # smallest share of an effect's estimate inside its plausible range, below which it indicates
+    # another effect; the linear estimate of a strong effect may overshoot
     forbidden: float = 0.2
-    # of the past's size: so far it is taken to be known; what a wrong model leaves of data without
-    # noise is smooth, and could be extrapolated so well that only wriggles count; a tenth cost
-    # effects that come second a tenth of their standardized distance
+    # ridge of the autoregressive filter, relative to the past residuals; without noise, a wrong
+    # model's residuals are smooth and could be extrapolated almost exactly; a value of 0.1 costs
+    # effects that are added second a tenth of their standardised distance
     trust: float = 0.03
-    prior: float = 12.0  # usual clusters that are added to those that give an error
-    power: float = 0.8  # what counts as likely to be found; Cohen 1988
+    prior: float = 12.0  # prior weight of the pooled variance, in clusters
+    power: float = 0.8  # power that counts as detectable; Cohen 1988
 
 
 _RULES: ContextVar[Rules | None] = ContextVar("rules", default=None)
 
 
 def rules() -> Rules:
-    """Those that hold now."""
+    """The present values."""
     return _RULES.get() or Rules()
 
 
 @contextmanager
 def applied(chosen: Rules) -> Iterator[None]:
-    """Other rules for a while."""
+    """Use other values within a context."""
     token = _RULES.set(chosen)
     try:
         yield

@@ -1,1 +1,1 @@
-"""Agents who differ: a law, the agents' own parameters, disturbances that last, errors."""
+"""Mixed-effects models: a law, agent-specific parameters, disturbances and errors."""

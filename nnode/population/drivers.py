@@ -1,4 +1,4 @@
-"""Drivers who differ: which of a law's parameters, by how much, and each driver's own."""
+"""Mixed-effects calibration: random effects of drivers, their variances and their modes."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ from nnode.simulation.rhs import formula_of
 
 #: Bounds of standard deviations of logarithms of parameters, and where searches start.
 LEAST_SPREAD, MOST_SPREAD, SPREAD = 1e-3, 1.0, 0.1
-#: Share of an upper bound that an estimate is away from it at least; one that is nearer is none.
+#: An estimate within this share of an upper bound counts as being at the bound.
 NEAR = 1e-3
-#: A parameter differs between drivers if the data leave less than this share of its variance, in
-#: the median over drivers.
+#: A parameter is a random effect if its shrinkage is below this value, in the median over drivers.
 SHRINKAGE = 0.7
 #: Pushes: bounds of their standard deviation, and its start, by the law's order, in m/s or m/s².
 PUSH = {1: (1e-4, 5.0, 0.2), 2: (1e-4, 5.0, 0.1)}
-#: Bounds of the time that pushes last, in sampling intervals and as a share of the record: one that
-#: lasts longer is a difference between drivers. Where searches start, s.
+#: Bounds of the correlation time of pushes, in sampling intervals and as a share of the record (a
+#: longer one is a difference between drivers), and where searches start, s.
 SHORT, LONG, LASTING = 1.0, 1 / 3, 3.0
-#: Standard deviations of starts: of positions in errors of measurement, of speeds in m/s.
+#: Standard deviations of starts: of positions in standard deviations of the measurement errors; of
+#: speeds the bounds and the start of searches, m/s.
 START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
-#: Step of a parameter's logarithm at most, and how closely estimates converge.
+#: Largest step of a parameter's logarithm, and the tolerance of estimates.
 LONGEST, TOLERANCE = 0.3, 1e-2
-#: At most so many parameters are estimated to differ before the best is chosen.
+#: At most so many candidate random effects are estimated before the best is chosen.
 RANKED = 2
-#: Linearisations of each of these before the best is chosen. Most estimates converge in fewer; the
-#: search for the chosen one is continued if it did not.
+#: Linearisations of each of these before the best is chosen. Most estimates converge in fewer. If
+#: the chosen one did not, its search is continued.
 RANKING_STEPS = 15
-#: Pairs of simulations that tell the bias. The error that two pairs leave is a fifth of an
-#: estimate's standard error.
+#: Antithetic pairs of simulations that estimate the bias. The Monte Carlo error of two pairs is a
+#: fifth of an estimate's standard error.
 PAIRS = 2
-#: Fewer followers say nothing of how drivers differ.
+#: With fewer followers, variances between drivers are not estimated.
 LEAST_DRIVERS = 5
-#: s, longest step of the simulations, by the Runge-Kutta method of fourth order.
+#: Longest step of the simulations, s, by the Runge-Kutta method of fourth order.
 STEP = 0.2
 
 log = logging.getLogger(__name__)
@@ -58,14 +58,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Population:
-    """A calibrated law, and the drivers that it was calibrated to.
+    """A calibrated mixed-effects model of drivers.
 
     Attributes:
         model: the law behind measured leaders.
         noise: pushes and errors of measurement.
         estimate: parameters, deviations, variances.
-        bias: ``(P,)`` by how much the parameters were too large before they were corrected, in the
-            scales in which they are varied.
+        bias: ``(P,)`` the bias that was subtracted from the parameters, in the scales in which
+            they are varied.
     """
 
     model: Followers
@@ -75,7 +75,7 @@ class Population:
 
     @property
     def marginal(self) -> Marginal:
-        """The likelihood, and what follows from it."""
+        """The marginal likelihood and the quantities derived from it."""
         return self.estimate.marginal
 
     @property
@@ -93,47 +93,51 @@ def fit_drivers(
     seed: int = 0,
     pairs: int = PAIRS,
 ) -> Population:
-    """Calibrate a law to drivers who differ.
+    """Calibrate a mixed-effects model: a law whose parameters differ between drivers.
 
     Args:
         system: the law, with effects; a search starts at its parameters.
         paths: the followers.
-        drivers: ``auto``: parameters of which the data tell how they differ; ``none``; or names,
-            as ``T``.
-        first: parameters by name, as ``idm.T``, where another search starts; that which ends at
-            the larger likelihood counts.
-        seed: of the simulations that tell the bias.
+        drivers: ``auto``: random effects are selected; ``none``; or names, such as ``T``.
+        first: parameters by name, such as ``idm.T``, where a second search starts; the result with
+            the larger likelihood is taken.
+        seed: of the simulations that estimate the bias.
         pairs: of these simulations, see :func:`nnode.population.followers.score_bias`; 0: the
-            estimates are not corrected, nor are those that did not converge.
+            estimates are not corrected. Estimates that did not converge are never corrected.
 
     Raises:
         ConfigError: a name that the law does not have, a model without a formula, or simulations
             that blow up.
     """
     plain, noise = Followers(system, paths), PushNoise(paths.error)
-    begin = plain(plain.start, np.zeros((0, 0)), np.zeros((0, 0)))
-    if not np.isfinite(begin.columns).all():
+    initial = plain(plain.start, np.zeros((0, 0)), np.zeros((0, 0)))
+    if not np.isfinite(initial.columns).all():
         raise ConfigError(
             "drivers who differ: followers behind their measured leaders are not simulated to "
             f"finite positions in steps of {2 * paths.half:g} s; start from other parameters, or "
             "take drivers=none"
         )
     row = plain.natural(plain.start)
-    other = [(first or {}).get(n, v) for n, v in zip(plain.names, row, strict=True)]
-    starts = [plain.start] if first is None else [plain.start, plain.at(np.array(other))]
-    law = plain.that_may_differ
+    alternative = [(first or {}).get(n, v) for n, v in zip(plain.names, row, strict=True)]
+    starts = [plain.start] if first is None else [plain.start, plain.at(np.array(alternative))]
+    law = plain.may_differ
     if drivers == "auto":
-        found = _differing(_best(plain, noise, starts))
+        population = _with_random_effects(_most_likely(plain, noise, starts))
     else:
-        names = [] if drivers == "none" else known_names(drivers, law)
+        names = [] if drivers == "none" else full_names(drivers, law)
         model = Followers(system, paths, names) if names else plain
-        found = _best(model, noise, starts)
-    sound = pairs > 0 and found.estimate.converged
-    return _corrected(found, np.random.default_rng(seed), pairs) if sound else found
+        population = _most_likely(model, noise, starts)
+    correctable = pairs > 0 and population.estimate.converged
+    return (
+        _bias_corrected(population, np.random.default_rng(seed), pairs)
+        if correctable
+        else population
+    )
 
 
 def obstacle(system: System, sequences: list[Sequence]) -> str | None:
-    """Why drivers who differ have no place in a model or in its data; None: they have."""
+    """Why differences between drivers cannot be estimated for a model or its data; None if they
+    can."""
     physical = sum(value.numel() for value, _ in system.physical().values())
     if system.domain != "traffic":
         return "people meet everybody in their sequence, and only cars follow measured leaders"
@@ -146,39 +150,43 @@ def obstacle(system: System, sequences: list[Sequence]) -> str | None:
         return "the model reads what other drivers remember, which was not measured"
     if "dt" in getattr(system.formula, "symbols", ()):
         return "the law is a map from step to step"
-    number = sum(s.n_agents - 1 for s in sequences)
-    if number < LEAST_DRIVERS:
-        return f"there are {number} followers behind measured leaders, fewer than {LEAST_DRIVERS}"
+    n_followers = sum(s.n_agents - 1 for s in sequences)
+    if n_followers < LEAST_DRIVERS:
+        return (
+            f"there are {n_followers} followers behind measured leaders, fewer than {LEAST_DRIVERS}"
+        )
     if not np.ptp([s.dt for s in sequences]) < 1e-6:
         return "the sequences have different sampling intervals"
     return None
 
 
-def fit_again(before: Population, system: System, paths: Paths, *, fixed: bool) -> Population:
-    """Calibrate another model to drivers, from an estimate of a model of the same law.
+def refit(before: Population, system: System, paths: Paths, *, fixed: bool) -> Population:
+    """Calibrate another model of the same law, starting from an earlier estimate.
 
     Args:
-        before: where the search starts; further parameters may differ.
+        before: where the search starts; further random effects may be selected.
         system, paths: the model and the followers.
-        fixed: only deviations are estimated; parameters are the system's, variances those before.
+        fixed: only estimate deviations, with the system's parameters and the earlier variances.
     """
-    model, known = Followers(system, paths, before.random), before.estimate
-    variances = _started(known.variances, model)
-    same = before.model.paths.names == paths.names
-    same &= known.start.shape == (len(paths.agent), model.starts)
-    modes = (known.agents, known.start) if same else (None, None)
+    model, previous = Followers(system, paths, before.random), before.estimate
+    variances = _with_starts(previous.variances, model)
+    same_followers = before.model.paths.names == paths.names
+    same_followers &= previous.start.shape == (len(paths.agent), model.starts)
+    modes = (previous.agents, previous.start) if same_followers else (None, None)
     if not fixed:
-        return _differing(_estimated(model, before.noise, model.start, variances, *modes))
+        return _with_random_effects(_estimated(model, before.noise, model.start, variances, *modes))
     agents, start = modes
-    found = fit_deviations(model, before.noise, model.start, variances, agents=agents, start=start)
-    return replace(before, model=model, estimate=found, bias=np.zeros(len(model.start)))
+    deviations = fit_deviations(
+        model, before.noise, model.start, variances, agents=agents, start=start
+    )
+    return replace(before, model=model, estimate=deviations, bias=np.zeros(len(model.start)))
 
 
-def known_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
-    """Names of a law's parameters, with the law's, from those without.
+def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
+    """Full names of a law's parameters, from their short names.
 
     Args:
-        law: the parameters' names with the law's, as ``idm.T``.
+        law: the full names, such as ``idm.T``.
 
     Raises:
         ConfigError: a name that the law does not have.
@@ -193,23 +201,23 @@ def known_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
     return [short[name] for name in drivers]
 
 
-def _corrected(found: Population, rng: np.random.Generator, pairs: int) -> Population:
-    """Without the bias of the parameters that simulations of the estimated model show.
+def _bias_corrected(population: Population, rng: np.random.Generator, pairs: int) -> Population:
+    """Correct the parameters for their bias in simulations of the estimated model.
 
-    The linearisation at the modes and the errors of smoothed leaders shift estimates. Standard
-    deviations stay as they are: their bias is smaller than what few simulations add to their error.
+    The linearisation at the modes and the errors of smoothed leaders bias the estimates. Standard
+    deviations are not corrected: their bias is smaller than the Monte Carlo error of a correction.
     """
-    model, noise, before = found.model, found.noise, found.estimate
+    model, noise, before = population.model, population.noise, population.estimate
     try:
         bias = score_bias(model, noise, before, rng, pairs)
     except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
         log.warning("parameters are not corrected for their bias: simulated drivers left the road")
-        return found
+        return population
     bias = np.clip(bias, -LONGEST, LONGEST)
     theta = np.clip(before.theta - bias, model.low, model.high)
-    there = fit_deviations(model, noise, theta, before.variances)
-    there = replace(there, converged=before.converged)
-    return replace(found, estimate=there, bias=before.theta - theta)
+    deviations = fit_deviations(model, noise, theta, before.variances)
+    deviations = replace(deviations, converged=before.converged)
+    return replace(population, estimate=deviations, bias=before.theta - theta)
 
 
 def _estimated(
@@ -221,9 +229,9 @@ def _estimated(
     start: np.ndarray | None = None,
     steps: int = STEPS,
 ) -> Population:
-    """The estimate of a model; the search starts at parameters, standard deviations and, where they
-    are given, deviations of drivers and of starts."""
-    found = estimate(
+    """The estimate of a model, from given parameters, standard deviations and, optionally,
+    deviations of drivers and of starts."""
+    result = estimate(
         model,
         noise,
         theta,
@@ -236,68 +244,69 @@ def _estimated(
         start=start,
         steps=steps,
     )
-    return Population(model=model, noise=noise, estimate=found, bias=np.zeros(len(found.theta)))
+    return Population(model=model, noise=noise, estimate=result, bias=np.zeros(len(result.theta)))
 
 
-def _best(model: Followers, noise: PushNoise, starts: list[np.ndarray]) -> Population:
-    """The estimate of a model from several starts, that of the largest likelihood."""
-    found = [_estimated(model, noise, theta, _variances(model)) for theta in starts]
-    return max(found, key=lambda one: one.marginal.loglik)
+def _most_likely(model: Followers, noise: PushNoise, starts: list[np.ndarray]) -> Population:
+    """The estimate with the largest likelihood from several starts."""
+    fits = [_estimated(model, noise, theta, _variances(model)) for theta in starts]
+    return max(fits, key=lambda fit: fit.marginal.loglik)
 
 
-def _differing(best: Population) -> Population:
-    """With those further parameters that differ between drivers, as far as the data tell.
+def _with_random_effects(best: Population) -> Population:
+    """Forward selection of random effects.
 
-    Parameters are added one after the other, while twice the logarithm of the marginal likelihood
-    rises by more than the logarithm of the number of drivers (Schwarz's criterion). Candidates are
-    ranked by the marginal likelihood of the samples as they are linearised without them, with
-    variances of their own; the best two are then estimated.
+    Random effects are added while twice the log marginal likelihood rises by more than the
+    logarithm of the number of drivers (BIC, Schwarz 1978). Candidates are ranked by the marginal
+    likelihood of the samples as linearised without them, with refitted variances; then the best two
+    are estimated.
     """
     price = math.log(max(len(best.model.paths.names), 2)) / 2
-    while (better := _better(best, price)) is not None:
+    while (better := _next_random_effect(best, price)) is not None:
         best = better
     return best
 
 
-def _better(best: Population, price: float) -> Population | None:
-    """With one more parameter that differs; None: no parameter raises the likelihood enough."""
+def _next_random_effect(best: Population, price: float) -> Population | None:
+    """The estimate with one more random effect; None if none raises the likelihood enough."""
     limit = best.marginal.loglik + price
-    left = [name for name in best.model.that_may_differ if name not in best.random]
-    ranked = [(_linearised(best, name), name) for name in left]
-    tried = [name for value, name in sorted(ranked, reverse=True) if value > limit]
-    better: list[Population] = []
-    for name in tried:
+    remaining = [name for name in best.model.may_differ if name not in best.random]
+    ranked = [(_linearised_loglik(best, name), name) for name in remaining]
+    candidates = [name for value, name in sorted(ranked, reverse=True) if value > limit]
+    improved: list[Population] = []
+    for name in candidates:
         system, paths = best.model.system, best.model.paths
         model, before = Followers(system, paths, [*best.random, name]), best.estimate
-        variances = _widened(before.variances)
-        found = _estimated(model, best.noise, before.theta, variances, steps=RANKING_STEPS)
-        if _differs(found.estimate) and found.marginal.loglik > limit:
-            better.append(found)
-        if len(better) == RANKED:
+        variances = _with_random_effect(before.variances)
+        fit = _estimated(model, best.noise, before.theta, variances, steps=RANKING_STEPS)
+        if _identified(fit.estimate) and fit.marginal.loglik > limit:
+            improved.append(fit)
+        if len(improved) == RANKED:
             break
-    chosen = max(better, key=lambda one: one.marginal.loglik, default=None)
+    chosen = max(improved, key=lambda fit: fit.marginal.loglik, default=None)
     if chosen is None or chosen.estimate.converged:
         return chosen
-    there = chosen.estimate
-    modes = there.agents, there.start
-    return _estimated(chosen.model, best.noise, there.theta, there.variances, *modes)
+    partial = chosen.estimate
+    modes = partial.agents, partial.start
+    return _estimated(chosen.model, best.noise, partial.theta, partial.variances, *modes)
 
 
-def _linearised(best: Population, name: str) -> float:
-    """The logarithm of the marginal likelihood with one more parameter that differs, the samples'
-    linearisation kept."""
-    model, found = best.model, best.estimate
+def _linearised_loglik(best: Population, name: str) -> float:
+    """The log marginal likelihood with one more random effect, at the present linearisation."""
+    model, previous = best.model, best.estimate
     random = [*model.random, model.names.index(name)]
-    data = replace(found.data, random=found.data.fixed[..., random])
-    variances = fit_variances(data, best.noise, _widened(found.variances), tolerance=TOLERANCE)
+    data = replace(previous.data, random=previous.data.fixed[..., random])
+    variances = fit_variances(
+        data, best.noise, _with_random_effect(previous.variances), tolerance=TOLERANCE
+    )
     products = best.noise.products(data, variances.noise)
     return marginal(data, products, variances.spread, variances.start).loglik
 
 
-def _differs(found: Estimate) -> bool:
-    """Whether the data tell how each of the parameters differs."""
-    told = np.median(found.marginal.shrinkage, 0) < SHRINKAGE
-    return bool((told & (found.variances.spread < (1 - NEAR) * MOST_SPREAD)).all())
+def _identified(fit: Estimate) -> bool:
+    """Whether the data identify the variances of all random effects."""
+    informative = np.median(fit.marginal.shrinkage, 0) < SHRINKAGE
+    return bool((informative & (fit.variances.spread < (1 - NEAR) * MOST_SPREAD)).all())
 
 
 def _variances(model: Followers) -> Variances:
@@ -307,41 +316,41 @@ def _variances(model: Followers) -> Variances:
     short, long = SHORT * paths.dt, max(LONG * length, 2 * SHORT * paths.dt)
     position = START_POSITION * paths.error
     low_speed, high_speed, speed = START_SPEED
-    starts, least, most = [position], [position], [position]
+    starts, lowest, highest = [position], [position], [position]
     for _ in range(model.starts - 1):  # of speeds, and of what terms remember
-        starts, least, most = [*starts, speed], [*least, low_speed], [*most, high_speed]
+        starts, lowest, highest = [*starts, speed], [*lowest, low_speed], [*highest, high_speed]
     return Variances(
         noise=np.array([push, np.clip(LASTING, short, long)]),
         spread=np.full(number, SPREAD),
         start=np.array(starts),
-        low=np.array([low_push, short, *[LEAST_SPREAD] * number, *least]),
-        high=np.array([high_push, long, *[MOST_SPREAD] * number, *most]),
+        low=np.array([low_push, short, *[LEAST_SPREAD] * number, *lowest]),
+        high=np.array([high_push, long, *[MOST_SPREAD] * number, *highest]),
     )
 
 
-def _started(variances: Variances, model: Followers) -> Variances:
-    """With the standard deviations of as many starts as a model has."""
-    number, usual = len(variances.start), _variances(model)
-    if number == model.starts:
+def _with_starts(variances: Variances, model: Followers) -> Variances:
+    """Variances with as many standard deviations of starts as a model needs."""
+    n_starts, defaults = len(variances.start), _variances(model)
+    if n_starts == model.starts:
         return variances
-    kept = min(number, model.starts)
-    start = np.append(variances.start[:kept], usual.start[kept:])
-    ends = len(variances.row) - number
-    low = np.append(variances.low[:ends], usual.low[-model.starts :])
-    high = np.append(variances.high[:ends], usual.high[-model.starts :])
+    kept = min(n_starts, model.starts)
+    start = np.append(variances.start[:kept], defaults.start[kept:])
+    ends = len(variances.row) - n_starts
+    low = np.append(variances.low[:ends], defaults.low[-model.starts :])
+    high = np.append(variances.high[:ends], defaults.high[-model.starts :])
     return replace(variances, start=start, low=low, high=high)
 
 
-def _widened(variances: Variances) -> Variances:
-    """With one more parameter that differs. Pushes that last as long as they may stood in for
-    that, and the search begins with others."""
+def _with_random_effect(variances: Variances) -> Variances:
+    """Variances with one more random effect. If the correlation time of the pushes is at its bound,
+    it stood in for this effect, and the search restarts with a shorter one."""
     at = len(variances.noise) + len(variances.spread)
-    push, lasts = variances.noise
-    if lasts >= (1 - NEAR) * variances.high[1]:
-        push, lasts = push / 2, np.clip(LASTING, *np.stack([variances.low, variances.high])[:, 1])
+    push, push_time = variances.noise
+    if push_time >= (1 - NEAR) * variances.high[1]:
+        push, push_time = push / 2, np.clip(LASTING, variances.low[1], variances.high[1])
     return replace(
         variances,
-        noise=np.array([push, lasts]),
+        noise=np.array([push, push_time]),
         spread=np.append(variances.spread, SPREAD),
         low=np.insert(variances.low, at, LEAST_SPREAD),
         high=np.insert(variances.high, at, MOST_SPREAD),

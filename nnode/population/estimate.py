@@ -1,13 +1,14 @@
-"""Parameters, differences between agents and disturbances, estimated together.
+"""Estimation of mixed-effects models with autocorrelated disturbances.
 
-Two steps take turns until neither changes the result. The first maximises the marginal likelihood
-of the linearised samples over the variances. The second minimises the penalised sum of squares
+Two steps alternate until convergence. The first maximises the marginal likelihood of the linearised
+samples over the variances. The second minimises the penalised sum of squares
 
     (y - f)' V0^-1 (y - f) + b' Omega^-1 b + h' S^-1 h
 
-over the parameters, the deviations of agents and those of starts, by a step of Gauss and Newton's
-that is halved until the sum falls, for agents whose own sum rises. A step that turns back is
-shortened as well: the covariance changes with the parameters, so the steps might cycle.
+over the parameters, the deviations of agents and those of starts (the empirical Bayes modes), by a
+Gauss-Newton step. The step is halved until the sum falls, also separately for agents whose own sum
+rises. A step that reverses the previous one is shortened too, because the covariance changes with
+the parameters and the steps might cycle.
 
 Source: Lindstrom & Bates 1990, Biometrics 46; Wolfinger & Lin 1997, Comput. Stat. Data Anal. 25.
 """
@@ -24,13 +25,13 @@ from nnode.population.likelihood import Linearised, Marginal, Noise, Products, m
 
 #: Difference of logarithms of standard deviations for derivatives.
 DIFFERENCE = 1e-6
-#: Halvings of a step at most.
+#: Largest number of halvings of a step.
 HALVINGS = 6
-#: How closely deviations are found where parameters and variances are given, see :func:`estimate`.
+#: Tolerance of deviations with given parameters and variances, see :func:`estimate`.
 MODES = 0.02
-#: Linearisations of a search at most.
+#: Largest number of linearisations of a search.
 STEPS = 40
-#: The smallest share of a step that turns back.
+#: The smallest relaxation factor of steps that reverse the previous one.
 LEAST = 0.2
 
 
@@ -50,13 +51,13 @@ class Response(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Variances:
-    """Standard deviations, and the times for which disturbances last.
+    """Standard deviations, and the correlation times of disturbances.
 
     Attributes:
         noise: of the :class:`~nnode.population.likelihood.Noise`, in the order of its names.
         spread: ``(Q,)`` of the agents' deviations.
         start: ``(H,)`` of the starts' deviations.
-        low, high: of all of them, one after the other; where these are equal, nothing is estimated.
+        low, high: bounds of all of them, concatenated; values with equal bounds are fixed.
     """
 
     noise: np.ndarray
@@ -79,16 +80,16 @@ class Variances:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """What was estimated.
+    """An estimate of a mixed-effects model.
 
     Attributes:
         theta: ``(P,)`` parameters.
         agents: ``(D, Q)`` deviations of the agents. start: ``(S, H)`` of the starts.
         variances: standard deviations.
-        data: the samples, linearised there.
-        marginal: the likelihood there.
-        steps: linearisations.
-        converged: whether the last step changed nothing.
+        data: the samples, linearised at the estimate.
+        marginal: the marginal likelihood at the estimate.
+        steps: number of linearisations.
+        converged: whether the last step was below the tolerance.
     """
 
     theta: np.ndarray
@@ -116,17 +117,17 @@ def estimate(
     agents: np.ndarray | None = None,
     start: np.ndarray | None = None,
 ) -> Estimate:
-    """Estimate a model of agents who differ.
+    """Estimate a mixed-effects model.
 
     Args:
         response: the model.
-        noise: what differs from sample to sample.
+        noise: the residual covariance.
         theta: ``(P,)`` where the search starts.
         variances: where it starts, and bounds.
         low, high: ``(P,)`` bounds of the parameters.
         restricted: REML, for few agents.
-        longest: step of a parameter at most, in its own unit.
-        steps: linearisations at most.
+        longest: largest step of a parameter, in its own unit.
+        steps: largest number of linearisations.
         tolerance: the search ends when a step moves no parameter by more than this share of its
             standard error, no standard deviation by more than this share of itself, and no agent's
             deviation by more than this share of their standard deviation.
@@ -135,47 +136,52 @@ def estimate(
     theta = np.array(theta, dtype=float)
     low = np.full(len(theta), -np.inf) if low is None else low
     high = np.full(len(theta), np.inf) if high is None else high
-    none = np.zeros((0, 0))
-    data = response(theta, none if agents is None else agents, none if start is None else start)
-    converged, taken, number = False, 1, int(data.agent.max()) + 1
-    agents = np.zeros((number, data.random.shape[-1])) if agents is None else agents
+    empty = np.zeros((0, 0))
+    data = response(theta, empty if agents is None else agents, empty if start is None else start)
+    converged, n_linearisations, n_agents = False, 1, int(data.agent.max()) + 1
+    agents = np.zeros((n_agents, data.random.shape[-1])) if agents is None else agents
     start = np.zeros(data.start.shape[::2]) if start is None else start
-    most, last = 1.0, np.zeros(len(theta))
+    relaxation, previous_change = 1.0, np.zeros(len(theta))
     for _ in range(steps):
         before = variances
         variances = fit_variances(
             data, noise, variances, restricted=restricted, tolerance=tolerance
         )
         products = noise.products(data, variances.noise)
-        here = marginal(data, products, variances.spread, variances.start, restricted=restricted)
-        change = np.clip(here.change, -longest, longest)
+        current = marginal(data, products, variances.spread, variances.start, restricted=restricted)
+        change = np.clip(current.change, -longest, longest)
         change = np.clip(change, low - theta, high - theta)
         misfit = _misfit(data, products, variances, agents, start)
-        turned = last @ here.information @ change < 0
-        most, last = max(most / 2, LEAST) if turned else min(1.25 * most, 1.0), change
-        share, shares, found, there = most, np.full((number, 1), most), None, data
+        reversed_step = previous_change @ current.information @ change < 0
+        relaxation = max(relaxation / 2, LEAST) if reversed_step else min(1.25 * relaxation, 1.0)
+        previous_change, accepted, linearised = change, None, data
+        share, shares = relaxation, np.full((n_agents, 1), relaxation)
         for _ in range(HALVINGS):
             trial = (
                 theta + share * change,
-                agents + shares * (here.deviations - agents),
-                start + shares[data.agent] * (here.start - start),
+                agents + shares * (current.deviations - agents),
+                start + shares[data.agent] * (current.start - start),
             )
-            there, taken = response(*trial), taken + 1
-            fixed = replace(there, step=data.step, forced=data.forced)
-            then = _misfit(fixed, noise.products(fixed, variances.noise), variances, *trial[1:])
-            if then.sum() <= misfit.sum():
-                found = trial
+            linearised, n_linearisations = response(*trial), n_linearisations + 1
+            fixed = replace(linearised, step=data.step, forced=data.forced)
+            trial_products = noise.products(fixed, variances.noise)
+            trial_misfit = _misfit(fixed, trial_products, variances, *trial[1:])
+            if trial_misfit.sum() <= misfit.sum():
+                accepted = trial
                 break
-            share, shares = share / 2, np.where((then > misfit)[:, None], shares / 2, shares)
-        scale = np.sqrt(np.maximum(np.diag(here.information), 1e-300))
-        moved = np.max(np.abs(change) * scale, initial=0.0)
-        moved = max(moved, np.max(np.abs(np.log(variances.row / before.row)), initial=0.0))
-        differ = np.abs(here.deviations - agents) / variances.spread
-        moved = max(moved, np.max(differ, initial=0.0))
-        if found is not None:
-            (theta, agents, start), data = found, there
-        if moved < tolerance or found is None:
-            converged = bool(moved < tolerance)
+            rises = (trial_misfit > misfit)[:, None]
+            share, shares = share / 2, np.where(rises, shares / 2, shares)
+        scale = np.sqrt(np.maximum(np.diag(current.information), 1e-300))
+        changes = (
+            np.abs(change) * scale,
+            np.abs(np.log(variances.row / before.row)),
+            np.abs(current.deviations - agents) / variances.spread,
+        )
+        largest_change = max(np.max(values, initial=0.0) for values in changes)
+        if accepted is not None:
+            (theta, agents, start), data = accepted, linearised
+        if largest_change < tolerance or accepted is None:
+            converged = bool(largest_change < tolerance)
             break
     variances = fit_variances(data, noise, variances, restricted=restricted, tolerance=tolerance)
     products = noise.products(data, variances.noise)
@@ -187,7 +193,7 @@ def estimate(
         variances=variances,
         data=data,
         marginal=final,
-        steps=taken,
+        steps=n_linearisations,
         converged=converged,
     )
 
@@ -201,14 +207,14 @@ def fit_deviations(
     agents: np.ndarray | None = None,
     start: np.ndarray | None = None,
 ) -> Estimate:
-    """Estimate the deviations of agents and of starts, parameters and variances given.
+    """The empirical Bayes modes of agents and of starts, given parameters and variances.
 
     Args:
         response, noise, agents, start: see :func:`estimate`.
         theta: ``(P,)`` the parameters.
     """
     fixed = replace(variances, low=variances.row, high=variances.row)
-    found = estimate(
+    modes = estimate(
         response,
         noise,
         theta,
@@ -219,7 +225,7 @@ def fit_deviations(
         agents=agents,
         start=start,
     )
-    return replace(found, variances=variances)
+    return replace(modes, variances=variances)
 
 
 def fit_variances(
@@ -230,53 +236,53 @@ def fit_variances(
     restricted: bool = False,
     tolerance: float = 1e-3,
 ) -> Variances:
-    """The variances that are most likely, the samples' linearisation given.
+    """The maximum likelihood variances at the present linearisation.
 
-    Logarithms of standard deviations are scaled by the spread of the agents' scores, which is their
-    curvature (Berndt et al. 1974).
+    Logarithms of standard deviations are scaled by the outer product of the agents' scores, which
+    approximates the information (Berndt et al. 1974).
 
     Args:
-        tolerance: the search ends when a step gains less in the logarithm of the likelihood.
+        tolerance: the search ends when a step raises the log likelihood by less.
     """
-    whole, free = np.log(variances.row), np.flatnonzero(variances.low < variances.high)
+    logs_all, free = np.log(variances.row), np.flatnonzero(variances.low < variances.high)
     if not len(free):
         return variances
 
-    def at(row: np.ndarray) -> tuple[Marginal, list[Marginal]]:
-        """The likelihood, and those with a little more of each standard deviation."""
-        known: dict[tuple[float, ...], Products] = {}  # most of them have the same noise
+    def likelihoods(row: np.ndarray) -> tuple[Marginal, list[Marginal]]:
+        """The likelihood, and those with each standard deviation increased slightly."""
+        products: dict[tuple[float, ...], Products] = {}  # most share the same noise
 
-        def one(row: np.ndarray) -> Marginal:
-            logs = whole.copy()
-            logs[free] = row
-            found = variances.filled(np.exp(logs))
-            key = tuple(found.noise)
-            if key not in known:
-                known[key] = noise.products(data, found.noise)
-            return marginal(data, known[key], found.spread, found.start, restricted=restricted)
+        def likelihood(row: np.ndarray) -> Marginal:
+            log_row = logs_all.copy()
+            log_row[free] = row
+            trial = variances.filled(np.exp(log_row))
+            key = tuple(trial.noise)
+            if key not in products:
+                products[key] = noise.products(data, trial.noise)
+            return marginal(data, products[key], trial.spread, trial.start, restricted=restricted)
 
-        return one(row), [one(row + step) for step in DIFFERENCE * np.eye(len(row))]
+        return likelihood(row), [likelihood(row + step) for step in DIFFERENCE * np.eye(len(row))]
 
-    first, sides = at(whole[free])
-    scores = np.stack([(up.each - first.each) / DIFFERENCE for up in sides])
+    centre, sides = likelihoods(logs_all[free])
+    scores = np.stack([(up.each - centre.each) / DIFFERENCE for up in sides])
     scale = 1 / np.sqrt(np.maximum((scores**2).sum(1), 1.0))
 
     def value(scaled: np.ndarray) -> tuple[float, np.ndarray]:
-        here, sides = at(scaled * scale)
-        slope = np.array([up.loglik - here.loglik for up in sides]) / DIFFERENCE
-        return -here.loglik, -slope * scale
+        centre, sides = likelihoods(scaled * scale)
+        slope = np.array([up.loglik - centre.loglik for up in sides]) / DIFFERENCE
+        return -centre.loglik, -slope * scale
 
     low, high = np.log(variances.low[free]) / scale, np.log(variances.high[free]) / scale
     best = minimize(
         value,
-        whole[free] / scale,
+        logs_all[free] / scale,
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(low, high, strict=True)),
-        options={"ftol": tolerance / max(abs(first.loglik), 1.0), "gtol": tolerance},
+        options={"ftol": tolerance / max(abs(centre.loglik), 1.0), "gtol": tolerance},
     )
-    whole[free] = best.x * scale
-    return variances.filled(np.exp(whole))
+    logs_all[free] = best.x * scale
+    return variances.filled(np.exp(logs_all))
 
 
 def _misfit(
@@ -286,12 +292,19 @@ def _misfit(
     agents: np.ndarray,
     start: np.ndarray,
 ) -> np.ndarray:
-    """``(D,)`` the agents' penalised sums of squares; infinite where a simulation blows up."""
+    """``(D,)`` the agents' penalised sums of squares; infinite where a simulation diverges."""
     number, count = data.fixed.shape[-1], len(agents)
-    blown = ~np.isfinite(np.where(data.seen, data.residual, 0.0)).all(1)
-    back = -np.concatenate([agents[data.agent], start], 1)
-    weights = np.concatenate([np.ones((len(back), 1)), np.zeros((len(back), number)), back], 1)
+    diverged = ~np.isfinite(np.where(data.observed, data.residual, 0.0)).all(1)
+    negative_deviations = -np.concatenate([agents[data.agent], start], 1)
+    weights = np.concatenate(
+        [
+            np.ones((len(negative_deviations), 1)),
+            np.zeros((len(negative_deviations), number)),
+            negative_deviations,
+        ],
+        1,
+    )
     square = np.einsum("si,sij,sj->s", weights, products.gram, weights)
-    square = np.where(blown, np.inf, square + ((start / variances.start) ** 2).sum(1))
-    tied = ((agents / variances.spread) ** 2).sum(1)
-    return np.bincount(data.agent, square, count) + tied
+    square = np.where(diverged, np.inf, square + ((start / variances.start) ** 2).sum(1))
+    penalty = ((agents / variances.spread) ** 2).sum(1)
+    return np.bincount(data.agent, square, count) + penalty

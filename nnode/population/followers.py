@@ -1,8 +1,8 @@
 """Followers of a lane, each behind the measured and smoothed paths of the vehicles ahead.
 
-Given these paths, the likelihood of a platoon is the product of those of its followers, and what is
-particular about a leader does not disturb the estimates of those behind. The price is an error in
-variables: the smoothed path of a leader has errors of its own.
+Given these paths, the likelihood of a platoon is the product of the likelihoods of its followers,
+and an unusual leader does not affect the estimates of the followers behind. The price is an error
+in variables: the smoothed path of a leader has errors.
 """
 
 from __future__ import annotations
@@ -34,33 +34,33 @@ from nnode.simulation.linear import trapezoidal
 from nnode.simulation.numpy import simulated, strides
 from nnode.simulation.rhs import formula_of
 
-#: Least standard deviation of errors of measurement, m: that of a camera.
+#: Smallest standard deviation of measurement errors, m: that of a camera.
 FLOOR = 0.01
-#: Errors of positions that are new at every sample, m, between which followers are simulated
-#: behind their own leaders unless something else is asked for. Below, positions were smoothed or
-#: simulated: SUMO's paths at 5 Hz, which have none, look like errors of 0.011 m, and errors of
-#: smoothed positions last, which the likelihood does not know of. Above, smoothed leaders keep too
-#: much: ESIMAS's errors of 0.57 m are taken for pushes. A table in docs/discovery.md compares both
-#: ways at errors below the upper limit.
+#: Range of white measurement errors, m, in which differences between drivers are estimated by
+#: default. Below it, positions were smoothed or simulated: SUMO's paths at 5 Hz, which have no
+#: errors, seem to have errors of 0.011 m, and errors of smoothed positions are autocorrelated,
+#: which the likelihood neglects. Above it, smoothed leaders keep too much noise: ESIMAS's errors of
+#: 0.57 m are attributed to pushes. A table in docs/discovery.md compares both approaches below the
+#: upper limit.
 NOISE = (0.015, 0.45)
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
 DIFFERENCE, START_DIFFERENCE = 1e-4, 1e-2
-#: What is added to the highest rate ``(R, F)``, of the number among the times of the paths ahead,
-#: and of states and rates ``(M, R, F)``.
+#: The push on the highest rate ``(R, F)``, as a function of the index of the time in the paths
+#: ahead, and of states and rates ``(M, R, F)``.
 Push = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
-#: Standard normal numbers of a shape.
+#: Draws standard normal numbers of a shape.
 Draw = Callable[[tuple[int, ...]], np.ndarray]
-#: States beside those of motion that disturbances may act through.
+#: Largest number of states besides those of motion through which disturbances act.
 STATES = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Paths:
-    """What F followers were measured to do, and the vehicles ahead of them.
+    """The measured paths of F followers, and of the vehicles ahead of them.
 
     Attributes:
         x: ``(F, K)`` measured positions of the followers, m.
-        seen: ``(F, K)`` True where there is a sample.
+        observed: ``(F, K)`` True where there is a sample.
         sequence, place: ``(F,)`` the sequence and the place in the platoon.
         agent: ``(F,)`` number of the follower, from 0.
         names: of the agents.
@@ -76,7 +76,7 @@ class Paths:
     """
 
     x: np.ndarray
-    seen: np.ndarray
+    observed: np.ndarray
     sequence: np.ndarray
     place: np.ndarray
     agent: np.ndarray
@@ -92,8 +92,8 @@ class Paths:
     batch: Batch
 
     def remeasured(self, x: np.ndarray, draw: Draw) -> Paths:
-        """The paths with other followers, and with leaders as they would be measured and smoothed
-        if the smoothed paths were their true ones.
+        """Simulated measurements: of other followers, and of leaders whose true paths are the
+        smoothed ones.
 
         Args:
             x: ``(F, K)`` true positions of the followers, m.
@@ -104,8 +104,8 @@ class Paths:
         which = smoothed, self.sequence, self.place, self.dt
         start = np.stack(
             [
-                _start(smooth(path[seen]), self.dt)
-                for path, seen in zip(measured, self.seen, strict=True)
+                _start(smooth(path[observed]), self.dt)
+                for path, observed in zip(measured, self.observed, strict=True)
             ],
             1,
         )
@@ -130,12 +130,12 @@ def paths_of(sequences: list[Sequence], step: float) -> Paths:
     half = dt * stride / parts / 2
     times = 2 * math.ceil((samples - 1) / stride) * parts + 1
     which = [(b, i) for b, s in enumerate(sequences) for i in range(s.n_agents - 1)]
-    x, seen = np.zeros((len(which), samples)), np.zeros((len(which), samples), dtype=bool)
+    x, observed = np.zeros((len(which), samples)), np.zeros((len(which), samples), dtype=bool)
     agents = dict[tuple[str, str], int]()
     names, agent = list[str](), list[int]()
     for f, (b, i) in enumerate(which):
         s = sequences[b]
-        x[f, : s.n_samples], seen[f, : s.n_samples] = s.x[:, i, 0], True
+        x[f, : s.n_samples], observed[f, : s.n_samples] = s.x[:, i, 0], True
         key = (s.site or s.recording, s.agents[i]) if s.agents else (s.name, f"{s.name}:{i}")
         if key not in agents:
             agents[key] = len(names)
@@ -147,7 +147,7 @@ def paths_of(sequences: list[Sequence], step: float) -> Paths:
     noise = measured_noise(sequences).position
     return Paths(
         x=x,
-        seen=seen,
+        observed=observed,
         sequence=sequence,
         place=place,
         agent=np.array(agent),
@@ -160,11 +160,11 @@ def paths_of(sequences: list[Sequence], step: float) -> Paths:
         start=start,
         second=np.array([float(i + 2 < sequences[b].n_agents) for b, i in which]),
         error=max(noise, FLOOR) if math.isfinite(noise) else FLOOR,
-        batch=collate(_with_those_ahead(sequences[b], i) for b, i in which),
+        batch=collate(_with_vehicles_ahead(sequences[b], i) for b, i in which),
     )
 
 
-def _with_those_ahead(s: Sequence, place: int) -> Sequence:
+def _with_vehicles_ahead(s: Sequence, place: int) -> Sequence:
     """The sequence of a follower and of the one or two vehicles ahead of him."""
     index = np.arange(s.n_agents)
     return s.select((index >= place) & (index <= place + 2))
@@ -184,33 +184,33 @@ def _ahead(
     times: int,
     apart: float,
 ) -> np.ndarray:
-    """``(H, 4, F)`` as in :class:`Paths`, at so many times so far apart (s); after the last sample
-    vehicles stay where they were."""
-    found = np.empty((times, 4, len(sequence)))
+    """``(H, 4, F)`` as in :class:`Paths`, at ``times`` times that are ``apart`` s apart; constant
+    after the last sample."""
+    ahead_paths = np.empty((times, 4, len(sequence)))
     for b, paths in enumerate(smoothed):
         time = dt * np.arange(len(paths))
         at = np.minimum(apart * np.arange(times), time[-1])
         spline = CubicSpline(time, paths)
         x, v = spline(at), spline(at, 1)
         for f in np.flatnonzero(sequence == b):
-            first = place[f] + 1
-            second = min(first + 1, paths.shape[1] - 1)
-            far = SAFE if second == first else 0.0
-            found[:, :, f] = np.stack(
-                [x[:, first], v[:, first], x[:, second] + far, v[:, second]], 1
+            next_place = place[f] + 1
+            after_next = min(next_place + 1, paths.shape[1] - 1)
+            offset = SAFE if after_next == next_place else 0.0
+            ahead_paths[:, :, f] = np.stack(
+                [x[:, next_place], v[:, next_place], x[:, after_next] + offset, v[:, after_next]], 1
             )
-    return found
+    return ahead_paths
 
 
-def _named(ahead: np.ndarray) -> dict[str, np.ndarray]:
-    """What formulas call the vehicles ahead ``(4, ..., F)``."""
+def _ahead_symbols(ahead: np.ndarray) -> dict[str, np.ndarray]:
+    """The formulas' names of the states ``(4, ..., F)`` of the vehicles ahead."""
     x1, v1, x2, v2 = ahead
     return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
 
 
-def behind_leaders(system: System) -> LaneDynamics | None:
-    """The formula of a model that needs no more than the positions and the speeds of the vehicles
-    ahead; None for others."""
+def follower_formula(system: System) -> LaneDynamics | None:
+    """The formula of a model that only reads the positions and speeds of the vehicles ahead; None
+    for other models."""
     lane = formula_of(system)
     if lane is None or any(name not in ("x", "v") for name, _ in lane.ahead):
         return None
@@ -218,32 +218,32 @@ def behind_leaders(system: System) -> LaneDynamics | None:
 
 
 def drivers_differ(system: System, sequences: Iterable[Sequence]) -> bool:
-    """Whether it is estimated how drivers differ unless something else is asked for: with formulas
-    of the positions and the speeds of a driver and of the vehicles ahead, where these were measured
-    well enough."""
-    if behind_leaders(system) is None:
+    """Whether differences between drivers are estimated by default: if the model is a formula of
+    the positions and speeds of a driver and of the vehicles ahead, and the measurement errors are
+    in the range :data:`NOISE`."""
+    if follower_formula(system) is None:
         return False
     return NOISE[0] < measured_noise(sequences).position < NOISE[1]
 
 
-def _followed(lane: LaneDynamics) -> int:
-    """States through which disturbances act, those at the start as well."""
+def _n_disturbed(lane: LaneDynamics) -> int:
+    """The number of states through which disturbances act, also at the start."""
     number = len(lane.rates)
     return number if number <= lane.order + STATES else lane.order
 
 
 @cache
-def _slopes(lane: LaneDynamics) -> tuple[list[tuple[int, int]], Formulas]:
-    """Derivatives of the rates by the states through which disturbances act: which, and a function
-    of all."""
+def _jacobian(lane: LaneDynamics) -> tuple[list[tuple[int, int]], Formulas]:
+    """Derivatives of the rates by the states through which disturbances act: their places in the
+    Jacobian, and a function that computes them."""
     states = list(lane.rates)
-    number = _followed(lane)
-    found = [
+    number = _n_disturbed(lane)
+    slopes = [
         ((p, states.index(name)), slope)
         for p, state in enumerate(states[:number])
         for name, slope in derivatives(lane.rates[state], states[:number]).items()
     ]
-    return [place for place, _ in found], Formulas([slope for _, slope in found])
+    return [place for place, _ in slopes], Formulas([slope for _, slope in slopes])
 
 
 class Followers:
@@ -268,27 +268,27 @@ class Followers:
 
     def __init__(self, system: System, paths: Paths, random: list[str] | None = None) -> None:
         self.system, self.paths = system, paths
-        terms, lane = cast(list[Term], list(system.terms)), behind_leaders(system)
+        terms, lane = cast(list[Term], list(system.terms)), follower_formula(system)
         if lane is None:
             raise ConfigError(
                 "drivers who differ need a model of a lane whose law and effects are formulas of "
                 "the positions and speeds of the vehicles ahead; take drivers=none"
             )
-        self.lane, self.starts = lane, _followed(lane)
+        self.lane, self.starts = lane, _n_disturbed(lane)
         self.vector = ParameterVector(system)
         symbols = {(name, place): symbol for symbol, (name, place, _) in lane.owned.items()}
         self._symbols = [symbols[place] for place in self.vector.places]
         self.names = [symbol.replace("__", ".", 1) for symbol in self._symbols]
         low, high = self.vector.bounds
         row = self.vector.row.numpy()
-        own = f"{terms[0].name}."
-        self.law = np.array([name.startswith(own) for name in self.names], dtype=bool)
-        # a law without a bound leaves it open; its quantities have a sign
+        law_prefix = f"{terms[0].name}."
+        self.law = np.array([name.startswith(law_prefix) for name in self.names], dtype=bool)
+        # a positive quantity of a law without a bound has a sign
         self.logs = ((low >= 0) | (self.law & np.isinf(low))) & (row > 0)
         self.random = np.array([self.names.index(name) for name in random or []], dtype=int)
         self.start = self.at(row)
-        least = 1e-3 * np.abs(row)
-        self.low, self.high = self.at(np.maximum(low, least * self.logs)), self.at(high)
+        smallest = 1e-3 * np.abs(row)
+        self.low, self.high = self.at(np.maximum(low, smallest * self.logs)), self.at(high)
         inputs = inputs_of(terms, lane, system.scene(paths.batch))
         self._fixed: dict[str, Any] = {n: v[:, 0].double().numpy() for n, v in inputs.items()}
         self._fixed |= {
@@ -296,23 +296,25 @@ class Followers:
             "dt": 2 * paths.half,
             "second": paths.second,
         }
-        known = {name: value.detach().double() for name, value in own_values(terms, lane).items()}
-        values = values_of(lane, known)
+        constants = {
+            name: value.detach().double() for name, value in own_values(terms, lane).items()
+        }
+        values = values_of(lane, constants)
         self._fixed |= {s: float(v) for s, v in zip(lane.owned, values, strict=True)}
         self._rates = Formulas(list(lane.rates.values()))
         self._starts = Formulas(list(lane.starts.values())) if lane.starts else None
 
     @property
-    def that_may_differ(self) -> list[str]:
+    def may_differ(self) -> list[str]:
         """Names of the law's parameters that are varied in logarithms."""
-        own = zip(self.names, self.logs & self.law, strict=True)
-        return [name for name, differs in own if differs]
+        flags = zip(self.names, self.logs & self.law, strict=True)
+        return [name for name, differs in flags if differs]
 
-    def behind(self, paths: Paths) -> Followers:
-        """The same model of other paths of the same followers."""
-        found = copy.copy(self)
-        found.paths = paths
-        return found
+    def with_paths(self, paths: Paths) -> Followers:
+        """The same model with other paths of the same followers."""
+        model = copy.copy(self)
+        model.paths = paths
+        return model
 
     def at(self, row: np.ndarray) -> np.ndarray:
         """Parameters in the scales in which they are varied."""
@@ -330,162 +332,174 @@ class Followers:
         Args:
             theta: ``(R, P, F)`` parameters.
             start: ``(R, H, F)`` deviations of the first H states at the start, from what was
-                measured and from what terms begin with.
-            pushed: what is added to the highest rate.
+                measured and from the initial states of terms.
+            pushed: the push on the highest rate.
         """
         paths, order = self.paths, self.lane.order
-        given = self._given(theta)
+        fixed = self._constants(theta)
 
         def rate(t: float, y: np.ndarray) -> np.ndarray:
-            at = round(t / paths.half)
-            values = {**given, **dict(zip(self.lane.rates, y, strict=True)), "t": t}
-            found = np.empty_like(y)
-            rates = self._rates({**values, **_named(paths.ahead[at])})
-            for own, one in zip(found, rates, strict=True):
-                own[...] = one
+            initial_values = round(t / paths.half)
+            values = {**fixed, **dict(zip(self.lane.rates, y, strict=True)), "t": t}
+            rate_values = np.empty_like(y)
+            rates = self._rates({**values, **_ahead_symbols(paths.ahead[initial_values])})
+            for target, part in zip(rate_values, rates, strict=True):
+                target[...] = part
             if pushed is not None:
-                found[order - 1] += pushed(at, y, found)
-            return found
+                rate_values[order - 1] += pushed(initial_values, y, rate_values)
+            return rate_values
 
         shape = len(theta), len(paths.agent)
-        begin = np.stack([np.broadcast_to(one, shape) for one in paths.start[:order]])
-        begin += start.transpose(1, 0, 2)[:order]
+        initial = np.stack([np.broadcast_to(part, shape) for part in paths.start[:order]])
+        initial += start.transpose(1, 0, 2)[:order]
         if self._starts is not None:
-            at = {**given, "x": begin[0], "v": begin[-1], "t": 0.0, **_named(paths.ahead[0])}
+            initial_values = {
+                **fixed,
+                "x": initial[0],
+                "v": initial[-1],
+                "t": 0.0,
+                **_ahead_symbols(paths.ahead[0]),
+            }
             if order == 1:
-                at["v"] = np.broadcast_to(paths.start[1], shape)
-            added = [np.broadcast_to(one, shape) for one in self._starts(at)]
-            begin = np.concatenate([begin, np.stack(added)])
-            begin[order : start.shape[1]] += start.transpose(1, 0, 2)[order:]
+                initial_values["v"] = np.broadcast_to(paths.start[1], shape)
+            term_states = [np.broadcast_to(part, shape) for part in self._starts(initial_values)]
+            initial = np.concatenate([initial, np.stack(term_states)])
+            initial[order : start.shape[1]] += start.transpose(1, 0, 2)[order:]
         with np.errstate(all="ignore"):
-            return simulated(rate, begin, paths.dt, paths.x.shape[1], 2 * paths.half + 1e-9)
+            return simulated(rate, initial, paths.dt, paths.x.shape[1], 2 * paths.half + 1e-9)
 
-    def _given(self, theta: np.ndarray) -> dict[str, Any]:
-        """What does not change in runs with parameters ``(R, P, F)``."""
+    def _constants(self, theta: np.ndarray) -> dict[str, Any]:
+        """The constants of runs with parameters ``(R, P, F)``."""
         natural = self.natural(theta.transpose(0, 2, 1)).transpose(2, 0, 1)
         return {**self._fixed, **dict(zip(self._symbols, natural, strict=True))}
 
     def spread(self, theta: np.ndarray, agents: np.ndarray) -> np.ndarray:
         """``(P, F)`` parameters of each follower."""
-        found = np.repeat(theta[:, None], len(self.paths.agent), 1)
+        parameters = np.repeat(theta[:, None], len(self.paths.agent), 1)
         if agents.size:
-            found[self.random] += agents[self.paths.agent].T
-        return found
+            parameters[self.random] += agents[self.paths.agent].T
+        return parameters
 
     def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
         paths, order = self.paths, self.lane.order
-        own, number, several = self.spread(theta, agents), len(theta), self.starts
-        begin = start.T if start.size else np.zeros((several, len(paths.agent)))
-        runs = np.repeat(own[None], 1 + 2 * (number + several), 0)
-        begins = np.repeat(begin[None], len(runs), 0)
-        for p in range(number):
+        parameters, n_parameters, n_starts = self.spread(theta, agents), len(theta), self.starts
+        initial = start.T if start.size else np.zeros((n_starts, len(paths.agent)))
+        runs = np.repeat(parameters[None], 1 + 2 * (n_parameters + n_starts), 0)
+        initials = np.repeat(initial[None], len(runs), 0)
+        for p in range(n_parameters):
             runs[1 + 2 * p, p] += DIFFERENCE
             runs[2 + 2 * p, p] -= DIFFERENCE
-        for h in range(several):
-            begins[1 + 2 * (number + h), h] += START_DIFFERENCE
-            begins[2 + 2 * (number + h), h] -= START_DIFFERENCE
-        states = self.simulate(runs, begins)
+        for h in range(n_starts):
+            initials[1 + 2 * (n_parameters + h), h] += START_DIFFERENCE
+            initials[2 + 2 * (n_parameters + h), h] -= START_DIFFERENCE
+        states = self.simulate(runs, initials)
         x = states[:, 0].transpose(1, 2, 0)  # (R, F, K)
         higher, lower = x[1::2], x[2::2]
-        step = np.repeat([DIFFERENCE, START_DIFFERENCE], [number, several])
+        step = np.repeat([DIFFERENCE, START_DIFFERENCE], [n_parameters, n_starts])
         columns = ((higher - lower) / (2 * step[:, None, None])).transpose(1, 2, 0)
-        fixed, first = columns[..., :number], columns[..., number:]
+        fixed, by_start = columns[..., :n_parameters], columns[..., n_parameters:]
         random = fixed[..., self.random]
         residual = paths.x - x[0]
         if agents.size:
             residual = residual + np.einsum("fkq,fq->fk", random, agents[paths.agent])
         if start.size:
-            residual = residual + np.einsum("fkh,fh->fk", first, start)
-        moved, after = self.linear(own, states[:, :, 0])
-        forced = np.ascontiguousarray(after[..., order - 1])
+            residual = residual + np.einsum("fkh,fh->fk", by_start, start)
+        transition, by_forcing = self.linear(parameters, states[:, :, 0])
+        forced = np.ascontiguousarray(by_forcing[..., order - 1])
         return Linearised(
             residual=residual,
             fixed=fixed,
             random=random,
-            start=first,
-            seen=paths.seen,
+            start=by_start,
+            observed=paths.observed,
             agent=paths.agent,
-            step=moved,
+            step=transition,
             forced=forced,
             dt=paths.dt,
         )
 
-    def rates(self, own: np.ndarray, states: np.ndarray) -> np.ndarray:
+    def rates(self, parameters: np.ndarray, states: np.ndarray) -> np.ndarray:
         """``(M, K, F)`` rates along a run.
 
         Args:
-            own: ``(P, F)`` parameters of each follower. states: ``(K, M, F)`` of the run.
+            parameters: ``(P, F)`` parameters of each follower. states: ``(K, M, F)`` of the run.
         """
         with np.errstate(all="ignore"):
-            found = self._rates(self._along(own, states))
-        return np.stack([np.broadcast_to(one, states[:, 0].shape) for one in found])
+            rates = self._rates(self._symbols_along(parameters, states))
+        return np.stack([np.broadcast_to(rate, states[:, 0].shape) for rate in rates])
 
-    def _along(self, own: np.ndarray, states: np.ndarray) -> dict[str, Any]:
-        """What formulas name along a run."""
+    def _symbols_along(self, parameters: np.ndarray, states: np.ndarray) -> dict[str, Any]:
+        """The formulas' symbols along a run."""
         times = self.paths.dt * np.arange(len(states))
         return {
-            **self._given(own[None]),
+            **self._constants(parameters[None]),
             **dict(zip(self.lane.rates, states.transpose(1, 0, 2), strict=True)),
             "t": times[:, None],
-            **_named(self.paths.ahead_at_samples.swapaxes(0, 1)),
+            **_ahead_symbols(self.paths.ahead_at_samples.swapaxes(0, 1)),
         }
 
-    def linear(self, own: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linear(self, parameters: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The linear response along a run by the trapezoidal rule, of the M states of motion and
-        of a few that terms remember.
+        of memory.
 
         Args:
-            own, states: as of :meth:`rates`.
+            parameters, states: as of :meth:`rates`.
 
         Returns:
             Two arrays ``(F, K - 1, M, M)``: the states after a sampling interval by those before,
             and by the sum of the changes of their rates at both ends.
         """
         paths, lane = self.paths, self.lane
-        which, function = _slopes(lane)
-        size = max([lane.order, *(max(place) + 1 for place in which)])
+        entries, slopes = _jacobian(lane)
+        size = max([lane.order, *(max(place) + 1 for place in entries)])
         matrix = np.zeros((len(states), len(paths.agent), size, size))
         with np.errstate(all="ignore"):
-            for (p, q), value in zip(which, function(self._along(own, states)), strict=True):
+            for (p, q), value in zip(
+                entries, slopes(self._symbols_along(parameters, states)), strict=True
+            ):
                 matrix[..., p, q] = np.broadcast_to(value, matrix.shape[:2])
-        # a linearisation that blows up describes no disturbance
+        # the linearisation is only valid while it does not diverge
         matrix = np.clip(np.nan_to_num(matrix), -1 / paths.dt, 1 / paths.dt)
-        step, after = (one.numpy().swapaxes(0, 1) for one in trapezoidal(matrix, paths.dt))
-        return np.ascontiguousarray(step), np.ascontiguousarray(paths.dt / 2 * after)
+        step, by_forcing = (
+            matrices.numpy().swapaxes(0, 1) for matrices in trapezoidal(matrix, paths.dt)
+        )
+        return np.ascontiguousarray(step), np.ascontiguousarray(paths.dt / 2 * by_forcing)
 
-    def drawn(self, found: Estimate, draw: Draw) -> Paths:
-        """Paths that the estimated model would have had.
+    def simulated_paths(self, estimate: Estimate, draw: Draw) -> Paths:
+        """Simulated measurements of the estimated model (parametric bootstrap).
 
         Args:
-            found: an estimate of this model, with pushes ``sigma``, ``tau``.
+            estimate: of this model, with pushes ``sigma``, ``tau``.
             draw: of deviations of drivers, pushes and errors.
 
         Raises:
             SimulationError: drawn drivers blow up.
         """
-        paths, (sigma, tau) = self.paths, found.variances.noise
-        agents = found.variances.spread * draw(found.agents.shape)
+        paths, (sigma, tau) = self.paths, estimate.variances.noise
+        agents = estimate.variances.spread * draw(estimate.agents.shape)
         keep = math.exp(-paths.half / tau)
         shape = len(paths.ahead), len(paths.agent)
-        fresh = sigma * draw(shape)
-        pushes = fresh.copy()
+        innovations = sigma * draw(shape)
+        pushes = innovations.copy()
         for k in range(1, shape[0]):
-            pushes[k] = keep * pushes[k - 1] + math.sqrt(1 - keep**2) * fresh[k]
-        own = self.spread(found.theta, agents)
-        x = self.simulate(own[None], found.start.T[None], lambda at, *_: pushes[at])[:, 0, 0].T
-        if not np.isfinite(x[paths.seen]).all():
+            pushes[k] = keep * pushes[k - 1] + math.sqrt(1 - keep**2) * innovations[k]
+        parameters = self.spread(estimate.theta, agents)
+        x = self.simulate(parameters[None], estimate.start.T[None], lambda at, *_: pushes[at])[
+            :, 0, 0
+        ].T
+        if not np.isfinite(x[paths.observed]).all():
             raise SimulationError("followers with drawn parameters and disturbances blow up")
         return paths.remeasured(x, draw)
 
 
 def score_bias(
-    model: Followers, noise: Noise, found: Estimate, rng: np.random.Generator, pairs: int = 4
+    model: Followers, noise: Noise, estimate: Estimate, rng: np.random.Generator, pairs: int = 4
 ) -> np.ndarray:
-    """``(P,)`` by how much estimates are off, by simulation.
+    """``(P,)`` the bias of the estimates, by simulation.
 
-    Data that the estimated model draws are scored at the parameters that they were drawn with. The
-    mean of a correct score is zero; the linearisation at the modes and the errors of smoothed
-    leaders move it. Draws come in pairs of opposite signs, in which the linear part of the score
+    Simulated data of the estimated model are scored at the parameters that they were simulated
+    with. The mean of a correct score is zero; the linearisation at the modes and the errors of
+    smoothed leaders shift it. Draws are antithetic pairs, in which the linear part of the score
     cancels.
 
     Args:
@@ -493,15 +507,17 @@ def score_bias(
     """
     changes = []
     for _ in range(pairs):
-        for draw in opposite(int(rng.integers(2**63))):
-            paths = model.drawn(found, draw)
-            again = fit_deviations(model.behind(paths), noise, found.theta, found.variances)
-            changes.append(again.marginal.change)
+        for draw in antithetic_draws(int(rng.integers(2**63))):
+            paths = model.simulated_paths(estimate, draw)
+            modes = fit_deviations(
+                model.with_paths(paths), noise, estimate.theta, estimate.variances
+            )
+            changes.append(modes.marginal.change)
     return np.asarray(np.mean(changes, 0))
 
 
-def opposite(seed: int) -> list[Draw]:
-    """Two draws of opposite signs, in which all that is linear in them cancels."""
+def antithetic_draws(seed: int) -> list[Draw]:
+    """An antithetic pair of draws: antithetic_draws signs, so that linear terms cancel."""
     return [partial(_signed, np.random.default_rng(seed), sign) for sign in (1.0, -1.0)]
 
 

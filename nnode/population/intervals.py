@@ -1,8 +1,8 @@
-"""How sure the estimates of a population are.
+"""Confidence intervals of a population's estimates.
 
-Those of parameters follow from how clusters of drivers differ (CR2, weighted by the marginal
-covariance). They hold where the model of the drivers or of their pushes is wrong. Those of standard
-deviations follow from the curvature of the marginal likelihood over their logarithms (Wald).
+The intervals of parameters are cluster-robust (CR2, weighted by the marginal covariance): they are
+valid even if the model of drivers or pushes is wrong. The intervals of standard deviations are Wald
+intervals from the curvature of the marginal likelihood over their logarithms.
 """
 
 from __future__ import annotations
@@ -17,80 +17,85 @@ from nnode.model.term import short_names
 from nnode.population.drivers import Population
 from nnode.population.likelihood import Products, marginal
 
-#: An estimate is at a bound where its logarithm, or the parameter itself, is nearer to it.
+#: An estimate is at a bound if its logarithm, or the parameter itself, is closer to it than this.
 NEAR = 1e-3
 #: Difference of logarithms of standard deviations for second derivatives.
 DIFFERENCE = 1e-2
 
 
-def at_bounds(found: Population) -> tuple[np.ndarray, np.ndarray]:
-    """``(P,)`` twice: which parameters are at the lower and at the upper end of what is allowed."""
-    theta, model = found.estimate.theta, found.model
+def at_bounds(population: Population) -> tuple[np.ndarray, np.ndarray]:
+    """``(P,)`` twice: which parameters are at their lower and at their upper bound."""
+    theta, model = population.estimate.theta, population.model
     return theta <= model.low + NEAR, theta >= model.high - NEAR
 
 
-def influence(found: Population, cluster: np.ndarray) -> tuple[ClusterInfluence, np.ndarray]:
-    """Of clusters of drivers on the parameters that are at no bound, and ``(P,)`` which these are.
+def influence(population: Population, cluster: np.ndarray) -> tuple[ClusterInfluence, np.ndarray]:
+    """The influence of clusters of drivers on the free parameters, and ``(P,)`` which are free.
 
     Args:
-        cluster: ``(D,)`` which cluster a driver belongs to.
+        cluster: ``(D,)`` the driver's cluster.
     """
-    low, high = at_bounds(found)
+    low, high = at_bounds(population)
     free = ~(low | high)
     member = (np.unique(cluster)[:, None] == cluster).astype(float)
-    products = np.tensordot(member, found.marginal.agents, 1)[:, 1:]
+    products = np.tensordot(member, population.marginal.agents, 1)[:, 1:]
     grams = products[:, :, 1:]
-    scores = products[:, :, 0] - grams @ found.marginal.change
+    scores = products[:, :, 0] - grams @ population.marginal.change
     return ClusterInfluence(grams[:, free][:, :, free], scores[:, free]), free
 
 
-def deviation_intervals(found: Population) -> np.ndarray:
+def deviation_intervals(population: Population) -> np.ndarray:
     """``(V, 2)`` intervals of 95 % of the standard deviations and times, in the order of
-    :attr:`nnode.population.estimate.Variances.row`; NaN at a bound, or where the likelihood is not
-    curved."""
-    variances, data = found.estimate.variances, found.estimate.data
-    logs, low, high = (np.log(one) for one in (variances.row, variances.low, variances.high))
+    :attr:`nnode.population.estimate.Variances.row`; NaN at a bound, or if the likelihood is not
+    concave."""
+    variances, data = population.estimate.variances, population.estimate.data
+    logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
     free = np.flatnonzero((logs > low + NEAR) & (logs < high - NEAR))
     products: dict[tuple[float, ...], Products] = {}
 
     def loglik(move: np.ndarray) -> float:
         row = logs.copy()
         row[free] += move
-        there = variances.filled(np.exp(row))
-        key = tuple(there.noise)
+        shifted = variances.filled(np.exp(row))
+        key = tuple(shifted.noise)
         if key not in products:
-            products[key] = found.noise.products(data, there.noise)
-        return marginal(data, products[key], there.spread, there.start).loglik
+            products[key] = population.noise.products(data, shifted.noise)
+        return marginal(data, products[key], shifted.spread, shifted.start).loglik
 
     steps, size = DIFFERENCE * np.eye(len(free)), len(free)
-    curved = np.zeros((size, size))
+    curvature = np.zeros((size, size))
     for i in range(size):
         for j in range(i + 1):
-            both, apart = steps[i] + steps[j], steps[i] - steps[j]
-            cross = loglik(both) + loglik(-both) - loglik(apart) - loglik(-apart)
-            curved[i, j] = curved[j, i] = -cross / (4 * DIFFERENCE**2)
+            sum_step, difference_step = steps[i] + steps[j], steps[i] - steps[j]
+            cross = (
+                loglik(sum_step)
+                + loglik(-sum_step)
+                - loglik(difference_step)
+                - loglik(-difference_step)
+            )
+            curvature[i, j] = curvature[j, i] = -cross / (4 * DIFFERENCE**2)
     half = np.full(len(logs), np.nan)
-    if size and np.linalg.eigvalsh(curved).min() > 0:
-        half[free] = norm.ppf(0.5 + LEVEL / 2) * np.sqrt(np.diag(np.linalg.inv(curved)))
+    if size and np.linalg.eigvalsh(curvature).min() > 0:
+        half[free] = norm.ppf(0.5 + LEVEL / 2) * np.sqrt(np.diag(np.linalg.inv(curvature)))
     return np.exp(logs[:, None] + half[:, None] * np.array([-1.0, 1.0]))
 
 
-def variations(found: Population) -> dict[str, dict[str, Any]]:
-    """Standard deviations of drivers' parameters (%), of pushes and of errors, and the time that
-    pushes last, by name: ``estimate``, the interval from ``lower`` to ``upper``, ``unit``,
-    ``at_bound`` (``low``, ``high`` or empty), and the median ``shrinkage`` over drivers. NaN where
-    the data tell none."""
-    variances, order = found.estimate.variances, found.model.lane.order
-    short = short_names(found.model.names)
-    names = ["push", "push_time", *(short[name] for name in found.random)]
-    units = ["m/s" if order == 1 else "m/s²", "s", *["%"] * len(found.random)]
-    factor = np.array([1.0, 1.0, *[100.0] * len(found.random)])
+def variations(population: Population) -> dict[str, dict[str, Any]]:
+    """Standard deviations of drivers' parameters (%), of pushes and of errors, and the correlation
+    time of pushes, by name: ``estimate``, the interval from ``lower`` to ``upper``, ``unit``,
+    ``at_bound`` (``low``, ``high`` or empty), and the median ``shrinkage`` over drivers. NaN if
+    they are not estimated."""
+    variances, order = population.estimate.variances, population.model.lane.order
+    short = short_names(population.model.names)
+    names = ["push", "push_time", *(short[name] for name in population.random)]
+    units = ["m/s" if order == 1 else "m/s²", "s", *["%"] * len(population.random)]
+    factor = np.array([1.0, 1.0, *[100.0] * len(population.random)])
     number = len(names)  # the standard deviations of starts come after these
     values, lowest, highest = (
         row[:number] for row in (variances.row, variances.low, variances.high)
     )
-    ends = deviation_intervals(found)[:number]
-    left = [np.nan, np.nan, *np.median(found.marginal.shrinkage, 0)]
+    ends = deviation_intervals(population)[:number]
+    shrinkage = [np.nan, np.nan, *np.median(population.marginal.shrinkage, 0)]
     table: dict[str, dict[str, Any]] = {}
     for k, name in enumerate(names):
         bound = "low" if values[k] <= lowest[k] * (1 + NEAR) else ""
@@ -102,10 +107,10 @@ def variations(found: Population) -> dict[str, dict[str, Any]]:
             "upper": upper,
             "unit": units[k],
             "at_bound": bound,
-            "shrinkage": float(left[k]),
+            "shrinkage": float(shrinkage[k]),
         }
     table["measurement"] = {
-        "estimate": found.noise.error,
+        "estimate": population.noise.error,
         "lower": np.nan,
         "upper": np.nan,
         "unit": "m",

@@ -1,4 +1,4 @@
-"""The marginal likelihood of agents who differ, under disturbances that last.
+"""The marginal likelihood of a mixed-effects model with autocorrelated disturbances.
 
 Linearised at parameters theta, at the deviations b of each agent and at the deviations h of each
 start, the samples y of a segment are
@@ -7,8 +7,8 @@ start, the samples y of a segment are
 
 where b* ~ N(0, Omega) and h* ~ N(0, S) with diagonal Omega and S, d is the response to a push e(t),
 an Ornstein-Uhlenbeck process of standard deviation sigma and correlation time tau, and eps are
-independent errors of measurement. A Kalman filter whitens all columns by the covariance of d + eps;
-b* and h* then only take products of whitened columns (Woodbury's identity).
+independent measurement errors. A Kalman filter whitens all columns by the covariance of d + eps;
+b* and h* are then integrated out with products of whitened columns (Woodbury's identity).
 
 Source:
     Lindstrom & Bates 1990, Biometrics 46 (the linearisation at the modes);
@@ -38,11 +38,11 @@ class Linearised:
         fixed: ``(S, K, P)`` X, by parameters.
         random: ``(S, K, Q)`` Z, by the agent's deviations.
         start: ``(S, K, H)`` by the deviations of the segment's start; H may be 0.
-        seen: ``(S, K)`` True where there is a sample.
+        observed: ``(S, K)`` True where there is a sample.
         agent: ``(S,)`` number of the segment's agent, from 0.
-        step: ``(S, K - 1, M, M)`` the states of the linear response after a sampling interval, by
-            those before; None: nothing is pushed.
-        forced: ``(S, K - 1, M)`` the same by the sum of the push at both ends.
+        step: ``(S, K - 1, M, M)`` transition matrices of the linear response over a sampling
+            interval; None: there are no pushes.
+        forced: ``(S, K - 1, M)`` its derivatives by the sum of the push at both ends.
         dt: sampling interval, s.
     """
 
@@ -50,7 +50,7 @@ class Linearised:
     fixed: np.ndarray
     random: np.ndarray
     start: np.ndarray
-    seen: np.ndarray
+    observed: np.ndarray
     agent: np.ndarray
     step: np.ndarray | None = None
     forced: np.ndarray | None = None
@@ -59,8 +59,8 @@ class Linearised:
     @cached_property
     def columns(self) -> np.ndarray:
         """``(S, K, 1 + P + Q + H)`` w, X, Z and H; 0 where there is no sample."""
-        every = [self.residual[..., None], self.fixed, self.random, self.start]
-        return np.where(self.seen[..., None], np.concatenate(every, -1), 0.0)
+        blocks = [self.residual[..., None], self.fixed, self.random, self.start]
+        return np.where(self.observed[..., None], np.concatenate(blocks, -1), 0.0)
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Products:
         """The products after the last columns have been integrated out.
 
         Args:
-            deviations: ``(Q,)`` standard deviations of their factors.
+            deviations: ``(Q,)`` standard deviations of the coefficients of these columns.
         """
         q = len(deviations)
         if not q:
@@ -87,16 +87,16 @@ class Products:
         root, moved = self._inner(deviations)
         half = np.linalg.solve(root, moved)
         n = self.gram.shape[-1] - q
-        rest = self.gram[:, :n, :n] - half.transpose(0, 2, 1) @ half
+        reduced_gram = self.gram[:, :n, :n] - half.transpose(0, 2, 1) @ half
         logdet = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
-        return Products(rest, self.logdet + logdet)
+        return Products(reduced_gram, self.logdet + logdet)
 
     def factors(self, deviations: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """``(S, Q)`` expected factors of the last columns, and their ``(S, Q)`` variances.
+        """``(S, Q)`` posterior means of the last columns' coefficients, and their variances.
 
         Args:
-            deviations: ``(Q,)`` their standard deviations.
-            weights: ``(S, C - Q)`` of the other columns in what is explained.
+            deviations: ``(Q,)`` their prior standard deviations.
+            weights: ``(S, C - Q)`` weights of the other columns, whose sum is the response.
         """
         root, moved = self._inner(deviations)
         inverse = np.linalg.inv(root)
@@ -113,7 +113,7 @@ class Products:
         return Products(gram, np.bincount(group, self.logdet, number))
 
     def _inner(self, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cholesky's factor of 1 + D Z'Z D, and D times the products with the other columns."""
+        """The Cholesky factor of 1 + D Z'Z D, and D times the products with the other columns."""
         n = self.gram.shape[-1] - len(deviations)
         inner = deviations[:, None] * self.gram[:, n:, n:] * deviations
         root = np.linalg.cholesky(np.eye(len(deviations)) + inner)
@@ -121,13 +121,13 @@ class Products:
 
 
 class Noise(Protocol):
-    """What differs from sample to sample."""
+    """The residual covariance of a segment."""
 
     def products(self, data: Linearised, values: np.ndarray) -> Products:
         """Products of the columns, whitened.
 
         Args:
-            values: of its parameters, all of them positive.
+            values: positive values of its parameters.
         """
         white, logdet = self.whitened(data, data.columns, values)
         return Products(white.transpose(0, 2, 1) @ white, logdet)
@@ -151,14 +151,14 @@ class WhiteNoise(Noise):
     def whitened(
         self, data: Linearised, columns: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        return columns / values[0], 2 * np.log(values[0]) * data.seen.sum(1)
+        return columns / values[0], 2 * np.log(values[0]) * data.observed.sum(1)
 
 
 @dataclass(frozen=True)
 class PushNoise(Noise):
-    """Pushes on the highest rate, and errors of measurement.
+    """Pushes on the highest rate (an Ornstein-Uhlenbeck process), and measurement errors.
 
-    The parameters are the standard deviation of the pushes and the time that they last, s.
+    The parameters are the standard deviation of the pushes and their correlation time, s.
 
     Attributes:
         error: standard deviation of the errors of measurement, m.
@@ -171,32 +171,32 @@ class PushNoise(Noise):
     ) -> tuple[np.ndarray, np.ndarray]:
         assert data.step is not None
         assert data.forced is not None
-        found: tuple[np.ndarray, np.ndarray] = _filtered(
+        whitened: tuple[np.ndarray, np.ndarray] = _filtered(
             np.ascontiguousarray(columns),
-            data.seen,
+            data.observed,
             data.step,
             data.forced,
             values[0],
             np.exp(-data.dt / values[1]),
             self.error**2,
         )
-        return found
+        return whitened
 
 
 @njit(cache=True, nogil=True)
 def _filtered(
     columns: np.ndarray,
-    seen: np.ndarray,
+    observed: np.ndarray,
     step: np.ndarray,
     forced: np.ndarray,
     sigma: float,
     keep: float,
     variance: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Columns that a Kalman filter has whitened, and logarithms of determinants.
+    """Columns whitened by a Kalman filter, and log determinants.
 
-    The state is (d, e); the first element of d is measured. All arrays of a step are allocated
-    once: allocations would take most of the time.
+    The state is (d, e); the first element of d is measured. The arrays of a step are allocated
+    once, because allocations would take most of the time.
     """
     number, samples, width = columns.shape
     m = step.shape[-1]
@@ -217,7 +217,7 @@ def _filtered(
                     for j in range(m):
                         forward[i, j] = step[s, k - 1, i, j]
                 _predict(mean, spread, forward, noise, sigma**2 * (1 - keep**2), before, half)
-            if seen[s, k]:
+            if observed[s, k]:
                 logdet[s] += _condition(mean, spread, columns[s, k], variance, white[s, k], gain)
     return white, logdet
 
@@ -288,13 +288,13 @@ def _condition(
 
 
 class Whitening:
-    """Turns columns of samples into such of independent ones: the symmetric root of the inverse of
-    the covariance by deviations of agents and of starts, after that of :class:`Noise`.
+    """Whitens columns of samples by the whole covariance: first by that of :class:`Noise`, then by
+    the symmetric inverse square roots for the random effects of starts and of agents.
 
-    Products of columns that it has turned are those by the inverse of the whole covariance.
+    Products of whitened columns are products by the inverse of the whole covariance.
 
     Args:
-        data: linearised samples. noise: what differs from sample to sample.
+        data: linearised samples. noise: the residual covariance.
         values: of the noise's parameters.
         spread: ``(Q,)`` standard deviations of the agents' deviations.
         start: ``(H,)`` of the starts' deviations.
@@ -320,8 +320,8 @@ class Whitening:
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         """``(S, K, C)`` of columns ``(S, K, C)``; 0 where there is no sample."""
-        seen = self._data.seen[..., None]
-        white, _ = self._noise.whitened(self._data, np.where(seen, columns, 0.0), self._values)
+        observed = self._data.observed[..., None]
+        white, _ = self._noise.whitened(self._data, np.where(observed, columns, 0.0), self._values)
         for column, inner, group in self._parts:
             products = np.zeros((len(inner), column.shape[-1], columns.shape[-1]))
             np.add.at(products, group, column.transpose(0, 2, 1) @ white)
@@ -329,14 +329,14 @@ class Whitening:
         return white
 
     def _add(self, column: np.ndarray, group: np.ndarray) -> None:
-        """Deviations that columns ``(S, K, Q)`` of variance 1 make in groups of segments."""
+        """Add random effects of variance 1 with columns ``(S, K, Q)``, in groups of segments."""
         gram = np.zeros((int(group.max()) + 1, *[column.shape[-1]] * 2))
         np.add.at(gram, group, column.transpose(0, 2, 1) @ column)
-        size, way = np.linalg.eigh(gram)
+        values, vectors = np.linalg.eigh(gram)
         # (1 + B B')^(-1/2) = 1 - B M B', M of the eigenvalues s of B'B: (1 - (1 + s)^(-1/2)) / s
-        root = np.sqrt(1 + np.maximum(size, 0.0))
+        root = np.sqrt(1 + np.maximum(values, 0.0))
         share = 1 / (root * (1 + root))
-        self._parts.append((column, (way * share[:, None]) @ way.transpose(0, 2, 1), group))
+        self._parts.append((column, (vectors * share[:, None]) @ vectors.transpose(0, 2, 1), group))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -344,14 +344,15 @@ class Marginal:
     """The marginal likelihood of linearised samples.
 
     Attributes:
-        loglik: logarithm of the likelihood, of the restricted one if that was asked for.
-        each: ``(D,)`` the agents' terms of it, without that of the restriction.
-        change: ``(P,)`` of the parameters, by generalised least squares.
+        loglik: log likelihood, or the restricted one if requested.
+        each: ``(D,)`` the agents' terms of it, without the REML term.
+        change: ``(P,)`` change of the parameters, by generalised least squares.
         information: ``(P, P)`` X' V^-1 X.
         agents: ``(D, 1 + P, 1 + P)`` products of w and X by V^-1, of the agents.
-        deviations: ``(D, Q)`` expected deviations b of the agents; variances: their variances.
-        shrinkage: ``(D, Q)`` share of the variance between agents that the data leave.
-        start: ``(S, H)`` expected deviations of the starts.
+        deviations: ``(D, Q)`` posterior means of the agents' deviations b; variances: their
+            posterior variances.
+        shrinkage: ``(D, Q)`` posterior over prior variance of the agents' deviations.
+        start: ``(S, H)`` posterior means of the starts' deviations.
     """
 
     loglik: float
@@ -373,47 +374,47 @@ def marginal(
     *,
     restricted: bool = False,
 ) -> Marginal:
-    """The marginal likelihood, and what follows from it.
+    """The marginal likelihood and the quantities derived from it.
 
     Args:
         data: the samples. segments: their columns' products by :class:`Noise`.
         spread: ``(Q,)`` standard deviations of the agents' deviations.
         start: ``(H,)`` of the starts' deviations.
-        restricted: whether the parameters' loss of degrees of freedom counts (REML).
+        restricted: whether to use the restricted likelihood (REML).
     """
     number = int(data.agent.max()) + 1
     without_start = segments.without(start)
     agents = without_start.summed(data.agent, number)
-    rest = agents.without(spread)
-    total = rest.gram.sum(0)
+    without_agents = agents.without(spread)
+    total = without_agents.gram.sum(0)
     information, score = total[1:, 1:], total[1:, 0]
     change = flat_solve(information, score)
     weights = np.concatenate([[1.0], -change])
-    square = np.einsum("i,dij,j->d", weights, rest.gram, weights)
-    seen = np.bincount(data.agent, data.seen.sum(1), number)
-    each = -0.5 * (rest.logdet + square + seen * np.log(2 * np.pi))
+    square = np.einsum("i,dij,j->d", weights, without_agents.gram, weights)
+    observed = np.bincount(data.agent, data.observed.sum(1), number)
+    each = -0.5 * (without_agents.logdet + square + observed * np.log(2 * np.pi))
     loglik = float(each.sum())
     if restricted and len(change):
         loglik += 0.5 * (len(change) * np.log(2 * np.pi) - np.linalg.slogdet(information)[1])
-    b, left = agents.factors(spread, np.tile(weights, (number, 1)))
-    every = np.concatenate([np.tile(weights, (len(data.agent), 1)), -b[data.agent]], 1)
-    h, _ = segments.factors(start, every)
+    b, posterior_variances = agents.factors(spread, np.tile(weights, (number, 1)))
+    all_weights = np.concatenate([np.tile(weights, (len(data.agent), 1)), -b[data.agent]], 1)
+    h, _ = segments.factors(start, all_weights)
     return Marginal(
         loglik=loglik,
         each=each,
         change=change,
         information=information,
-        agents=rest.gram,
+        agents=without_agents.gram,
         deviations=b,
-        variances=left,
-        shrinkage=left / spread**2,
+        variances=posterior_variances,
+        shrinkage=posterior_variances / spread**2,
         start=h,
     )
 
 
 def flat_solve(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """The solution of a symmetric system, 0 in directions that nothing depends on."""
+    """The solution of a symmetric system, 0 in its null space."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     inverse = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=FLAT, hermitian=True)
-    found: np.ndarray = inverse @ (vector / scale) / scale
-    return found
+    solution: np.ndarray = inverse @ (vector / scale) / scale
+    return solution

@@ -20,9 +20,9 @@ from nnode.app import nearest_law
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import EsimasOptions, TableOptions
-from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report import page
 from nnode.errors import ConfigError
 from nnode.model import System
@@ -318,7 +318,7 @@ def test_laws_are_compared_again_with_what_the_one_asked_for_lacks(
     """Behind a zone idm comes first, and imitates it well enough to need nothing; lin needs the
     zone, and with it comes first."""
 
-    def diagnose(system: System, *arguments: Any, **how: Any) -> Found:
+    def diagnose(system: System, *arguments: Any, **how: Any) -> DiagnosisOutcome:
         found = stand_in.diagnose(system, *arguments, **how)
         return found if system.order == 1 else dataclasses.replace(found, searched=system)
 

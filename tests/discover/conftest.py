@@ -10,9 +10,9 @@ import pytest
 
 from nnode.app.python.inputs import model_options
 from nnode.data.options import TableOptions
-from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs, read_inputs
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.model import build_model
 from tests.discover import stand_in
 from tests.discover.recorded import corridor, lane
@@ -27,7 +27,7 @@ class Case:
     model: dict[str, Any]
     inputs: Inputs
     options: DiscoverOptions
-    found: Found
+    found: DiagnosisOutcome
 
 
 def _case(folder: Path, domain: str, table: Path, walls: Path | None, model: Any) -> Case:

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Sequence
-from nnode.discover.found import Found, Simulation
-from nnode.discover.judge.sealed import defined
+from nnode.discover.judge.confirmation import defined
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.outcome import DiagnosisOutcome, Simulation
 from nnode.discover.report.deviation import simulate
 from nnode.discover.result import (
     Absence,
@@ -68,7 +68,7 @@ def diagnose(
     stages: object = None,
     nearer: object = None,
     hint: object = None,
-) -> Found:
+) -> DiagnosisOutcome:
     """Results that a right diagnosis of :mod:`tests.discover.recorded` would come to."""
     if os.environ.get(WAIT):
         Path(os.environ[WAIT]).write_text("")
@@ -109,7 +109,7 @@ def diagnose(
     floor = 0.0025 if traffic else 0.0002
     at = np.linspace(0, 1000, 12)
     near = np.exp(-(((at - 500) / 90) ** 2))
-    return Found(
+    return DiagnosisOutcome(
         diagnosis=Diagnosis(
             verdict="named",
             domain=system.domain,
@@ -180,8 +180,8 @@ def diagnose(
         base=base,
         extended=extended,
         searched=extended,
-        open=[i for i in range(len(sequences)) if i not in sealed],
-        sealed=sealed,
+        exploration=[i for i in range(len(sequences)) if i not in sealed],
+        confirmation=sealed,
         simulated=simulated,
     )
 

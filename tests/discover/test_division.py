@@ -34,9 +34,9 @@ def alone(number: int) -> list[Sequence]:
 
 def assert_sound(found: Division, sequences: list[Sequence]) -> None:
     """Every sequence once, no cluster on both sides, at least half of them open."""
-    assert sorted(found.open + found.sealed) == list(range(len(sequences)))
-    assert not set(found.label[found.open]) & set(found.label[found.sealed])
-    assert 0 < len(found.sealed) <= len(sequences) / 2
+    assert sorted(found.exploration + found.confirmation) == list(range(len(sequences)))
+    assert not set(found.label[found.exploration]) & set(found.label[found.confirmation])
+    assert 0 < len(found.confirmation) <= len(sequences) / 2
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -44,13 +44,17 @@ def test_five_of_sixteen_clusters_are_sealed_as_it_takes_to_confirm(seed: int) -
     sequences = alone(16)
     found = divide(sequences, DiscoverOptions(seed=seed))
     assert_sound(found, sequences)
-    assert (found.number(found.open), found.number(found.sealed), found.note) == (11, 5, "")
+    assert (found.number(found.exploration), found.number(found.confirmation), found.note) == (
+        11,
+        5,
+        "",
+    )
     again = divide(sequences, DiscoverOptions(seed=seed))
-    assert (again.open, again.sealed) == (found.open, found.sealed)
+    assert (again.exploration, again.confirmation) == (found.exploration, found.confirmation)
 
 
 def test_another_seed_seals_other_clusters() -> None:
-    drawn = {tuple(divide(alone(16), DiscoverOptions(seed=seed)).sealed) for seed in range(5)}
+    drawn = {tuple(divide(alone(16), DiscoverOptions(seed=seed)).confirmation) for seed in range(5)}
     assert len(drawn) > 1
 
 
@@ -64,8 +68,8 @@ def test_whole_clusters_are_sealed_but_never_more_than_half_of_the_sequences(see
     for share in (0.1, 0.3, 0.6, 0.9):
         found = divide(sequences, DiscoverOptions(seed=seed, sealed=share))
         assert_sound(found, sequences)
-        assert found.number([*found.open, *found.sealed]) == len(sizes)
-        assert found.number(found.sealed) <= max(round(share * len(sizes)), 1)
+        assert found.number([*found.exploration, *found.confirmation]) == len(sizes)
+        assert found.number(found.confirmation) <= max(round(share * len(sizes)), 1)
         assert found.note == ""
 
 
@@ -73,12 +77,12 @@ def test_one_cluster_alone_gives_a_block_of_time_and_says_so() -> None:
     # everybody is in two sequences: all of them hang together
     sequences = recorded(*[chr(200 + i) + chr(201 + i) for i in range(20)])
     found = divide(sequences, DiscoverOptions())
-    assert found.number(found.open) == found.number(found.sealed) == 1
+    assert found.number(found.exploration) == found.number(found.confirmation) == 1
     assert "sealed are not independent of the others" in found.note
-    first, last = min(found.sealed), max(found.sealed)
-    assert found.sealed == list(range(first, last + 1))
-    who = {agent for i in found.sealed for agent in sequences[i].agents}
-    assert not who & {agent for i in found.open for agent in sequences[i].agents}
+    first, last = min(found.confirmation), max(found.confirmation)
+    assert found.confirmation == list(range(first, last + 1))
+    who = {agent for i in found.confirmation for agent in sequences[i].agents}
+    assert not who & {agent for i in found.exploration for agent in sequences[i].agents}
 
 
 def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
@@ -97,9 +101,9 @@ def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
     for together, number in ((False, 32), (True, 16)):
         found = divide(sequences, DiscoverOptions(), together=together)
         assert_sound(found, sequences)
-        assert found.number([*found.open, *found.sealed]) == number
+        assert found.number([*found.exploration, *found.confirmation]) == number
         assert found.why.endswith("or are there at one time") == together
-    assert len(found.sealed) == 10
+    assert len(found.confirmation) == 10
 
 
 def test_the_gap_between_sequences_without_names_is_an_option() -> None:
@@ -113,7 +117,7 @@ def test_the_gap_between_sequences_without_names_is_an_option() -> None:
         for i in range(16)
     ]
     found = divide(sequences, DiscoverOptions(gap=3.0))
-    assert found.number(found.open) == 11
+    assert found.number(found.exploration) == 11
     assert "are closer than 3 s in time" in found.why
     assert divide(sequences, DiscoverOptions()).note  # 4 s apart, so one chain
 

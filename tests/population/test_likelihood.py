@@ -18,15 +18,15 @@ def example(seed: int, states: int) -> Linearised:
     """Three segments of two agents, some samples missing."""
     rng = np.random.default_rng(seed)
     segments, samples = 3, 12
-    seen = rng.random((segments, samples)) < 0.8
-    seen[1, 9:] = False
+    observed = rng.random((segments, samples)) < 0.8
+    observed[1, 9:] = False
     step = 0.9 * np.eye(states) + 0.05 * rng.normal(size=(segments, samples - 1, states, states))
     return Linearised(
         residual=rng.normal(size=(segments, samples)),
         fixed=rng.normal(size=(segments, samples, 2)),
         random=rng.normal(size=(segments, samples, 2)),
         start=rng.normal(size=(segments, samples, 1)),
-        seen=seen,
+        observed=observed,
         agent=np.array([0, 1, 0]),
         step=step,
         forced=rng.normal(size=(segments, samples - 1, states)),
@@ -63,9 +63,9 @@ def covariance(data: Linearised) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_filter_is_a_dense_gaussian(seed: int, states: int) -> None:
     data = example(seed, states)
-    seen = data.seen.ravel()
-    v = covariance(data)[np.ix_(seen, seen)]
-    x, w = data.fixed.reshape(-1, 2)[seen], data.residual.ravel()[seen]
+    observed = data.observed.ravel()
+    v = covariance(data)[np.ix_(observed, observed)]
+    x, w = data.fixed.reshape(-1, 2)[observed], data.residual.ravel()[observed]
     information = x.T @ np.linalg.solve(v, x)
     change = np.linalg.solve(information, x.T @ np.linalg.solve(v, w))
     loglik = multivariate_normal(np.zeros(len(w)), v).logpdf(w - x @ change)
@@ -82,8 +82,8 @@ def test_the_filter_is_a_dense_gaussian(seed: int, states: int) -> None:
     assert restricted.loglik == pytest.approx(loglik + loss, rel=1e-8)
     np.testing.assert_allclose(found.change, change, rtol=1e-8)
     np.testing.assert_allclose(found.information, information, rtol=1e-8)
-    agent = np.repeat(data.agent, data.seen.shape[1])[seen]
-    z, rest = data.random.reshape(-1, 2)[seen], np.linalg.solve(v, w - x @ change)
+    agent = np.repeat(data.agent, data.observed.shape[1])[observed]
+    z, rest = data.random.reshape(-1, 2)[observed], np.linalg.solve(v, w - x @ change)
     for d in range(2):
         own = z * (agent == d)[:, None]
         np.testing.assert_allclose(found.deviations[d], SPREAD**2 * (own.T @ rest), rtol=1e-7)

@@ -53,7 +53,7 @@ class Curves:
             fixed=fixed,
             random=fixed[..., self.random],
             start=np.zeros((*self.y.shape, 0)),
-            seen=np.ones(self.y.shape, dtype=bool),
+            observed=np.ones(self.y.shape, dtype=bool),
             agent=np.arange(len(self.y)),
         )
 

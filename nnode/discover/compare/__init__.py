@@ -1,1 +1,1 @@
-"""Which base law comes nearest, before anything is said to be missing."""
+"""Comparison of base laws, before effects are selected."""

@@ -1,10 +1,9 @@
-"""Base laws compared on clusters that their calibration left out: a wrong law is the commonest
-missing effect.
+"""Comparison of base laws by leave-one-cluster-out costs.
 
-Every law is calibrated to the positions of whole sequences, the best of them tells how residuals
-depend on each other in time, and all are calibrated once more to residuals that are whitened so:
-laws are compared by the same numbers. Their costs are those of clusters that a calibration left
-out. Where another law comes out best, it tells the whitening, and all are compared once more.
+Every law is calibrated to the positions of whole sequences. The whitening is fitted to the
+residuals of the best law, and all laws are recalibrated to residuals with this common whitening.
+Their costs are those of left-out clusters. If another law is then the best, the whitening is fitted
+to its residuals and the comparison is repeated.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.able import check_model, not_offered
 from nnode.discover.division import divide
-from nnode.discover.judge.confirm import engine_of, windows_of
-from nnode.discover.name.search import Search, Step, begun
+from nnode.discover.eligibility import check_model, not_offered
+from nnode.discover.judge.model_comparison import engine_of, windows_of
+from nnode.discover.name.search import Selection, Step, initial_fit
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import Fit, refine
@@ -34,7 +33,7 @@ from nnode.model.effects import CATALOGUE, Effect
 from nnode.model.extend import effects_of, extended
 from nnode.model.system import System
 
-#: Rounds of choosing the law that tells the whitening.
+#: Largest number of repetitions with another law's whitening.
 ROUNDS = 3
 
 
@@ -44,11 +43,11 @@ def compare_laws(
     options: DiscoverOptions,
     within: Callable[[float], None] = lambda part: None,
 ) -> tuple[Laws, dict[str, System]]:
-    """Rank laws on the open clusters of a diagnosis with the same options.
+    """Rank laws on the exploration clusters of a diagnosis with the same options.
 
     Args:
         candidates: models by name; they are not changed. Those that the diagnosis cannot simulate
-            are told as refused, with the reason.
+            are reported as refused, with the reason.
         sequences: without faults, at least three of them.
         within: is told which part of the work is done, between 0 and 1.
 
@@ -59,80 +58,82 @@ def compare_laws(
         DataError: too few sequences.
     """
     division = divide(sequences, options)
-    chosen, label = [sequences[i] for i in division.open], division.label[division.open]
-    one = next(iter(candidates.values()))
-    whole = engine_of(one, chosen, label, whole=True)
-    found, refused = _calibrated(whole, candidates, within)
-    if not found:
+    exploration = [sequences[i] for i in division.exploration]
+    label = division.label[division.exploration]
+    any_system = next(iter(candidates.values()))
+    whole = engine_of(any_system, exploration, label, whole=True)
+    fits, refused = _calibrated(whole, candidates, within)
+    if not fits:
         return Laws([], refused, 0), {}
     number = np.bincount(whole.cluster)
-    errors = {name: heldout(fit, whole.cluster) / number for name, fit in found.items()}
-    if one.domain == "crowd":  # whose residuals are no positions
-        errors = {n: np.array([square_of(whole, fit.system)]) for n, fit in found.items()}
-    first = min(errors, key=lambda name: float(errors[name].mean()))
-    engine = windows_of(one, chosen, label)
+    errors = {name: heldout(fit, whole.cluster) / number for name, fit in fits.items()}
+    if any_system.domain == "crowd":  # its residuals are not positions
+        errors = {n: np.array([square_of(whole, fit.system)]) for n, fit in fits.items()}
+    reference = min(errors, key=lambda name: float(errors[name].mean()))
+    engine = windows_of(any_system, exploration, label)
     costs: dict[str, np.ndarray] = {}
     for _ in range(ROUNDS):
-        engine.settle(found[first].system, ParameterVector(found[first].system).row)
-        for place, (name, fit) in enumerate(found.items()):
-            within((1 + place / len(found)) / 2)
-            found[name] = refine(engine, copy.deepcopy(fit.system))
-        costs = {name: heldout(fit, engine.cluster) for name, fit in found.items()}
+        engine.fit_whitening(fits[reference].system, ParameterVector(fits[reference].system).row)
+        for place, (name, fit) in enumerate(fits.items()):
+            within((1 + place / len(fits)) / 2)
+            fits[name] = refine(engine, copy.deepcopy(fit.system))
+        costs = {name: heldout(fit, engine.cluster) for name, fit in fits.items()}
         best = min(costs, key=lambda name: _level(costs[name]))
-        if best == first:
+        if best == reference:
             break
-        first = best
+        reference = best
     ranking = []
     for name in sorted(costs, key=lambda name: _level(costs[name])):
-        against = compare(costs[name], costs[best])
-        system = found[name].system
+        comparison = compare(costs[name], costs[best])
+        system = fits[name].system
         ranking.append(
             ComparedLaw(
                 name=name,
-                parameters=len(found[name].row),
+                parameters=len(fits[name].row),
                 error=float(errors[name].mean()),
                 behind=math.exp(_level(costs[name]) - _level(costs[best])) - 1,
-                p_value=1.0 if name == best else against.p_value,
+                p_value=1.0 if name == best else comparison.p_value,
                 values={k: (float(v), unit) for k, (v, unit) in system.physical().items()},
             )
         )
-    systems = {name: fit.system for name, fit in found.items()}
+    systems = {name: fit.system for name, fit in fits.items()}
     return Laws(ranking, refused, int(engine.cluster.max()) + 1), systems
 
 
 def with_effects(laws: Mapping[str, System], effects: list[Effect]) -> dict[str, System]:
-    """Copies of laws with those effects that they have a place for, from the values given."""
-    found = {}
+    """Copies of laws with those effects that apply to them, with the given start values."""
+    extended_laws = {}
     for name, law in laws.items():
-        known = CATALOGUE.of(cast(Domain, law.domain), law.order)
-        own = {effect.name for effect in effects_of(law)}
+        offered = CATALOGUE.of(cast(Domain, law.domain), law.order)
+        present = {effect.name for effect in effects_of(law)}
         for effect in effects:
             kind = type(effect)
-            if kind in known and effect.name not in own and not not_offered(kind, law):
+            if kind in offered and effect.name not in present and not not_offered(kind, law):
                 law, _ = extended(law, kind(**effect.options()))
-        found[name] = copy.deepcopy(law)
-    return found
+        extended_laws[name] = copy.deepcopy(law)
+    return extended_laws
 
 
 @dataclass(frozen=True)
-class Nearer:
-    """A law that comes nearer than the one that is diagnosed, with what was found missing in it.
+class BetterLaw:
+    """A law that fits better than the diagnosed one, with the effects selected for it.
 
     Attributes:
-        system: calibrated on the same open clusters.
+        system: calibrated on the same exploration clusters.
     """
 
     name: str
     system: System
 
 
-def imitated(
-    engine: Engine, found: Search, label: np.ndarray, nearer: Nearer
+def explained_by_law(
+    engine: Engine, selection: Selection, label: np.ndarray, nearer: BetterLaw
 ) -> tuple[list[Step], float]:
-    """Effects that a nearer law does without: they imitate that law, and are nothing of their own.
+    """Selected effects that a better-fitting law does not need: they imitate that law.
 
-    None where the nearer law does not predict left-out clusters better than the diagnosed one with
-    its effects. Effects that laws have in themselves stay, and those that the nearer one lacks too.
+    There are none if that law does not predict left-out clusters better than the diagnosed one
+    with its effects. Effects that are built into laws, and those that the better law lacks too,
+    are not returned.
 
     Args:
         label: ``(S,)`` clusters of the engine's sequences.
@@ -140,11 +141,11 @@ def imitated(
     Returns:
         The effects, and the one-sided p-value of that comparison.
     """
-    common = windows_of(nearer.system, engine.sequences, label)
-    common.settle(nearer.system, ParameterVector(nearer.system).row)
+    engine_of_law = windows_of(nearer.system, engine.sequences, label)
+    engine_of_law.fit_whitening(nearer.system, ParameterVector(nearer.system).row)
     costs = [
-        heldout(refine(common, copy.deepcopy(system)), common.cluster)
-        for system in (found.fit.system, nearer.system)
+        heldout(refine(engine_of_law, copy.deepcopy(system)), engine_of_law.cluster)
+        for system in (selection.fit.system, nearer.system)
     ]
     p_value = compare(*costs).p_value
     if p_value > rules().level:
@@ -152,23 +153,23 @@ def imitated(
     shared = {effect.name for effect in effects_of(nearer.system)}
     steps = [
         step
-        for step in found.steps
+        for step in selection.steps
         if not step.chosen.score.effect.built_into_laws and step.chosen.name not in shared
     ]
     return steps, p_value
 
 
 def _level(costs: np.ndarray) -> float:
-    """Mean logarithm of the clusters' costs: no cluster dominates."""
-    found = np.log(np.maximum(np.nan_to_num(costs, nan=np.inf), 1e-300)).mean()
-    return float(found)
+    """Mean logarithm of the clusters' costs, so that no cluster dominates."""
+    level = np.log(np.maximum(np.nan_to_num(costs, nan=np.inf), 1e-300)).mean()
+    return float(level)
 
 
 def _calibrated(
     engine: Engine, candidates: Mapping[str, System], within: Callable[[float], None]
 ) -> tuple[dict[str, Fit], dict[str, str]]:
-    """Every law from the better of two starts, by the engine's residuals as they are."""
-    found: dict[str, Fit] = {}
+    """Every law, calibrated from the better of two starts with the present whitening."""
+    fits: dict[str, Fit] = {}
     refused: dict[str, str] = {}
     for place, (name, system) in enumerate(candidates.items()):
         within(place / len(candidates) / 2)
@@ -177,9 +178,9 @@ def _calibrated(
         except ConfigError as error:
             refused[name] = str(error)
             continue
-        fit = begun(engine, copy.deepcopy(system).double())
+        fit = initial_fit(engine, copy.deepcopy(system).double())
         if fit is None:
             refused[name] = "it blows up on these data"
         else:
-            found[name] = fit
-    return found, refused
+            fits[name] = fit
+    return fits, refused

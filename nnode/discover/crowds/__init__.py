@@ -1,1 +1,1 @@
-"""What only crowds need: residuals on short windows in which every person walks alone."""
+"""The engine of crowds: residuals on short windows with every person simulated alone."""

@@ -1,4 +1,4 @@
-"""The residuals of models of crowds, on short windows of every person's path."""
+"""Engine of crowds: residuals on short windows of every person's path."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.able import check_model
 from nnode.discover.crowds.variables import crowd_variables
 from nnode.discover.crowds.whitening import Whitening
 from nnode.discover.crowds.windows import Windows
-from nnode.discover.found import Simulation
+from nnode.discover.eligibility import check_model
+from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
@@ -27,20 +27,20 @@ from nnode.model.system import Crowd, System
 from nnode.model.term import State
 from nnode.simulation.alone import PersonAlone, RunAlone, Surroundings
 
-#: A simulated person is never further than this from the measured one, m: contacts may throw
-#: somebody far away, and the rest of the run still counts.
+#: Largest difference between simulated and measured positions, m. Differences are clipped because
+#: contact forces may throw a person far away.
 LIMIT = 3.0
-#: Pairs of people in the largest intermediate result.
+#: Number of pairs of people in the largest intermediate result.
 CHUNK = 100_000
 
 
 class CrowdEngine:
-    """Residuals on windows in which everyone is simulated alone among the others.
+    """Residuals on windows in which every person is simulated alone among the others.
 
-    In a crowd, errors of one person's simulated path would spread to all. So the sequences are
-    cut into windows, the others walk on their measured and smoothed paths, and what an unknown
-    start state of a person explains is projected out. The remaining differences of positions are
-    whitened, and windows in which a person does something quite unusual count less.
+    In a crowd, errors of one person's simulated path would propagate to all. Therefore the
+    sequences are cut into windows, the others follow their measured and smoothed paths, and the
+    part of the differences that an unknown start state explains is projected out. The remaining
+    differences of positions are whitened, and outlying windows have smaller weights.
 
     Args:
         sequences: of people, equally sampled.
@@ -50,7 +50,7 @@ class CrowdEngine:
     Attributes:
         batch: the sequences.
         sequence: ``(n,)`` position of each residual's sequence in the batch.
-        clock: ``(n,)`` s, when its window begins.
+        clock: ``(n,)`` start time of its window, s.
         unit: ``(n,)`` number of its person, counted through all sequences.
         people: of each unit the sequence and the place of the person.
 
@@ -67,10 +67,10 @@ class CrowdEngine:
         self.sequences, self.least = list(sequences), rules().least
         self.batch = collate(sequences)
         self.windows = Windows(sequences, window)
-        which, who = self.windows.person.T
+        window_of, place_of = self.windows.person.T
         self._clusters = clusters
         pairs, unit = np.unique(
-            np.stack([self.windows.sequence[which], who], 1), axis=0, return_inverse=True
+            np.stack([self.windows.sequence[window_of], place_of], 1), axis=0, return_inverse=True
         )
         self._unit = unit.reshape(-1)
         self.people = [[(int(b), int(i))] for b, i in pairs]
@@ -80,26 +80,26 @@ class CrowdEngine:
         self._whitening: Whitening | None = None
         self._run: tuple[System, Tensor, RunAlone] | None = None
 
-    # -- what every engine has -------------------------------------------------------------
+    # -- the interface of engines ----------------------------------------------------------
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)``: whitened differences, measured minus simulated, of R runs of one model."""
         differences = self._differences(system, rows)
-        self._settled(system, rows[0])
+        self._fitted_whitening(system, rows[0])
         flat = differences.reshape(len(rows), *self._matrix.shape[::2], 1)
         return (self._matrix @ flat).reshape(len(rows), -1)
 
     def squares(self, system: System, row: Tensor) -> Squares:
-        """Squared errors of positions, without what start states explain."""
-        which = self.windows.person[:, 0]
-        squares = (self._away(system, row) ** 2).sum(-1)
-        each = squares.shape[1]
-        return Squares(squares.ravel(), self.windows.sequence[which].repeat(each))
+        """Squared errors of positions, after start states were projected out."""
+        window = self.windows.person[:, 0]
+        squares = (self._projected_errors(system, row) ** 2).sum(-1)
+        n_samples = squares.shape[1]
+        return Squares(squares.ravel(), self.windows.sequence[window].repeat(n_samples))
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
-        """Windows one after the other, each from the start state that suits the model best."""
-        away, length = self._away(system, row), self.windows.length
-        found: list[Simulation | None] = [None] * len(self.sequences)
+        """The windows in sequence, each from the best-fitting start state."""
+        difference, length = self._projected_errors(system, row), self.windows.length
+        simulations: list[Simulation | None] = [None] * len(self.sequences)
         for i in self.windows.used:
             s, first, stride = self.sequences[i], *self.windows.compared[i]
             windows = np.flatnonzero(self.windows.sequence == i)
@@ -116,61 +116,61 @@ class CrowdEngine:
             for number, window in enumerate(windows):
                 people = self.windows.person[:, 0] == window
                 who = self.windows.person[people, 1]
-                x[number * length : (number + 1) * length, who] -= away[people].swapaxes(0, 1)
-            found[i] = Simulation(part, x, restart=length)
-        return found
+                x[number * length : (number + 1) * length, who] -= difference[people].swapaxes(0, 1)
+            simulations[i] = Simulation(part, x, restart=length)
+        return simulations
 
-    def _away(self, system: System, row: Tensor) -> np.ndarray:
-        """``(P, L, 2)`` m: measured minus simulated positions, without what starts explain."""
-        whitening = self._settled(system, row)
-        found: np.ndarray = whitening.projected(self._differences(system, row[None]).numpy())[0]
-        return found.reshape(len(found), -1, 2)
+    def _projected_errors(self, system: System, row: Tensor) -> np.ndarray:
+        """``(P, L, 2)`` m: measured minus simulated positions, start states projected out."""
+        whitening = self._fitted_whitening(system, row)
+        projected: np.ndarray = whitening.projected(self._differences(system, row[None]).numpy())[0]
+        return projected.reshape(len(projected), -1, 2)
 
     def variables(self) -> list[Variable]:
-        """What deviations of people may depend on."""
-        windows, nothing = self.windows, Crowd([])
+        """The variables on which deviations of people may depend."""
+        windows, no_forces = self.windows, Crowd([])
         measured = torch.cat([windows.batch.x[::2], windows.batch.v[::2]], -1)
-        run = RunAlone(windows.around(nothing), nothing, measured)
-        first = dict(zip(self.batch.names, self.batch.start.tolist(), strict=True))
-        return crowd_variables(run.state, first)
+        run = RunAlone(windows.around(no_forces), no_forces, measured)
+        start_of = dict(zip(self.batch.names, self.batch.start.tolist(), strict=True))
+        return crowd_variables(run.state, start_of)
 
     def noise_floor(self) -> float:
-        """m²: mean square of :meth:`positions` that the measurement's noise alone makes, summed
-        over both coordinates."""
+        """Mean square error of positions due to measurement noise, summed over both coordinates,
+        m²."""
         length = self.windows.length
         return 2 * self.windows.variance * (1 - 2 / length)
 
-    def settle(self, system: System, row: Tensor) -> None:
-        """Take a model as the one around which residuals are whitened, weighted and linearised.
+    def fit_whitening(self, system: System, row: Tensor) -> None:
+        """Fit the whitening and the weights to the residuals of a model, and linearise around it.
 
-        Called after a fit was accepted; residuals from before cannot be compared with later ones,
-        and even their number may change.
+        It is called after a fit was accepted. Residuals before and after the call cannot be
+        compared; even their number may change.
         """
         self._run = self._simulated(system, row)
         start, forced = self._run[-1].unit_responses()
-        every = self.windows.sub
+        stride = self.windows.sub
         difference = self._differences(system, row[None])[0].numpy()
         self._whitening = Whitening.fit(
-            difference, start[:, ::every].numpy(), self._turns(), self.windows.variance
+            difference, start[:, ::stride].numpy(), self._turns(), self.windows.variance
         )
         self._matrix = torch.as_tensor(self._whitening.matrix())
-        self._response = self._matrix @ forced[:, ::every].flatten(1, 2)
+        self._response = self._matrix @ forced[:, ::stride].flatten(1, 2)
         self._label(self._matrix.shape[1])
 
-    def _label(self, each: int) -> None:
-        """Say whose ``each`` residuals of every person's window are."""
-        which = self.windows.person[:, 0]
-        self.sequence = self.windows.sequence[which].repeat(each)
+    def _label(self, n_residuals: int) -> None:
+        """Label the ``n_residuals`` residuals of every person's window."""
+        window = self.windows.person[:, 0]
+        self.sequence = self.windows.sequence[window].repeat(n_residuals)
         self.cluster = of_residuals(self._clusters, self.sequence)
-        self.clock = self.windows.batch.start.numpy()[which].repeat(each)
-        self.component = np.tile(np.arange(each), len(which))
-        self.unit = self._unit.repeat(each)
+        self.clock = self.windows.batch.start.numpy()[window].repeat(n_residuals)
+        self.component = np.tile(np.arange(n_residuals), len(window))
+        self.unit = self._unit.repeat(n_residuals)
 
     # -- linear response ----------------------------------------------------------------------
 
     def linearised(self, system: System, row: Tensor) -> RunAlone:
-        """A model along its own paths; the response is that of the model it was settled at."""
-        self._settled(system, row)
+        """A model along its own paths; the response is that of the model of the whitening."""
+        self._fitted_whitening(system, row)
         if self._run is None or self._run[0] is not system or not torch.equal(self._run[1], row):
             self._run = self._simulated(system, row)
         return self._run[-1]
@@ -183,10 +183,8 @@ class CrowdEngine:
         return system, row.clone(), run
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
-        """``(K, n)``: derivatives of the residuals with respect to the calibrated parameters.
-
-        By linear response; a simulation for each parameter gives nearly the same.
-        """
+        """``(K, n)``: derivatives of the residuals with respect to the calibrated parameters, by
+        linear response."""
         run = self.linearised(system, row)
         rates = run.parameters(_differences(system))
         return torch.stack([self._respond(rate, run) for rate in rates])
@@ -207,31 +205,31 @@ class CrowdEngine:
         the order of its ``steps``; the change by the effect as a whole where it has no strength."""
 
         def rates(state: State) -> list[Tensor]:
-            without, found = effect(**probe.options)(state), []
+            base, changes = effect(**probe.options)(state), []
             if not probe.steps:
-                return [without]
+                return [base]
             for name, step in probe.steps.items():
                 changed = effect(**probe.options)
                 getattr(changed, name).add_(step)
-                found.append((changed(state) - without) / step)
-            return found
+                changes.append((changed(state) - base) / step)
+            return changes
 
         return self.response(system, row, rates)
 
     def individual(
         self, system: System, row: Tensor, effect: type[IndividualEffect], options: dict[str, Any]
     ) -> Tensor:
-        """``(M, n)``: derivatives of everyone's residuals with respect to M amounts of his own,
+        """``(M, n)``: derivatives of every person's residuals by M agent-specific parameters,
         see :meth:`~nnode.model.effects.IndividualEffect.directions`.
 
         As people walk alone, the derivative with respect to one person's amount is the same
         column, restricted to the residuals of this unit.
         """
-        names, most = set(self.batch.names), self.windows.batch.x.shape[2]
+        names, n_agents = set(self.batch.names), self.windows.batch.x.shape[2]
 
         def rates(state: State) -> list[Tensor]:
             return [
-                effect(people={name: [number] * most for name in names}, **values)(state)
+                effect(people={name: [number] * n_agents for name in names}, **values)(state)
                 for values, number in effect.directions(options)
             ]
 
@@ -239,9 +237,9 @@ class CrowdEngine:
 
     # -- parts -----------------------------------------------------------------------------
 
-    def _settled(self, system: System, row: Tensor) -> Whitening:
+    def _fitted_whitening(self, system: System, row: Tensor) -> Whitening:
         if self._whitening is None:
-            self.settle(system, row)
+            self.fit_whitening(system, row)
         assert self._whitening is not None
         return self._whitening
 
@@ -251,46 +249,46 @@ class CrowdEngine:
 
     def _differences(self, system: System, rows: Tensor) -> Tensor:
         """``(R, P, L, 2)`` m: measured minus simulated positions."""
-        which, who = self.windows.person.T
-        x = self._states(system, rows)[:: self.windows.sub, :, which, who, :2]
-        measured = torch.from_numpy(self.windows.measured[:, which, who])
+        window_of, place_of = self.windows.person.T
+        x = self._states(system, rows)[:: self.windows.sub, :, window_of, place_of, :2]
+        measured = torch.from_numpy(self.windows.measured[:, window_of, place_of])
         difference = (measured[:, None] - x).permute(1, 2, 0, 3)
         return difference.nan_to_num(LIMIT, LIMIT, -LIMIT).clamp(-LIMIT, LIMIT)
 
     def _states(self, system: System, rows: Tensor) -> Tensor:
         """``(F, R, W, N, 4)`` simulated positions (m) and velocities (m/s) at the steps."""
         windows = self.windows
-        # the systems of one diagnosis share walls, radii and masses: the first stands for all
+        # all systems of one diagnosis share walls, radii and masses
         if self._around is None:
             check_model(system)
             self._around = windows.around(system)
         w, n = windows.batch.agent.shape
         first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
-        found = []
+        states = []
         for part in rows.split(max(1, CHUNK // (w * n * n))):
             rhs = PersonAlone(self._around, system, ParameterVector(system).runs(part))
-            found.append(rhs.simulated(first, windows.steps))
-        return torch.cat(found, 1)
+            states.append(rhs.simulated(first, windows.steps))
+        return torch.cat(states, 1)
 
     def _turns(self) -> np.ndarray:
-        """``(P, 2, 2)``: rows along and across each person's way in his window."""
-        which, who = self.windows.person.T
-        x = self.windows.batch.x[:, which, who].numpy()
-        goal = self.windows.batch.destination[which, who].numpy()
-        way, far = x[-1] - x[0], goal - x[0]
-        slow = np.hypot(*way.T) < 0.1
-        way = np.where(slow[:, None], far, way)
-        way = way / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
-        return np.stack([way, np.stack([-way[:, 1], way[:, 0]], 1)], 1)
+        """``(P, 2, 2)``: unit vectors along and across each person's path in the window."""
+        window, person = self.windows.person.T
+        x = self.windows.batch.x[:, window, person].numpy()
+        goal = self.windows.batch.destination[window, person].numpy()
+        displacement, to_goal = x[-1] - x[0], goal - x[0]
+        standing = np.hypot(*displacement.T) < 0.1
+        displacement = np.where(standing[:, None], to_goal, displacement)
+        displacement = displacement / np.maximum(np.hypot(*displacement.T), 1e-9)[:, None]
+        return np.stack([displacement, np.stack([-displacement[:, 1], displacement[:, 0]], 1)], 1)
 
 
 def _differences(system: System) -> list[float]:
-    """``(K,)``: differences of the parameters by which derivatives are taken."""
-    found = []
+    """``(K,)``: finite differences of the parameters."""
+    differences = []
     for name, p in ParameterVector(system).parameters.items():
         _, place, key = name.split(".", 2)
         term = system.terms[int(place)]
         strength = term.strengths.get(key) if isinstance(term, Effect) else None
         size = 1e-3 * max(1.0, float(p.detach().abs().max()))
-        found += [size if strength is None else abs(strength.step)] * p.numel()
-    return found
+        differences += [size if strength is None else abs(strength.step)] * p.numel()
+    return differences

@@ -1,10 +1,9 @@
-"""What a crowd's calibration is off by, as simulations of the calibrated crowd show it.
+"""Bias correction of a crowd's calibration by indirect inference.
 
-People are simulated among the measured paths of the others. But the others have reacted to what
-a person really did, disturbances included, and a window's start is known by smoothing alone:
-coefficients come out a little too large or too small. How much is seen where the truth is known:
-the calibrated crowd is simulated, everybody reacting to everybody, disturbed as the measured
-people were, measured as they were, and calibrated again.
+People are simulated among the measured paths of the others. But the others have reacted to the
+person's actual path, including disturbances, and the starts of windows are smoothed. Both bias the
+coefficients slightly. The bias is estimated by simulation: the calibrated crowd is simulated with
+all interactions, with the disturbances and measurement errors of the data, and calibrated again.
 
 Source: Gouriéroux, Monfort & Renault 1993 (indirect inference); Wu 1986 (signs of residuals).
 """
@@ -30,16 +29,15 @@ from nnode.simulation.numpy import simulated
 
 log = logging.getLogger(__name__)
 
-#: Crowds that are simulated, and steps of the simulation in a sampling interval.
+#: Number of simulated crowds, and simulation steps per sampling interval.
 CROWDS, STEPS = 3, 2
 
 
-def unbiased(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
-    """A calibrated model without what simulations of it are off by; with what is uncertain in
-    that.
+def bias_corrected(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
+    """A calibrated model, corrected for its bias, with the standard errors of the correction.
 
-    Only as many simulations count as come to an end; with fewer than two the fit is returned as
-    it is. Residuals and derivatives remain those of the calibration.
+    Simulations that diverge are ignored; with fewer than two others, the fit is returned unchanged.
+    Residuals and derivatives remain those of the calibration.
 
     Args:
         fit: in the residuals of a :class:`CrowdEngine` of the sequences.
@@ -51,25 +49,25 @@ def unbiased(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
     batch = collate(replace(s, x=p.x, v=p.v) for s, p in zip(sequences, paths, strict=True))
     disturbed = _disturbances(fit.system, batch, paths)
     rng = np.random.default_rng(seed)
-    found = []
+    estimates = []
     for _ in range(CROWDS):
         kicks = [kick * rng.choice([-1.0, 1.0], (1, kick.shape[1], 1)) for kick in disturbed]
-        moved = _simulated(fit.system, batch, kicks)
+        simulated_paths = _simulated(fit.system, batch, kicks)
         measured = [
             replace(s, x=x + rng.normal(0.0, np.sqrt(smoother.variance), x.shape), v=None)
-            for s, x in zip(sequences, moved, strict=True)
+            for s, x in zip(sequences, simulated_paths, strict=True)
         ]
         try:
             engine, system = CrowdEngine(measured), copy.deepcopy(fit.system)
-            engine.settle(system, ParameterVector(system).row)
-            found.append(refine(engine, system, tolerance=ROUGH / 10).row)
+            engine.fit_whitening(system, ParameterVector(system).row)
+            estimates.append(refine(engine, system, tolerance=ROUGH / 10).row)
         except SimulationError:
             log.debug("a simulated crowd could not be calibrated")
-    if len(found) < 2:
+    if len(estimates) < 2:
         return fit
-    off = np.where(fit.free, np.mean(found, 0) - fit.row, 0.0)
-    row = np.clip(fit.row - off, *ParameterVector(fit.system).bounds)
-    error = np.where(fit.free, np.std(found, 0, ddof=1) / np.sqrt(len(found)), 0.0)
+    bias = np.where(fit.free, np.mean(estimates, 0) - fit.row, 0.0)
+    row = np.clip(fit.row - bias, *ParameterVector(fit.system).bounds)
+    error = np.where(fit.free, np.std(estimates, 0, ddof=1) / np.sqrt(len(estimates)), 0.0)
     system = ParameterVector(copy.deepcopy(fit.system)).fill_(row)
     return replace(fit, system=system, row=row, simulated=error)
 
@@ -77,21 +75,24 @@ def unbiased(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
 @torch.no_grad()
 def _disturbances(system: System, batch: Batch, paths: list[Path]) -> list[np.ndarray]:
     """``(K, N, 2)`` accelerations of the measured people that the model does not explain, m/s²."""
-    alone = _with(system, "measured")
-    scene = alone.scene(batch)
+    among_measured = _with(system, "measured")
+    scene = among_measured.scene(batch)
     time = batch.dt * torch.arange(batch.n_samples, dtype=torch.float64)
     states = torch.cat([batch.x, batch.v], -1)
-    known = torch.stack([alone(t, y, scene)[..., 2:4] for t, y in zip(time, states, strict=True)])
+    explained = torch.stack(
+        [among_measured(t, y, scene)[..., 2:4] for t, y in zip(time, states, strict=True)]
+    )
     return [
-        path.a - known[: len(path.x), b, : path.x.shape[1]].numpy() for b, path in enumerate(paths)
+        path.a - explained[: len(path.x), b, : path.x.shape[1]].numpy()
+        for b, path in enumerate(paths)
     ]
 
 
 @torch.no_grad()
 def _simulated(system: System, batch: Batch, kicks: list[np.ndarray]) -> list[np.ndarray]:
-    """``(K, N, 2)`` positions of each sequence's people, all reacting to each other, m."""
-    together = _with(system, "simulated")
-    scene, y = together.scene(batch), together.initial(batch)
+    """``(K, N, 2)`` positions of each sequence's people with all interactions, m."""
+    interacting = _with(system, "simulated")
+    scene, y = interacting.scene(batch), interacting.initial(batch)
     push = torch.zeros(batch.n_samples, *y.shape, dtype=torch.float64)
     for b, kick in enumerate(kicks):
         push[: len(kick), b, : kick.shape[1], 2:4] = torch.from_numpy(kick)
@@ -100,14 +101,14 @@ def _simulated(system: System, batch: Batch, kicks: list[np.ndarray]) -> list[np
         k = min(int(t / batch.dt + 1e-6), batch.n_samples - 2)
         kick = torch.lerp(push[k], push[k + 1], t / batch.dt - k)
         time = torch.tensor(t, dtype=torch.float64)
-        return (together(time, torch.from_numpy(y), scene) + kick).numpy()
+        return (interacting(time, torch.from_numpy(y), scene) + kick).numpy()
 
-    found = simulated(rate, y.numpy(), batch.dt, batch.n_samples, batch.dt / STEPS)
-    return [found[: len(kick), b, : kick.shape[1], :2] for b, kick in enumerate(kicks)]
+    states = simulated(rate, y.numpy(), batch.dt, batch.n_samples, batch.dt / STEPS)
+    return [states[: len(kick), b, : kick.shape[1], :2] for b, kick in enumerate(kicks)]
 
 
 def _with(system: System, neighbours: str) -> Crowd:
-    found = copy.deepcopy(system)
-    assert isinstance(found, Crowd)
-    found.neighbours = neighbours
-    return found
+    crowd = copy.deepcopy(system)
+    assert isinstance(crowd, Crowd)
+    crowd.neighbours = neighbours
+    return crowd

@@ -1,4 +1,4 @@
-"""Smooth paths of people, and the noise of their measurement."""
+"""Smoothed paths of people, and the variance of the measurement noise."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from scipy.interpolate import make_interp_spline
 from nnode.data.sequence import Sequence
 from nnode.errors import DataError
 
-#: Strengths of the roughness penalty among which cross-validation chooses.
+#: Strengths of the roughness penalty for cross-validation.
 PENALTIES = np.logspace(-4, 5, 55)
-#: Longer sequences are smoothed in pieces of about this many samples, which meet in the middle
-#: of an overlap.
+#: Longer sequences are smoothed in pieces of about this many samples, with an overlap.
 PIECE, OVERLAP = 240, 24
-#: Fewer samples than this have no jerk.
+#: Smallest number of samples for a third difference.
 LEAST = 4
 
 
@@ -38,7 +37,7 @@ class Path:
 
 
 class Smoother:
-    """Paths with little jerk near the measured ones.
+    """Smooths measured paths with a penalty of the jerk.
 
     The smoothed positions minimise the squared distance to the measured ones plus a penalty times
     the squared third differences. The penalty is one for all people and coordinates, by
@@ -48,7 +47,7 @@ class Smoother:
         sequences: with ``(K, N, 2)`` positions, K >= 4.
 
     Attributes:
-        penalty: that was chosen.
+        penalty: the selected strength.
         variance: m², of the noise in one coordinate.
 
     Raises:
@@ -72,17 +71,17 @@ class Smoother:
                 flat = item.x[part].reshape(part.stop - part.start, -1)
                 pieces.setdefault(len(flat), []).append(flat)
         stacks = {k: np.concatenate(parts, 1) for k, parts in pieces.items()}
-        freedom = np.zeros(len(PENALTIES))
-        left = np.zeros(len(PENALTIES))
+        degrees = np.zeros(len(PENALTIES))
+        residual_square = np.zeros(len(PENALTIES))
         for k, y in stacks.items():
             value, vector = _modes(k)
             power = ((vector.T @ y) ** 2).sum(1)
             keep = 1 / (1 + PENALTIES[:, None] * value)
-            left += ((1 - keep) ** 2 * power).sum(1)
-            freedom += (1 - keep).sum(1) * y.shape[1]
-        best = int(np.argmin(left / freedom**2))
+            residual_square += ((1 - keep) ** 2 * power).sum(1)
+            degrees += (1 - keep).sum(1) * y.shape[1]
+        best = int(np.argmin(residual_square / degrees**2))
         self.penalty = float(PENALTIES[best])
-        self.variance = float(left[best] / freedom[best])
+        self.variance = float(residual_square[best] / degrees[best])
 
     def path(self, item: Sequence, t: np.ndarray) -> Path:
         """The smoothed paths of one of the sequences at times ``t`` (s since the first)."""
@@ -91,10 +90,10 @@ class Smoother:
         for part in _pieces(k):
             value, vector = _modes(part.stop - part.start)
             keep = 1 / (1 + self.penalty * value)
-            # the ends of a piece know only one side: they count less where pieces overlap
-            own = np.minimum(np.arange(1, len(value) + 1), np.arange(len(value), 0, -1))[:, None]
-            smooth[part] += own * (vector @ (keep[:, None] * (vector.T @ flat[part])))
-            weight[part] += own
+            # estimates at the ends of a piece are less precise, so they have smaller weights
+            taper = np.minimum(np.arange(1, len(value) + 1), np.arange(len(value), 0, -1))[:, None]
+            smooth[part] += taper * (vector @ (keep[:, None] * (vector.T @ flat[part])))
+            weight[part] += taper
         line = make_interp_spline(item.dt * np.arange(k), smooth / weight, k=min(5, k - 1))
         shape = (len(t), item.n_agents, 2)
         x, v, a = (line(t, nu=order).reshape(shape) for order in range(3))
@@ -111,13 +110,13 @@ def _pieces(k: int) -> list[slice]:
     ]
 
 
-_KNOWN: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+_MODES: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
 
 def _modes(k: int) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvalues ``(k,)`` and eigenvectors ``(k, k)`` of the roughness penalty."""
-    if k not in _KNOWN:
+    if k not in _MODES:
         third = np.diff(np.eye(k), 3, axis=0)
         value, vector = np.linalg.eigh(third.T @ third)
-        _KNOWN[k] = value.clip(min=0), vector
-    return _KNOWN[k]
+        _MODES[k] = value.clip(min=0), vector
+    return _MODES[k]

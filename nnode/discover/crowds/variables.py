@@ -1,4 +1,4 @@
-"""What a deviation of people may depend on."""
+"""Variables on which deviations of people may depend."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from nnode.model.term import State
 
 Of = Callable[[State], Tensor]
 
-#: Knots of a curve; of curves along the way, where short waves are possible.
+#: Number of knots of a curve; of curves over the position, which may have short waves.
 KNOTS, FINE = 9, 25
-#: The shortest and the longest waves that are looked for, along x in m and in time in s.
+#: The shortest and the longest waves, along x in m and in time in s.
 WAY, CLOCK = (1.5, 10.0), (1.5, 10.0)
 #: Width of the kernel of the local density, m.
 KERNEL = 1.0
-#: Distance of the nearest person where there is none, m.
+#: Distance of the nearest person if there is none, m.
 NOBODY = 100.0
-#: Distance at which an absent wall stands, m.
+#: Distance of an absent wall, m.
 FAR = 1e4
 
 
@@ -92,9 +92,9 @@ def _speed(state: State) -> Tensor:
 
 def _nearest_wall(state: State) -> tuple[Tensor, Tensor]:
     d, n = wall_distance(state)
-    least, w = d.min(2)
+    distance, w = d.min(2)
     index = w[..., None, None].expand(*w.shape, 1, 2)
-    return least, n.gather(2, index)[:, :, 0]
+    return distance, n.gather(2, index)[:, :, 0]
 
 
 def _wall(state: State) -> Tensor:
@@ -105,39 +105,39 @@ def _away_from_wall(state: State) -> Tensor:
     return _nearest_wall(state)[1]
 
 
-def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
+def crowd_variables(state: State, start_of: dict[str, float]) -> list[Variable]:
     """The variables of people, with knots where there are data.
 
     Args:
         state: many moments of the measured and smoothed paths.
-        first: clock time of the first sample of each sequence, s, by name.
+        start_of: clock time of the first sample of each sequence, s, by name.
     """
     agent = state.scene.agent
     x, y, ahead, left = "along x", "along y", "ahead", "to the left"
     axes: dict[str, Of] = {x: _along(0), y: _along(1)}
-    own: dict[str, Of] = {ahead: _ahead, left: _left}
-    looks: list[tuple[str, str, Of, dict[str, Of], int]] = [
+    personal: dict[str, Of] = {ahead: _ahead, left: _left}
+    definitions: list[tuple[str, str, Of, dict[str, Of], int]] = [
         ("position x", "m", _position(0), axes, FINE),
         ("position y", "m", _position(1), axes, KNOTS),
         ("clock time", "s", clock, axes, KNOTS),
-        ("time since the start", "s", since_start(first), own, KNOTS),
-        ("speed", "m/s", _speed, own, KNOTS),
+        ("time since the start", "s", since_start(start_of), personal, KNOTS),
+        ("speed", "m/s", _speed, personal, KNOTS),
     ]
     if bool((agent.sum(1) > 1).any()):
-        looks += [
+        definitions += [
             (
                 "distance to the nearest person",
                 "m",
                 _distance,
-                {"away from him": _away_from_nearest, **own},
+                {"away from him": _away_from_nearest, **personal},
                 KNOTS,
             ),
-            ("bearing of the nearest person", "degrees", _bearing, own, KNOTS),
-            ("speed of approach of the nearest person", "m/s", _approach, own, KNOTS),
-            ("local density", "1/m²", _density, own, KNOTS),
+            ("bearing of the nearest person", "degrees", _bearing, personal, KNOTS),
+            ("speed of approach of the nearest person", "m/s", _approach, personal, KNOTS),
+            ("local density", "1/m²", _density, personal, KNOTS),
         ]
     if not state.scene.segment.isnan().any(-1).all():
-        looks.append(
+        definitions.append(
             (
                 "distance to the nearest wall",
                 "m",
@@ -146,14 +146,14 @@ def crowd_variables(state: State, first: dict[str, float]) -> list[Variable]:
                 KNOTS,
             )
         )
-    found = []
-    for name, unit, value, directions, most in looks:
-        seen = value(state)[agent].numpy().astype(float)
-        knots = knots_of(seen, most)
+    variables = []
+    for name, unit, value, directions, n_knots in definitions:
+        observed = value(state)[agent].numpy().astype(float)
+        knots = knots_of(observed, n_knots)
         for level, direction in directions.items():
-            found.append(Variable(name, unit, value, knots, direction, level))
-    found += waves_of("position x", "m", _position(0), state.x[..., 0][agent], WAY, axes)
-    return found + waves_of("clock time", "s", clock, clock(state)[agent], CLOCK, axes)
+            variables.append(Variable(name, unit, value, knots, direction, level))
+    variables += waves_of("position x", "m", _position(0), state.x[..., 0][agent], WAY, axes)
+    return variables + waves_of("clock time", "s", clock, clock(state)[agent], CLOCK, axes)
 
 
 def wall_distance(state: State) -> tuple[Tensor, Tensor]:
@@ -175,7 +175,7 @@ def right_of(direction: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Neighbours:
-    """What person i (second axis) sees of person j (third axis).
+    """The state of person j (third axis) relative to person i (second axis).
 
     Attributes:
         d: ``(B, N, N)`` distance, m.
@@ -193,12 +193,12 @@ class Neighbours:
     def of(cls, state: State) -> Neighbours:
         """Everyone's neighbours, where ``state.others`` has them."""
         x, v = state.x, velocity(state)
-        other, speed = state.others
-        dx = x[:, :, None] - other[:, None]
+        neighbour_positions, neighbour_velocities = state.others
+        dx = x[:, :, None] - neighbour_positions[:, None]
         d = norm(dx)
         apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
         acts = (state.scene.agent[:, None, :] & apart).to(x.dtype)
-        return cls(d, dx / d[..., None], speed[:, None] - v[:, :, None], acts)
+        return cls(d, dx / d[..., None], neighbour_velocities[:, None] - v[:, :, None], acts)
 
 
 def local_density(pair: Neighbours, kernel: float) -> Tensor:

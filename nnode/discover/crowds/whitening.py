@@ -1,4 +1,4 @@
-"""From differences of positions to residuals that are about independent, of variance about 1."""
+"""Whitening of a crowd's differences of positions: approximately independent, variance 1."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 #: Numerical errors of a simulated position, m: a lower limit of all noise.
 NUMERICAL = 3e-4
-#: A person's window counts half where its residuals are this many times as large as usual.
+#: A person's window has weight 1/2 if its residuals are this many times the median.
 OUTLYING = 3.0
-#: Directions in which the differences vary less than this many times as much as the
-#: measurement's noise are left out, but no more than all but the FEWEST largest.
+#: Directions are left out if the variance of the differences is below this multiple of the
+#: measurement noise's, but at least the FEWEST largest are kept.
 TELLING, FEWEST = 1.25, 4
-#: Rounds in which weights and covariances are found.
+#: Number of iterations of weights and covariances.
 ROUNDS = 4
 
 
@@ -21,15 +21,15 @@ ROUNDS = 4
 class Whitening:
     """A linear map of the differences ``(P, L, 2)`` of the P people of all windows.
 
-    Unknown start states are projected out, the rest is turned to the walking direction and
-    filtered by the inverse root of its covariance, which is one for all people. Directions of
-    it in which there is little but noise of the measurement are left out.
+    Unknown start states are projected out. The remainder is rotated to the walking direction and
+    multiplied by the inverse square root of its covariance, which is pooled over all people.
+    Directions that contain little but measurement noise are left out.
 
     Attributes:
-        project: ``(P, L*2, L*2)``: takes the part that a start state explains out of x, y.
+        project: ``(P, L*2, L*2)``: projects start states out of x, y.
         turn: ``(P, 2, 2)``: from x, y to along and across the walking direction.
         filter: ``(M, 2, L)``: M filters of the differences along and across.
-        weight: ``(P,)``: of the squares of each person's window, bounded influence.
+        weight: ``(P,)``: of the squares of each person's window, for bounded influence.
         covariance: ``(2, L, L)`` m², of the projected differences.
     """
 
@@ -54,21 +54,23 @@ class Whitening:
         p, length = difference.shape[:2]
         basis, _ = np.linalg.qr(start.reshape(p, 2 * length, 4))
         project = np.eye(2 * length) - basis @ basis.transpose(0, 2, 1)
-        left = np.einsum("pab,pb->pa", project, difference.reshape(p, -1)).reshape(p, length, 2)
-        left = np.einsum("pcd,pld->pcl", turn, left)
+        projected = np.einsum("pab,pb->pa", project, difference.reshape(p, -1)).reshape(
+            p, length, 2
+        )
+        projected = np.einsum("pcd,pld->pcl", turn, projected)
         weight = np.ones(p)
         for _ in range(ROUNDS):
-            total = np.einsum("p,pcl,pcm->clm", weight, left, left) / weight.sum()
+            total = np.einsum("p,pcl,pcm->clm", weight, projected, projected) / weight.sum()
             covariance = total + NUMERICAL**2 * np.eye(length)
             filters = _filters(covariance, variance)
-            size = (np.einsum("mcl,pcl->pm", filters, left) ** 2).mean(1)
-            # outliers are measured against the usual person, not against each other
-            usual = max(float(np.median(size)), 1e-12)
-            weight = 1 / (1 + size / usual / OUTLYING**2)
+            size = (np.einsum("mcl,pcl->pm", filters, projected) ** 2).mean(1)
+            # relative to the median, which is robust to outliers
+            median_size = max(float(np.median(size)), 1e-12)
+            weight = 1 / (1 + size / median_size / OUTLYING**2)
         return cls(project, turn, filters, weight, covariance)
 
     def projected(self, difference: np.ndarray) -> np.ndarray:
-        """``(..., P, L, 2)`` m: the differences without what start states explain."""
+        """``(..., P, L, 2)`` m: the differences, start states projected out."""
         flat = difference.reshape(*difference.shape[:-2], -1)
         out = np.einsum("pab,...pb->...pa", self.project, flat)
         return out.reshape(difference.shape)
@@ -83,13 +85,13 @@ class Whitening:
 
 def _filters(covariance: np.ndarray, variance: float) -> np.ndarray:
     """``(M, 2, L)``: from the ``(2, L, L)`` covariances of the differences along and across."""
-    found = []
+    filters = []
     for c, part in enumerate(covariance):
         value, vector = np.linalg.eigh(part)
-        # start states took away two directions
-        telling = np.flatnonzero(value > TELLING * (variance + NUMERICAL**2))
-        first = int(np.clip(len(value) - len(telling), 2, max(2, len(value) - FEWEST)))
-        own = np.zeros((len(value) - first, *covariance.shape[::2]))
-        own[:, c] = (vector[:, first:] / np.sqrt(value[first:])).T
-        found.append(own)
-    return np.concatenate(found)
+        # start states were projected out, which removes two directions
+        informative = np.flatnonzero(value > TELLING * (variance + NUMERICAL**2))
+        start = int(np.clip(len(value) - len(informative), 2, max(2, len(value) - FEWEST)))
+        rows = np.zeros((len(value) - start, *covariance.shape[::2]))
+        rows[:, c] = (vector[:, start:] / np.sqrt(value[start:])).T
+        filters.append(rows)
+    return np.concatenate(filters)

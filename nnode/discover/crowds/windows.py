@@ -1,4 +1,4 @@
-"""Short windows in which every person walks alone among the measured paths of the others."""
+"""Short windows in which every person is simulated alone among the others' measured paths."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.simulation.alone import Surroundings
 
-#: Longest step of a simulation, and about the interval of the residuals, s.
+#: Longest step of a simulation, and the approximate interval of the residuals, s.
 STEP = 0.13
 INTERVAL = 0.1
-#: Fewest samples of a window: four numbers of each coordinate pair go into the start.
+#: Smallest number of samples of a window; a start state has four numbers.
 LEAST = 5
-#: Windows are so short that at most this share of the sequences that allow any is shorter.
+#: Windows are shortened until at most this share of the usable sequences is shorter.
 LEFT_OUT = 0.1
 #: A wall point further away than r + CUT * B is left out: exp(-CUT) of the force at contact.
 CUT = 11.0
@@ -55,15 +55,15 @@ class Windows:
         dt = sequences[0].dt
         stride = max(1, round(INTERVAL / dt))
         count = [(item.n_samples + stride - 1) // stride for item in sequences]
-        enough = sorted(number for number in count if number >= LEAST)
-        if not enough:
+        sufficient = sorted(number for number in count if number >= LEAST)
+        if not sufficient:
             raise DataError(
                 f"the longest sequence has {max(item.n_samples for item in sequences)} samples "
                 f"of {dt:g} s, a window needs {LEAST * stride}; use longer sequences"
             )
-        # one long sequence among short ones is no reason to leave the short ones out
-        most = enough[int(LEFT_OUT * len(enough))]
-        length = min(max(LEAST + 1, round(window / (stride * dt))), most)
+        # a few long sequences must not exclude the short ones
+        longest = sufficient[int(LEFT_OUT * len(sufficient))]
+        length = min(max(LEAST + 1, round(window / (stride * dt))), longest)
         self.used = [i for i, number in enumerate(count) if number >= length]
         smoother = Smoother([sequences[i] for i in self.used])
         self.variance = smoother.variance
@@ -98,9 +98,9 @@ class Windows:
         return self.sub * (self.length - 1)
 
     def around(self, system: System) -> Surroundings:
-        """What people walk among where ``system`` simulates them."""
+        """The surroundings of the people whom ``system`` simulates."""
         scene = system.scene(self.batch)
-        # people see what ``Surroundings`` holds; copies for many runs need no whole paths
+        # terms read the paths from ``Surroundings``, so copies for many runs need only two samples
         scene.measured, scene.measured_rate = scene.measured[:2], scene.measured_rate[:2]
         force: Any = system.find_law("social_force")
         if force is not None and scene.wall.shape[1]:
@@ -127,7 +127,8 @@ def _piece(item: Sequence, time: np.ndarray, x: np.ndarray, v: np.ndarray) -> Se
 
 
 def _park(batch: Batch) -> None:
-    """Move the padding far from everything, also from its destination: directions stay finite."""
+    """Move padding agents far away from all others and from their destinations, so that directions
+    are finite."""
     far = PADDING_GAP * torch.arange(1, batch.x.shape[2] + 1, dtype=batch.x.dtype)
     place = far[:, None].expand(-1, 2)
     batch.x = torch.where(batch.agent[..., None], batch.x, place)
@@ -140,9 +141,9 @@ def _near(scene: Scene, x: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor
     radius = torch.linalg.vector_norm(x - middle, dim=-1).amax(0)
     d = torch.linalg.vector_norm(middle[:, :, None] - scene.wall[:, None], dim=-1)
     real = (d < reach + radius[..., None]) & scene.wall_point[:, None]
-    most = max(int(real.sum(-1).max()), 1)
-    # real points first, then any others, which the mask leaves out
-    index = torch.argsort((~real).to(torch.int8), dim=-1, stable=True)[..., :most]
+    n_points = max(int(real.sum(-1).max()), 1)
+    # real points first; the mask excludes the others
+    index = torch.argsort((~real).to(torch.int8), dim=-1, stable=True)[..., :n_points]
     places = index[..., None].expand(*index.shape, 2)
     shape = (*real.shape, 2)
     wall = scene.wall[:, None].expand(shape).gather(2, places)

@@ -1,1 +1,1 @@
-"""What may be said of it: verdicts, and the sealed clusters that confirm them or not."""
+"""Verdicts on the selected effects, and their confirmation on held-back clusters."""

@@ -1,9 +1,9 @@
-"""Agents' own numbers, held out: from the first part of their time, tried on the later part.
+"""Held-out test of agent-specific parameters: estimated early, tested on the later part.
 
-Variance, shrinkage and settings come from the open clusters, an agent's number from the first part
-of the time in which he and those around him are seen in the sealed sequences; the score is that of
-the last part, simulated from the state in which it begins. What predicts as well from the same
-first part stands beside it.
+Variance, shrinkage and settings are estimated in the exploration clusters. In the confirmation
+sequences, an agent's parameter is estimated from the first part of the time in which the agent and
+its neighbours are observed. Errors are those of the last part, simulated from its first state. They
+are compared with the errors of simpler predictions from the same first part.
 """
 
 from __future__ import annotations
@@ -14,115 +14,121 @@ import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
-from nnode.discover.found import Simulation
-from nnode.discover.judge.confirm import Comparing, windows_of
-from nnode.discover.statistics.random_effects import Individuals, numbers, with_people
+from nnode.discover.judge.model_comparison import ModelComparison, windows_of
+from nnode.discover.outcome import Simulation
+from nnode.discover.statistics.random_effects import (
+    IndividualEstimate,
+    agent_parameters,
+    with_agent_parameters,
+)
 from nnode.errors import DataError, SimulationError
 from nnode.model.system import Crowd, System
 
-#: Shares of the time: the first part, and from where on the last part begins. What lies between
-#: keeps moods from carrying over.
+#: Shares of the time: the end of the first part and the begin of the last part. The gap between
+#: them lets transient deviations decay.
 FIRST, LAST = 0.4, 0.6
 #: Samples that each part needs.
 LEAST = 4
 
-#: Who predicts: the models, and those that know no law.
+#: Names of the compared models.
 MODELS = ("without numbers", "own numbers", "one number per sequence")
 
 
 @dataclass
-class Later:
+class HeldOutErrors:
     """Errors in the last part of each sequence.
 
     Attributes:
         used: positions of the sequences that are long enough.
-        costs: ``(U,)`` mean square errors, m², by who predicts: :data:`MODELS` and
-            ``base`` (the model as it was given), ``own mean velocity``, ``constant velocity``.
-        leaning: ``(G,)`` of the others of :data:`MODELS` towards own numbers, by cluster, see
-            :meth:`Comparing.leaning`.
-        floor: of the measurement, m².
-        simulated: whose errors the costs of ``base`` and of own numbers are.
+        costs: ``(U,)`` mean square errors, m², of :data:`MODELS`, of ``base`` (the model as it was
+            given), ``own mean velocity`` and ``constant velocity``.
+        score_toward: ``(G,)`` scores of the other :data:`MODELS` toward the one with agent-specific
+            parameters, by cluster, see :meth:`ModelComparison.score_toward`.
+        floor: the variance of the measurement noise, m².
+        simulated: the simulations of ``base`` and of agent-specific parameters.
     """
 
     used: list[int]
     costs: dict[str, np.ndarray]
-    leaning: dict[str, np.ndarray]
+    score_toward: dict[str, np.ndarray]
     floor: float
     simulated: tuple[list[Simulation | None], list[Simulation | None]]
 
 
-def later(
+def held_out_errors(
     domain: str,
     base: System,
     system: System,
-    one: Individuals,
+    estimate: IndividualEstimate,
     sequences: list[Sequence],
     label: np.ndarray,
-) -> Later | None:
-    """None where no sequence is long enough.
+) -> HeldOutErrors | None:
+    """The errors in the last part; None if no sequence is long enough.
 
     Args:
         base: the model as it was given. system: with the population's effects.
-        one: an individual effect, of the open clusters.
-        sequences: sealed. label: ``(S,)`` their clusters.
+        estimate: of an individual effect in the exploration clusters.
+        sequences: of the confirmation set. label: ``(S,)`` their clusters.
     """
-    early, last, used = _parts(sequences)
-    if not used or not early:
+    early_pieces, late_pieces, used = _parts(sequences)
+    if not used or not early_pieces:
         return None
     try:
-        engine = windows_of(system, early)
-        engine.settle(system, ParameterVector(system).row)
+        engine = windows_of(system, early_pieces)
+        engine.fit_whitening(system, ParameterVector(system).row)
         people, shared = (
-            _carried(early, last, numbers(engine, system, one, common=common))
+            _carried(
+                early_pieces, late_pieces, agent_parameters(engine, system, estimate, common=common)
+            )
             for common in (False, True)
         )
-        comparing = Comparing(windows_of(system, last, label[used]), system)
-        each = {
+        comparison = ModelComparison(windows_of(system, late_pieces, label[used]), system)
+        models = {
             MODELS[0]: system,
-            MODELS[1]: with_people(system, one, people),
-            MODELS[2]: with_people(system, one, shared),
+            MODELS[1]: with_agent_parameters(system, estimate, people),
+            MODELS[2]: with_agent_parameters(system, estimate, shared),
         }
-        found = {name: comparing.squares(model) for name, model in each.items()}
-        leaning = {
-            name: comparing.leaning(model, each[MODELS[1]])
-            for name, model in each.items()
+        costs = {name: comparison.squares(model) for name, model in models.items()}
+        score_toward = {
+            name: comparison.score_toward(model, models[MODELS[1]])
+            for name, model in models.items()
             if name != MODELS[1]
         }
-        found["base"] = comparing.squares(base)
-        simulated = comparing.simulated(base), comparing.simulated(each[MODELS[1]])
+        costs["base"] = comparison.squares(base)
+        simulated = comparison.simulated(base), comparison.simulated(models[MODELS[1]])
     except (DataError, SimulationError):
         return None
     if domain == "crowd":
-        # an engine of people takes out what start states explain: to go straight on is no force
-        found["constant velocity"] = comparing.squares(Crowd([]))
+        # a crowd without forces moves at constant velocity, and start states are projected out
+        costs["constant velocity"] = comparison.squares(Crowd([]))
     else:
-        found |= _straight(early, last)
-    return Later(used, found, leaning, comparing.floor, simulated)
+        costs |= _constant_velocity_errors(early_pieces, late_pieces)
+    return HeldOutErrors(used, costs, score_toward, comparison.floor, simulated)
 
 
 def _parts(sequences: list[Sequence]) -> tuple[list[Sequence], list[Sequence], list[int]]:
     """Pieces of sequences in the first and in the last part of their agents' time, and the
-    positions of those that have a last one."""
-    seen: dict[Agent, tuple[float, float]] = {}
+    positions of the sequences that have a last piece."""
+    spans: dict[Agent, tuple[float, float]] = {}
     for s in sequences:
         for agent in _agents(s):
-            first, end = seen.get(agent, (np.inf, -np.inf))
-            seen[agent] = min(first, float(s.time[0])), max(end, float(s.time[-1]))
-    early, last, used = [], [], []
+            begin, finish = spans.get(agent, (np.inf, -np.inf))
+            spans[agent] = min(begin, float(s.time[0])), max(finish, float(s.time[-1]))
+    early, late, used = [], [], []
     for i, s in enumerate(sequences):
-        times = [seen[agent] for agent in _agents(s)]
-        start, end = min(first for first, _ in times), max(end for _, end in times)
-        length = end - start
-        before = _piece(s, start, start + FIRST * length)
-        after = _piece(s, start + LAST * length, end)
-        early += [] if before is None else [before]
-        if after is not None:
-            last.append(after)
+        times = [spans[agent] for agent in _agents(s)]
+        start, finish = min(begin for begin, _ in times), max(finish for _, finish in times)
+        length = finish - start
+        early_piece = _piece(s, start, start + FIRST * length)
+        late_piece = _piece(s, start + LAST * length, finish)
+        early += [] if early_piece is None else [early_piece]
+        if late_piece is not None:
+            late.append(late_piece)
             used.append(i)
-    return early, last, used
+    return early, late, used
 
 
-#: Site, sequence where there are no identifiers, and who.
+#: Site, sequence (empty if agents have identifiers), and agent.
 Agent = tuple[str, str, str]
 
 
@@ -133,7 +139,7 @@ def _agents(s: Sequence) -> list[Agent]:
 
 
 def _piece(sequence: Sequence, start: float, end: float) -> Sequence | None:
-    """What of a sequence lies between two times; None where it is too short."""
+    """The part of a sequence between two times; None if it is too short."""
     part = (sequence.time >= start - 1e-6) & (sequence.time <= end + 1e-6)
     if part.sum() < LEAST:
         return None
@@ -148,39 +154,44 @@ def _piece(sequence: Sequence, start: float, end: float) -> Sequence | None:
 
 
 def _carried(
-    early: list[Sequence], last: list[Sequence], people: dict[str, list[float]]
+    early: list[Sequence], late: list[Sequence], people: dict[str, list[float]]
 ) -> dict[str, list[float]]:
-    """The numbers of the agents of the last parts: the mean of those of their first parts."""
-    known: dict[Agent, list[float]] = {}
+    """The agents' parameters in the last parts: the mean of their estimates in the first parts."""
+    early_numbers: dict[Agent, list[float]] = {}
     for s in early:
         for agent, number in zip(_agents(s), people[s.name], strict=False):
-            known.setdefault(agent, []).append(number)
-    return {s.name: [float(np.mean(known.get(agent, [0.0]))) for agent in _agents(s)] for s in last}
+            early_numbers.setdefault(agent, []).append(number)
+    return {
+        s.name: [float(np.mean(early_numbers.get(agent, [0.0]))) for agent in _agents(s)]
+        for s in late
+    }
 
 
-def _straight(early: list[Sequence], last: list[Sequence]) -> dict[str, np.ndarray]:
-    """Errors of followers who keep the mean, or the last, velocity of the first part; who has none
-    keeps the mean of all."""
+def _constant_velocity_errors(early: list[Sequence], late: list[Sequence]) -> dict[str, np.ndarray]:
+    """Errors of followers who keep the mean, or the last, velocity of their first part. Followers
+    without a first part keep the mean velocity of all."""
     mean: dict[Agent, list[float]] = {}
     final: dict[Agent, tuple[float, float]] = {}
     for s in early:
-        known = max(2, min(s.n_samples, int(1.0 / s.dt) + 1))
+        n_last = max(2, min(s.n_samples, int(1.0 / s.dt) + 1))
         for n, agent in enumerate(_agents(s)):
             x = s.x[:, n, 0]
             mean.setdefault(agent, []).append((x[-1] - x[0]) / (s.dt * (len(x) - 1)))
-            speed = (x[-1] - x[-known]) / (s.dt * (known - 1))
+            speed = (x[-1] - x[-n_last]) / (s.dt * (n_last - 1))
             final[agent] = max(final.get(agent, (-np.inf, 0.0)), (float(s.time[-1]), speed))
-    usual = float(np.mean([np.mean(own) for own in mean.values()]))
+    overall_mean = float(np.mean([np.mean(agent_speeds) for agent_speeds in mean.values()]))
     speeds = {
-        "own mean velocity": {agent: float(np.mean(own)) for agent, own in mean.items()},
+        "own mean velocity": {
+            agent: float(np.mean(agent_speeds)) for agent, agent_speeds in mean.items()
+        },
         "constant velocity": {agent: speed for agent, (_, speed) in final.items()},
     }
-    found = {}
-    for name, known_speeds in speeds.items():
+    errors = {}
+    for name, speed_of in speeds.items():
         costs = []
-        for s in last:
-            speed = np.array([known_speeds.get(agent, usual) for agent in _agents(s)[:-1]])
-            away = s.x[:, :-1, 0] - s.x[0, :-1, 0] - speed * (s.time - s.time[0])[:, None]
-            costs.append(float((away[1:] ** 2).mean()))
-        found[name] = np.array(costs)
-    return found
+        for s in late:
+            speed = np.array([speed_of.get(agent, overall_mean) for agent in _agents(s)[:-1]])
+            deviation = s.x[:, :-1, 0] - s.x[0, :-1, 0] - speed * (s.time - s.time[0])[:, None]
+            costs.append(float((deviation[1:] ** 2).mean()))
+        errors[name] = np.array(costs)
+    return errors

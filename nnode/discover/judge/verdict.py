@@ -1,5 +1,4 @@
-"""What follows from a search: coefficients, what is absent, what could not be tested, what is
-left."""
+"""Conclusions of a selection: coefficients, bounds of absent effects, unexplained structure."""
 
 from __future__ import annotations
 
@@ -9,12 +8,12 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from nnode.discover.judge.measure_next import advised
+from nnode.discover.judge.measure_next import best_profile
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.locate.curves import tail
 from nnode.discover.locate.symbolic import symbolic
 from nnode.discover.name.candidate import Candidate
-from nnode.discover.name.search import Search, Step, apart_at
+from nnode.discover.name.search import Selection, Step, apart_at
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.variables import Curves
@@ -29,9 +28,9 @@ from nnode.discover.result import (
 )
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import clusters_to_tell
-from nnode.discover.statistics.power import Way
+from nnode.discover.statistics.power import PowerSimulation
 from nnode.discover.statistics.profile import intervals as edge_intervals
-from nnode.discover.statistics.random_effects import Individuals
+from nnode.discover.statistics.random_effects import IndividualEstimate
 from nnode.discover.statistics.score import Evidence, Score
 from nnode.model.effects import Effect
 from nnode.model.extend import place_of
@@ -44,7 +43,7 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
     """An accepted effect with its coefficients in a fit.
 
     Args:
-        confirmed: p-value of the sealed clusters.
+        confirmed: p-value of the confirmation clusters.
     """
     effect = step.chosen.score.effect
     coefficients = _coefficients(engine, fit, step)
@@ -56,14 +55,14 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
         where=_where(effect, coefficients, step.chosen.score.options),
         alternatives=[
             Alternative(
-                name=other.name,
-                loss=float(other.losses.sum() / step.chosen.losses.sum()),
+                name=rival.name,
+                loss=float(rival.losses.sum() / step.chosen.losses.sum()),
                 p_value=test.p_value,
                 separated_by=effect.distinguishing_data,
-                clusters=clusters_to_tell(test, apart_at(step.chosen, other)),
-                profile=_profile(engine, fit, other, apart_at(step.chosen, other)),
+                clusters=clusters_to_tell(test, apart_at(step.chosen, rival)),
+                profile=_profile(engine, fit, rival, apart_at(step.chosen, rival)),
             )
-            for other, test in step.rivals
+            for rival, test in step.rivals
         ],
         p_value=step.chosen.score.p_value,
         gain=step.chosen.gain.gain,
@@ -74,26 +73,26 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
 def _profile(engine: Engine, fit: Fit, rival: Candidate, level: float) -> Profile | None:
     if not isinstance(engine, TrafficEngine):
         return None
-    return advised(engine, fit.system, rival.fit.system, level)
+    return best_profile(engine, fit.system, rival.fit.system, level)
 
 
-def named_agents(one: Individuals, confirmed: float, order: int) -> NamedEffect:
-    """An individual effect that was confirmed, in a law of an order."""
-    effect = one.effect
-    found = {}
+def named_agents(estimate: IndividualEstimate, confirmed: float, order: int) -> NamedEffect:
+    """A confirmed individual effect, in a law of an order."""
+    effect = estimate.effect
+    coefficients = {}
     for name, strength in effect.strengths.items():
-        found[name] = Coefficient(one.sigma, *one.interval(), strength.unit)
+        coefficients[name] = Coefficient(estimate.sigma, *estimate.interval(), strength.unit)
     for name, setting in effect.settings.items():
-        value = float(one.options[name])
-        low, high = one.settings.get(name, (float("nan"), float("nan")))
-        found[name] = Coefficient(value, low, high, setting.unit)
+        value = float(estimate.options[name])
+        low, high = estimate.settings.get(name, (float("nan"), float("nan")))
+        coefficients[name] = Coefficient(value, low, high, setting.unit)
     return NamedEffect(
         name=effect.name,
         formula=effect.formula_for(order),
         source=effect.source,
-        coefficients=found,
+        coefficients=coefficients,
         where="everybody, everywhere",
-        p_value=one.p_value,
+        p_value=estimate.p_value,
         confirmed=confirmed,
     )
 
@@ -101,73 +100,77 @@ def named_agents(one: Individuals, confirmed: float, order: int) -> NamedEffect:
 def _coefficients(engine: Engine, fit: Fit, step: Step) -> dict[str, Coefficient]:
     effect = step.chosen.score.effect
     place = place_of(fit.system, effect.name)
-    own = fit.system.terms[place]
+    term = fit.system.terms[place]
     intervals = fit.intervals(engine.cluster)
     edges = edge_intervals(engine, fit, effect.name) if effect.consecutive else {}
-    found = {}
+    coefficients = {}
     units = {name: strength.unit for name, strength in effect.strengths.items()}
     units |= {name: setting.unit for name, setting in effect.settings.items()}
     for name, unit in units.items():
-        value = float(getattr(own, name).detach())
+        value = float(getattr(term, name).detach())
         full = f"terms.{place}.{name}"
         low, high = value, value
         if full in fit.names:
             low, high = (float(end) for end in intervals[fit.names.index(full)])
         low, high = edges.get(name, (low, high))
-        found[name] = Coefficient(value, low, high, unit)
-    return found
+        coefficients[name] = Coefficient(value, low, high, unit)
+    return coefficients
 
 
-def _where(effect: type[Effect], found: dict[str, Coefficient], options: dict[str, Any]) -> str:
+def _where(
+    effect: type[Effect], coefficients: dict[str, Coefficient], options: dict[str, Any]
+) -> str:
     if effect.consecutive:
-        what = "x" if found["a"].unit == "m" else "t"
-        return f"{what} in [{found['a'].value:.4g}, {found['b'].value:.4g}] {found['a'].unit}"
+        what = "x" if coefficients["a"].unit == "m" else "t"
+        a, b = coefficients["a"], coefficients["b"]
+        return f"{what} in [{a.value:.4g}, {b.value:.4g}] {a.unit}"
     if "kind" in options:
         return f"vehicles of class {options['kind']}"
-    if {"x_o", "y_o"} <= set(found):
-        return f"around ({found['x_o'].value:.2f}, {found['y_o'].value:.2f}) m"
+    if {"x_o", "y_o"} <= set(coefficients):
+        return f"around ({coefficients['x_o'].value:.2f}, {coefficients['y_o'].value:.2f}) m"
     return "everybody, everywhere"
 
 
-def absences(search: Search, way: Way) -> list[Absence]:
-    """What the final screening says of the effects that were not found, by the power of the whole
-    way."""
-    return [_absence(score, way) for score in search.scores]
+def absences(search: Selection, power: PowerSimulation) -> list[Absence]:
+    """Bounds of the effects that were not selected, by the power of the whole procedure."""
+    return [_absence(score, power) for score in search.scores]
 
 
-def _absence(score: Score, way: Way) -> Absence:
+def _absence(score: Score, power: PowerSimulation) -> Absence:
     effect = score.effect
     if not effect.strengths:
-        return _without_strength(score, way)
-    # the strength that is known best in units of what is plausible
+        return _without_strength(score, power)
+    # the strength with the smallest error relative to its expected size
     name = min(effect.strengths, key=lambda n: _relative(effect, n, score.error.get(n, 0.0)))
     strength, k = effect.strengths[name], list(effect.strengths).index(name)
     amount, error = score.amount.get(name, 0.0), score.error.get(name, math.inf)
-    known = error > 0 and math.isfinite(error) and bool(score.evidence)
-    expected, detectable, least, where = strength.expected, math.inf, 0.0, ""
-    if known and effect.consecutive:
-        # the interval that explains most was chosen for chance: one of median precision is judged
-        one = sorted(score.evidence, key=lambda each: each.error)[len(score.evidence) // 2]
-        detectable, amount, error = way.detectable(score, one, expected), one.amount, one.error
+    estimable = error > 0 and math.isfinite(error) and bool(score.evidence)
+    expected, detectable, smallest_tested, where = strength.expected, math.inf, 0.0, ""
+    if estimable and effect.consecutive:
+        # the interval that explains most was selected: one of median precision is judged instead
+        by_precision = sorted(score.evidence, key=lambda evidence: evidence.error)
+        median = by_precision[len(by_precision) // 2]
+        detectable = power.detectable(score, median, expected)
+        amount, error = median.amount, median.error
         where = (
-            f"from {one.options['a']:.0f} to {one.options['b']:.0f} {effect.settings['a'].unit}; "
-            "half of the intervals of this length are known better"
+            f"from {median.options['a']:.0f} to {median.options['b']:.0f} "
+            f"{effect.settings['a'].unit}; half of the intervals of this length are known better"
         )
-    elif known and effect.remembers():
-        # what was tried at a size says nothing of smaller ones
-        found = [
-            max(one.size, way.detectable(score, one, max(one.size, expected)))
-            for one in score.evidence
+    elif estimable and effect.remembers():
+        # a trace of finite strength does not apply to smaller strengths
+        detectable_sizes = [
+            max(evidence.size, power.detectable(score, evidence, max(evidence.size, expected)))
+            for evidence in score.evidence
         ]
-        best = int(np.argmin(found))
-        detectable, least = found[best], score.evidence[best].size
-    elif known:
-        detectable = way.detectable(
+        best = int(np.argmin(detectable_sizes))
+        detectable, smallest_tested = detectable_sizes[best], score.evidence[best].size
+    elif estimable:
+        detectable = power.detectable(
             score, score.evidence[min(k, len(score.evidence) - 1)], expected
         )
-    degrees = max(len(way.screen.costs(effect.name)) - 1, 1)
-    bound = max(least, abs(amount) + float(stats.t.ppf(0.975, degrees)) * error)
-    testable = known and detectable <= expected
+    degrees = max(len(power.screen.costs(effect.name)) - 1, 1)
+    bound = max(smallest_tested, abs(amount) + float(stats.t.ppf(0.975, degrees)) * error)
+    testable = estimable and detectable <= expected
     unit = "" if strength.unit == "1" else f" {strength.unit}"
     return Absence(
         name=effect.name,
@@ -185,16 +188,16 @@ def _absence(score: Score, way: Way) -> Absence:
     )
 
 
-def _without_strength(score: Score, way: Way) -> Absence:
-    """Of an effect that is there or not: the weakest of its settings that would be named."""
+def _without_strength(score: Score, power: PowerSimulation) -> Absence:
+    """The bound of an effect without a strength: the weakest setting that would be named."""
     effect = score.effect
     name, setting = next(iter(effect.settings.items()))
-    found = [
-        one
-        for one in score.evidence
-        if one.grams.sum() > 0 and way.power(score, one, 1.0) >= rules().power
+    detectable_settings = [
+        evidence
+        for evidence in score.evidence
+        if evidence.grams.sum() > 0 and power.power(score, evidence, 1.0) >= rules().power
     ]
-    weakest = min(found, key=_information, default=None)
+    weakest = min(detectable_settings, key=_information, default=None)
     value = None if weakest is None else float(weakest.options[name])
     return Absence(
         effect.name,
@@ -207,18 +210,18 @@ def _without_strength(score: Score, way: Way) -> Absence:
     )
 
 
-def _information(one: Evidence) -> float:
-    return float(one.grams.sum())
+def _information(evidence: Evidence) -> float:
+    return float(evidence.grams.sum())
 
 
-def agents_absent(one: Individuals, alpha: float, enough: bool) -> Absence:
-    """What the open clusters say of numbers that nobody was found to have of his own."""
-    (name,) = one.effect.strengths
-    strength = one.effect.strengths[name]
-    detectable, (_, high) = one.detectable(alpha), one.interval()
-    testable = enough and 0 < detectable <= strength.expected
+def agents_absent(estimate: IndividualEstimate, alpha: float, enough_clusters: bool) -> Absence:
+    """The bound of differences between agents that were not significant."""
+    (name,) = estimate.effect.strengths
+    strength = estimate.effect.strengths[name]
+    detectable, (_, high) = estimate.detectable(alpha), estimate.interval()
+    testable = enough_clusters and 0 < detectable <= strength.expected
     return Absence(
-        one.effect.name,
+        estimate.effect.name,
         testable,
         name,
         strength.unit,
@@ -237,60 +240,60 @@ def _relative(effect: type[Effect], name: str, error: float) -> float:
     return error / effect.strengths[name].expected if error > 0 else math.inf
 
 
-def places(found: list[Curves], excess: float) -> list[Place]:
-    """Where each curve is largest of where it stands out, the one that explains most first.
+def places(curves: list[Curves], excess: float) -> list[Place]:
+    """The interval of each significant curve around its largest height, in the curves' order.
 
     Args:
-        found: with what they remove.
-        excess: share of the squared errors that is not noise of the measurement.
+        curves: with the shares that they remove.
+        excess: share of the squared errors that is not measurement noise.
     """
     result = []
-    number = sum(len(one.heights) for one in found)
-    for one in found:
-        chance = tail(one, number)
-        known = chance <= rules().sure
-        if not known.any() or one.removed <= 0:
+    number = sum(len(curve.heights) for curve in curves)
+    for curve in curves:
+        p_values = tail(curve, number)
+        significant = p_values <= rules().sure
+        if not significant.any() or curve.removed <= 0:
             continue
-        best = int(np.argmax(np.where(known, np.abs(one.heights), 0.0)))
-        sign = np.sign(one.statistic)
-        alike = (sign == sign[best]) & (np.abs(one.statistic) > WIDE)
-        first = last = best
-        while first > 0 and alike[first - 1]:
-            first -= 1
-        while last < len(alike) - 1 and alike[last + 1]:
-            last += 1
-        part = slice(first, last + 1)
-        weight = 1 / one.errors[part] ** 2
-        mean = float((one.heights[part] * weight).sum() / weight.sum())
-        knots = one.variable.knots
+        best = int(np.argmax(np.where(significant, np.abs(curve.heights), 0.0)))
+        sign = np.sign(curve.statistic)
+        same_sign = (sign == sign[best]) & (np.abs(curve.statistic) > WIDE)
+        left = right = best
+        while left > 0 and same_sign[left - 1]:
+            left -= 1
+        while right < len(same_sign) - 1 and same_sign[right + 1]:
+            right += 1
+        part = slice(left, right + 1)
+        weight = 1 / curve.errors[part] ** 2
+        mean = float((curve.heights[part] * weight).sum() / weight.sum())
+        knots = curve.variable.knots
         result.append(
             Place(
-                variable=one.variable.name,
-                unit=one.variable.unit,
-                low=knots[first],
-                high=knots[last],
+                variable=curve.variable.name,
+                unit=curve.variable.unit,
+                low=knots[left],
+                high=knots[right],
                 deviation=mean,
                 error=float(1 / math.sqrt(weight.sum())),
-                share=min(one.removed / excess, 1.0),
-                p_value=float(chance[best]),
+                share=min(curve.removed / excess, 1.0),
+                p_value=float(p_values[best]),
                 curve={
                     "at": list(knots),
-                    "deviation": one.heights.tolist(),
-                    "error": one.errors.tolist(),
+                    "deviation": curve.heights.tolist(),
+                    "error": curve.errors.tolist(),
                 },
             )
         )
     return result
 
 
-def structure(found: list[Curves]) -> Structure:
-    """What is left, by the curves that are significant."""
-    best = found[0]
-    at = np.array(best.variable.knots)
+def structure(curves: list[Curves]) -> Structure:
+    """Unexplained structure, described by the significant curves."""
+    best = curves[0]
+    knots = np.array(best.variable.knots)
     return Structure(
-        variables=[one.variable.name for one in found],
+        variables=[curve.variable.name for curve in curves],
         gain=best.removed,
-        hint=symbolic(best.variable.name, at, best.heights, best.errors),
-        curve={"at": at.tolist(), "deviation": best.heights.tolist()},
+        hint=symbolic(best.variable.name, knots, best.heights, best.errors),
+        curve={"at": knots.tolist(), "deviation": best.heights.tolist()},
         unit=best.variable.unit,
     )

@@ -1,1 +1,1 @@
-"""What only traffic needs: residuals of whole platoons behind their measured leader."""
+"""The engines of lanes: residuals of platoons behind their measured leader."""

@@ -1,4 +1,4 @@
-"""Traffic: whole platoons are simulated behind their measured leader."""
+"""Engine of lanes: platoons are simulated behind their measured leader."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from torch import Tensor, nn
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.found import Simulation
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
+from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
@@ -35,37 +35,37 @@ from nnode.simulation.rhs import RightHandSide, formula_of, rates_along
 #: Longest step of the simulation, s, by the law's order. Steps are no longer than the shortest time
 #: constant of the states that terms own.
 STEP = {1: 0.4, 2: 0.2}
-#: That of laws which say what holds one step later, s: SUMO's usual one.
+#: Longest step of laws that are maps from step to step, s: SUMO's default.
 MAPPED = 0.1
-#: Sequences are compared in windows of about this length, s, each simulated from so much
-#: before (at most a share of the sequence) that its start is forgotten.
+#: Length of the windows in which sequences are compared, s; the preceding time in which the
+#: influence of the start decays, s, and its largest share of the sequence.
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
-#: Whitened residuals beyond this count less.
+#: Threshold of Huber's loss for whitened residuals.
 LARGE = 6.0
-#: Change of an agent's number by which derivatives are taken.
+#: Difference of an agent's parameter for derivatives.
 SMALL = 1e-4
-#: Numbers of sequences times changes whose response is computed at once: so many fit the cache.
+#: Number of sequences times changes whose response is computed at once; so many fit the cache.
 BLOCK = 4096
-#: Most past samples that a filter looks at.
+#: Largest order of the autoregressive filter.
 ORDER = 6
 
 
 class TrafficEngine:
     """Residuals of platoons; see :class:`~nnode.discover.residuals.engine.Engine`.
 
-    Only the leader's path and the starts are taken from the measurement, smoothed. Followers are
-    simulated behind each other, so that no follower's noise enters the right-hand side. A law of
-    following forgets its start within some seconds: windows keep the simulated paths near the
-    measured ones, also where the model is quite wrong, and lose little.
+    Only the leader's path and the starts are taken from the smoothed measurement. Followers are
+    simulated behind each other, so that no follower's noise enters the right-hand side. Because the
+    influence of the start decays within seconds, windows lose little information. They keep the
+    simulated paths near the measured ones, even if the model is very wrong.
 
     Args:
         sequences: at least one, of the same sampling interval.
         window: length of a window, s; infinite simulates whole sequences.
         clusters: ``(S,)`` of the sequences; None: each is one.
-        large: residuals beyond this count less.
+        large: threshold of Huber's loss.
 
     Attributes:
-        unit: ``(n,)`` agents whose own numbers are estimated together: those of a sequence.
+        unit: ``(n,)`` agents whose parameters are estimated jointly: those of a sequence.
         people: of each unit, per direction the sequence and the place of its agent.
     """
 
@@ -82,20 +82,20 @@ class TrafficEngine:
         self.batch = collate(part[0] for each in parts for part in each)
         smoothed = [_windows(_smoothed(sequence), window) for sequence in sequences]
         self.smoothed = collate(part[0] for each in smoothed for part in each)
-        owner = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
+        sequence_of = np.repeat(np.arange(len(parts)), [len(each) for each in parts])
         leader = self.batch.agent.sum(1) - 1
         index = torch.arange(self.batch.x.shape[2])
         follower = self.batch.agent & (index != leader[:, None])
         self.follows = self.batch.valid & follower
-        # the start is given, and tells of disturbances that still go on
-        first = [part[1] for each in parts for part in each]
+        # the start is given, and contains disturbances that continue
+        n_skipped = [part[1] for each in parts for part in each]
         time = torch.arange(self.batch.n_samples)[:, None]
-        self.seen = self.follows & (time > torch.tensor(first))[..., None]
+        self.compared = self.follows & (time > torch.tensor(n_skipped))[..., None]
         self.filter = PlatoonFilter.none()
         self._last: tuple[System, Tensor, Tensor] | None = None
         self._response: tuple[System, Tensor, LinearResponse] | None = None
-        k, b, _ = (axis.numpy() for axis in torch.nonzero(self.seen, as_tuple=True))
-        self.sequence = owner[b]
+        k, b, _ = (axis.numpy() for axis in torch.nonzero(self.compared, as_tuple=True))
+        self.sequence = sequence_of[b]
         self.cluster = of_residuals(clusters, self.sequence)
         self.clock = self.batch.start.numpy()[b] + k * self.batch.dt
         self.component = np.zeros(len(b), dtype=int)
@@ -105,10 +105,10 @@ class TrafficEngine:
         ]
 
     def noise_floor(self) -> float:
-        """Mean square error of positions that is noise of the measurement, m²."""
-        found = [noise_variance(s.x[:, :-1]) for s in self.sequences if s.n_samples > 4]
+        """Mean square error of positions due to measurement noise, m²."""
+        variances = [noise_variance(s.x[:, :-1]) for s in self.sequences if s.n_samples > 4]
         weight = [s.n_samples * (s.n_agents - 1) for s in self.sequences if s.n_samples > 4]
-        return float(np.average(found, weights=weight)) if found else float("nan")
+        return float(np.average(variances, weights=weight)) if variances else float("nan")
 
     @np.errstate(all="ignore")
     def simulate(self, system: System, rows: Tensor) -> Tensor:
@@ -116,8 +116,8 @@ class TrafficEngine:
         batch, longest = self.smoothed, self._longest(system, rows)
         scene = replace(system.scene(batch), step=self._step(longest))
         rhs = RightHandSide(system, scene, ParameterVector(system).runs(rows))
-        found = simulated(rhs, rhs.start(batch), batch.dt, batch.n_samples, longest)
-        return torch.from_numpy(found).permute(3, 0, 4, 2, 1).contiguous()
+        states = simulated(rhs, rhs.start(batch), batch.dt, batch.n_samples, longest)
+        return torch.from_numpy(states).permute(3, 0, 4, 2, 1).contiguous()
 
     def _longest(self, system: System, rows: Tensor) -> float:
         """Longest step, s."""
@@ -137,12 +137,14 @@ class TrafficEngine:
         with torch.no_grad():
             states = self.simulate(system, rows)
         self._last = system, rows[0].clone(), states[0]
-        away = self.batch.x[..., 0] - states[..., 0]
-        return torch.where(self.follows, away, 0.0)
+        difference = self.batch.x[..., 0] - states[..., 0]
+        return torch.where(self.follows, difference, 0.0)
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, n)`` whitened residuals, the largest drawn in."""
-        return drawn_in(self.filter(self.deviations(system, rows))[:, self.seen], self.large)
+        """``(R, n)`` whitened residuals, with Huber's loss for large ones."""
+        return huber_residuals(
+            self.filter(self.deviations(system, rows))[:, self.compared], self.large
+        )
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
         """``(K, n)`` derivatives of the residuals, by linear response."""
@@ -157,25 +159,27 @@ class TrafficEngine:
         response; the change by the effect as a whole where it has no strength."""
         response = self.linear(system, row)
         if effect.remembers():
-            return self._whole(response, effect, probe)
+            return self._finite_change(response, effect, probe)
         base = response.rates(response.system)
         sources = [
             (response.rates(changed) - base) / step
-            for changed, step in changed_by_each(response.system, effect, probe)
+            for changed, step in with_each_strength(response.system, effect, probe)
         ]
         return self._columns(response, response.response(torch.stack(sources)))
 
-    def _whole(self, response: LinearResponse, effect: type[Effect], probe: Probe) -> Tensor:
-        """``(1, n)`` change of the residuals by an effect of finite strength; zero where vehicles
-        would be moved by more than all the road that was seen: that is no small change."""
-        changed, amount = changed_as_whole(response.system, effect, probe)
+    def _finite_change(
+        self, response: LinearResponse, effect: type[Effect], probe: Probe
+    ) -> Tensor:
+        """``(1, n)`` change of the residuals by an effect of finite strength; zero if it moves
+        vehicles by more than the observed road, because it is then not small."""
+        changed, amount = with_all_strengths(response.system, effect, probe)
         with torch.no_grad():
             x = self.simulate(changed, ParameterVector(changed).row[None])[0][..., 0]
-        moved = torch.where(self.follows, x - response.states[..., 0], 0.0)
-        seen = self.batch.x[..., 0][self.batch.valid]
-        if not float(moved.abs().max()) <= float(seen.max() - seen.min()):
-            moved = torch.zeros_like(moved)
-        return self._columns(response, moved[None] / amount)
+        displacement = torch.where(self.follows, x - response.states[..., 0], 0.0)
+        measured = self.batch.x[..., 0][self.batch.valid]
+        if not float(displacement.abs().max()) <= float(measured.max() - measured.min()):
+            displacement = torch.zeros_like(displacement)
+        return self._columns(response, displacement[None] / amount)
 
     def response(
         self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
@@ -187,60 +191,62 @@ class TrafficEngine:
         """
         linear = self.linear(system, row)
         k, b, n = linear.states.shape[:3]
-        found = [one.reshape(k, b, n).transpose(1, 2) for one in rates(linear.state())]
+        speeds = [speed.reshape(k, b, n).transpose(1, 2) for speed in rates(linear.state())]
         size = max(1, BLOCK // b)
         columns = []
-        for first in range(0, len(found), size):
-            source = torch.stack(found[first : first + size], 2).permute(2, 0, 3, 1)[..., None]
+        for start in range(0, len(speeds), size):
+            source = torch.stack(speeds[start : start + size], 2).permute(2, 0, 3, 1)[..., None]
             # rates of places, or of speeds, before which those of places do not change
             source = nn.functional.pad(source, (system.order - 1, 0))
             columns.append(self._columns(linear, linear.response(source)))
-        return torch.cat([one.T for one in columns], 1).T
+        return torch.cat([speed.T for speed in columns], 1).T
 
     def linear(self, system: System, row: Tensor) -> LinearResponse:
-        """The linear response of a run, kept until another one is asked for."""
-        known = self._response
-        if known is not None and known[0] is system and torch.equal(known[1], row):
-            return known[2]
-        last = self._last
-        if last is None or last[0] is not system or not torch.equal(last[1], row):
+        """The linear response of a run; the last one is cached."""
+        cached = self._response
+        if cached is not None and cached[0] is system and torch.equal(cached[1], row):
+            return cached[2]
+        previous = self._last
+        if previous is None or previous[0] is not system or not torch.equal(previous[1], row):
             self.deviations(system, row[None])
         assert self._last is not None
         fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
         step = self._step(self._longest(system, row[None]))
         scene = replace(fixed.scene(self.smoothed), step=step)
         with torch.no_grad():
-            found = LinearResponse(fixed, self.smoothed, scene, self._last[2])
-        self._response = system, row.clone(), found
-        return found
+            response = LinearResponse(fixed, self.smoothed, scene, self._last[2])
+        self._response = system, row.clone(), response
+        return response
 
-    def _columns(self, response: LinearResponse, moved: Tensor) -> Tensor:
-        """``(C, n)`` changes of the residuals by positions moved ``(C, K, B, N)``."""
-        away = self.batch.x[..., 0] - response.states[..., 0]
-        residual = self.filter(torch.where(self.follows, away, 0.0))[self.seen]
+    def _columns(self, response: LinearResponse, displacement: Tensor) -> Tensor:
+        """``(C, n)`` changes of the residuals by displacements ``(C, K, B, N)``."""
+        difference = self.batch.x[..., 0] - response.states[..., 0]
+        residual = self.filter(torch.where(self.follows, difference, 0.0))[self.compared]
         weight = weights_of(residual, self.large)
-        found = self.filter(torch.where(self.follows, -moved, 0.0)).permute(1, 2, 3, 0)[self.seen]
-        return torch.nan_to_num(found.mul_(weight[:, None])).T
+        white_columns = self.filter(torch.where(self.follows, -displacement, 0.0)).permute(
+            1, 2, 3, 0
+        )[self.compared]
+        return torch.nan_to_num(white_columns.mul_(weight[:, None])).T
 
-    def near(self, system: System) -> System:
-        """A copy whose law is fitted to the smoothed rates: simulations started from there do
-        not end in a far minimum. The regression itself is biased by noise, as a start it may."""
-        found, batch = copy.deepcopy(system), self.smoothed
-        if found.memory:
-            return found  # speeds alone do not tell of states that nobody measures
-        vector = ParameterVector(found)
+    def regression_start(self, system: System) -> System:
+        """A copy whose law is fitted to the smoothed rates by regression. The regression is biased
+        by noise, but calibrations that start there avoid distant local minima."""
+        fitted, batch = copy.deepcopy(system), self.smoothed
+        if fitted.memory:
+            return fitted  # memory states are not measured
+        vector = ParameterVector(fitted)
         low, high = vector.bounds
-        states, wanted = batch.x, batch.v[..., 0]
+        states, measured_rates = batch.x, batch.v[..., 0]
         if system.order > 1 and batch.n_samples > 1:
             states = torch.cat([batch.x, batch.v], -1)
-            wanted = torch.from_numpy(velocity(batch.v[..., 0].numpy(), batch.dt))
-        scene = found.scene(batch)
+            measured_rates = torch.from_numpy(velocity(batch.v[..., 0].numpy(), batch.dt))
+        scene = fitted.scene(batch)
 
         def missed(row: np.ndarray) -> np.ndarray:
             rates = rates_along(vector.fill_(row), scene, states)
             rate = rates[..., system.order - 1]
-            away: np.ndarray = (wanted - rate)[self.follows].numpy()
-            return np.nan_to_num(away, nan=1e3, posinf=1e3, neginf=-1e3)
+            misfit: np.ndarray = (measured_rates - rate)[self.follows].numpy()
+            return np.nan_to_num(misfit, nan=1e3, posinf=1e3, neginf=-1e3)
 
         start = np.clip(vector.row.numpy(), low, high)
         best = least_squares(missed, start, bounds=(low, high), loss="soft_l1", max_nfev=50)
@@ -248,21 +254,21 @@ class TrafficEngine:
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of the followers' positions."""
-        away = self.deviations(system, row[None])[0][self.seen].numpy()
-        return Squares(away**2, self.sequence)
+        difference = self.deviations(system, row[None])[0][self.compared].numpy()
+        return Squares(difference**2, self.sequence)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """Whole sequences behind their leaders; of engines without windows."""
-        away = self.deviations(system, row[None])[0].numpy()
-        found: list[Simulation | None] = []
+        difference = self.deviations(system, row[None])[0].numpy()
+        simulations: list[Simulation | None] = []
         for i, s in enumerate(self.sequences):
-            x = s.x[..., 0] - away[: s.n_samples, i, : s.n_agents]
+            x = s.x[..., 0] - difference[: s.n_samples, i, : s.n_agents]
             x[:, -1] = np.nan
-            found.append(Simulation(s, x[..., None], skip=1))
-        return found
+            simulations.append(Simulation(s, x[..., None], skip=1))
+        return simulations
 
     def variables(self) -> list[Variable]:
-        """What deviations of vehicles may depend on."""
+        """The variables on which deviations of vehicles may depend."""
         return traffic_variables(self.smoothed)
 
     def individual(
@@ -272,96 +278,96 @@ class TrafficEngine:
         each place of the platoon, in all sequences at once."""
         linear = self.linear(system, row)
         ((values, number),) = effect.directions(options)
-        present = [one for one in effects_of(linear.system) if isinstance(one, effect)]
-        now = present[0].people if present else {}
-        plain = without(linear.system, effect.name) if present else linear.system
+        effects = [term for term in effects_of(linear.system) if isinstance(term, effect)]
+        numbers = effects[0].people if effects else {}
+        without_effect = without(linear.system, effect.name) if effects else linear.system
         size = self.batch.agent.shape[1]
 
         def rates(place: int | None) -> Tensor:
-            people = {name: [*now.get(name, []), *[0.0] * size][:size] for name in self.names}
-            for own in people.values():
+            people = {name: [*numbers.get(name, []), *[0.0] * size][:size] for name in self.names}
+            for agent_numbers in people.values():
                 if place is not None:
-                    own[place] += number * SMALL
-            return linear.rates(extended(plain, effect(people=people, **values))[0])
+                    agent_numbers[place] += number * SMALL
+            return linear.rates(extended(without_effect, effect(people=people, **values))[0])
 
         base = rates(None)
         sources = [(rates(place) - base) / SMALL for place in range(size)]
         return self._columns(linear, linear.response(torch.stack(sources)))
 
-    def of(self, sequences: list[Sequence]) -> TrafficEngine:
-        """An engine of other sequences, in the filter of this one."""
-        found = TrafficEngine(sequences, np.inf, None, np.inf)
-        found.filter = self.filter
-        return found
+    def on_sequences(self, sequences: list[Sequence]) -> TrafficEngine:
+        """An engine of other sequences, with the filter of this one."""
+        engine = TrafficEngine(sequences, np.inf, None, np.inf)
+        engine.filter = self.filter
+        return engine
 
-    def settle(self, system: System, row: Tensor) -> None:
-        """Fit the filter to the residuals that a model leaves."""
+    def fit_whitening(self, system: System, row: Tensor) -> None:
+        """Fit the autoregressive filter to the residuals of a model."""
         shortest = int(self.batch.valid.any(-1).sum(0).min())
         order = min(ORDER, max(0, (shortest - 2) // 3))
-        away = self.deviations(system, row[None])[0]
-        self.filter = PlatoonFilter.fitted(away, self.seen, order)
+        difference = self.deviations(system, row[None])[0]
+        self.filter = PlatoonFilter.fitted(difference, self.compared, order)
 
 
-def drawn_in(residual: Tensor, most: float = LARGE) -> Tensor:
-    """Residuals whose squares are Huber's loss: a vehicle that breaks down does not outweigh
-    all others.
+def huber_residuals(residual: Tensor, threshold: float = LARGE) -> Tensor:
+    """Residuals whose squares are Huber's loss, so that an outlier, such as a vehicle that breaks
+    down, does not dominate.
 
     Source: Huber 1964.
     """
     size = residual.abs()
-    if math.isinf(most):
+    if math.isinf(threshold):
         return residual
-    large = torch.sqrt((2 * most * size - most**2).clamp(min=0)).copysign(residual)
-    return torch.where(size <= most, residual, large)
+    large = torch.sqrt((2 * threshold * size - threshold**2).clamp(min=0)).copysign(residual)
+    return torch.where(size <= threshold, residual, large)
 
 
-def weights_of(residual: Tensor, most: float) -> Tensor:
-    """Derivatives of :func:`drawn_in`: less than 1 for large residuals."""
-    size = drawn_in(residual, most).abs()
-    return torch.where(residual.abs() <= most, 1.0, most / size)
+def weights_of(residual: Tensor, threshold: float) -> Tensor:
+    """Derivatives of :func:`huber_residuals`: less than 1 for large residuals."""
+    size = huber_residuals(residual, threshold).abs()
+    return torch.where(residual.abs() <= threshold, 1.0, threshold / size)
 
 
-def changed_as_whole(system: System, effect: type[Effect], probe: Probe) -> tuple[System, float]:
-    """A model with an effect whose strengths are all varied by a probe's steps, and by how much;
-    by 1 where it varies none."""
+def with_all_strengths(system: System, effect: type[Effect], probe: Probe) -> tuple[System, float]:
+    """A model with an effect whose strengths are all changed by a probe's steps, and the size of
+    the step; 1 if the probe changes none."""
     values, amount = dict(probe.options), 1.0
     for name, step in probe.steps.items():
         values[name], amount = effect.strengths[name].neutral + step, step
     return extended(system, effect(**values))[0], amount
 
 
-def changed_by_each(
+def with_each_strength(
     system: System, effect: type[Effect], probe: Probe
 ) -> list[tuple[System, float]]:
-    """A model with an effect of which one strength at a time is varied by a probe's step, and by
-    how much; as it is, by 1, where the probe varies none."""
+    """Models with an effect of which one strength at a time is changed by a probe's step, with the
+    size of the step. If the probe changes none: the effect itself, and 1."""
     if not probe.steps:
-        return [changed_as_whole(system, effect, probe)]
-    each = [replace(probe, steps={name: step}) for name, step in probe.steps.items()]
-    return [changed_as_whole(system, effect, one) for one in each]
+        return [with_all_strengths(system, effect, probe)]
+    probes = [replace(probe, steps={name: step}) for name, step in probe.steps.items()]
+    return [with_all_strengths(system, effect, single) for single in probes]
 
 
 def fastest(system: System, rows: Tensor) -> float:
-    """The shortest time constant of the states that terms own, s; infinite where none do."""
+    """The shortest time constant of the states of terms, s; infinite without such states."""
     factors = {
         f"terms.{i}.{name}": factor
         for i, term in enumerate(system.terms)
         for name, factor in cast(Term, term).fast.items()
     }
-    found = [
+    constants = [
         factors[name] * float(rows[:, j].min())
         for j, name in enumerate(ParameterVector(system).names)
         if name in factors
     ]
-    return min(found, default=math.inf)
+    return min(constants, default=math.inf)
 
 
 def _windows(sequence: Sequence, length: float) -> list[tuple[Sequence, int]]:
     """Windows, and of each the number of samples after its start that are not compared.
 
-    What is compared are pieces of equal length that share their boundary sample; each is
-    preceded by the time in which a start is forgotten. Whole sequences are compared from their
-    start on.
+    The compared pieces have equal lengths and share their boundary samples. Each is preceded by
+    samples in which the influence of the start decays. Whole sequences are compared from their
+    start.
     """
     intervals = sequence.n_samples - 1
     if intervals < 1 or not math.isfinite(length):

@@ -1,13 +1,13 @@
-"""Traffic where drivers differ: every follower is simulated behind his own measured leader.
+"""Engine of lanes with random effects: followers are simulated behind their measured leaders.
 
-At the estimates of :mod:`nnode.population`, the deviations b of drivers and h of starts, a model f
-leaves of the measured positions y the residuals
+At the estimates of :mod:`nnode.population`, the deviations b of drivers and h of starts, the
+residuals of a model f for the measured positions y are
 
     V^(-1/2) (y - f(theta, b, h) + Z b + H h),    V = V0 + Z Omega Z' + H S H',
 
-V0 of pushes that last and of errors of measurement. Their sum of squares is that of generalised
-least squares. V, Z, H, b and h stay as they were estimated until the next estimate: all models of a
-diagnosis are compared in the same residuals.
+where V0 is the covariance of autocorrelated pushes and of measurement errors. Their sum of squares
+is that of generalised least squares. V, Z, H, b and h are fixed until the next estimate, so that
+all models of a diagnosis are compared with the same whitening.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
-from nnode.discover.found import Simulation
 from nnode.discover.lanes.engine import (
     LARGE,
     STEP,
     TrafficEngine,
-    changed_as_whole,
-    changed_by_each,
-    drawn_in,
+    huber_residuals,
     weights_of,
+    with_all_strengths,
+    with_each_strength,
 )
+from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Curve
 from nnode.model.effects import Effect, Probe
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State
-from nnode.population.drivers import Population, fit_again, fit_drivers
-from nnode.population.followers import Followers, Paths, Push, opposite, paths_of
+from nnode.population.drivers import Population, fit_drivers, refit
+from nnode.population.followers import Followers, Paths, Push, antithetic_draws, paths_of
 from nnode.population.likelihood import Whitening, marginal
 from nnode.simulation.numpy import strides
 from nnode.simulation.rhs import side_by_side
 
-#: Change of a curve's scale by which derivatives are taken.
+#: Difference of a curve's scale for derivatives.
 SCALE = 1e-3
 
 
@@ -54,7 +54,7 @@ class _Run:
 
     Attributes:
         system: the model, with the run's parameters. model: its followers.
-        own: ``(P, F)`` parameters of each follower.
+        parameters: ``(P, F)`` parameters of each follower.
         states: ``(K, M, F)``.
         step, after: the linear response, see :meth:`Followers.linear`.
         weight: ``(n,)`` of the residuals: less than 1 for large ones.
@@ -62,7 +62,7 @@ class _Run:
 
     system: System
     model: Followers
-    own: np.ndarray
+    parameters: np.ndarray
     states: np.ndarray
     step: np.ndarray
     after: np.ndarray
@@ -75,12 +75,12 @@ class FollowersEngine(TrafficEngine):
     Args:
         sequences: at least one, of the same sampling interval.
         clusters: ``(S,)`` of the sequences; None: each is one.
-        large: residuals beyond this count less.
-        like: an engine whose estimates hold here, whatever model is asked for; only deviations of
-            drivers and of starts are estimated.
+        large: threshold of Huber's loss.
+        like: an engine whose estimates are used for all models; only deviations of drivers and of
+            starts are estimated.
 
     Attributes:
-        population: what :meth:`settle` estimated last; None before.
+        population: the last estimate of :meth:`fit_whitening`; None before.
     """
 
     def __init__(
@@ -92,14 +92,14 @@ class FollowersEngine(TrafficEngine):
     ) -> None:
         super().__init__(sequences, np.inf, clusters, large)
         self.least = -np.inf
-        self._known, self._like = dict[tuple[int, int], Paths](), like
+        self._paths_by_step, self._like = dict[tuple[int, int], Paths](), like
         self._label = np.arange(len(sequences)) if clusters is None else np.asarray(clusters)
         self.population: Population | None = None
         self._whitening: Whitening | None = None
         self._last_run: tuple[System, Tensor, _Run] | None = None
         paths = self._paths(STEP[2])
-        self._seen = torch.from_numpy(paths.seen)
-        f, k = np.nonzero(paths.seen)
+        self._observed = torch.from_numpy(paths.observed)
+        f, k = np.nonzero(paths.observed)
         self.sequence = paths.sequence[f]
         self.cluster = of_residuals(clusters, self.sequence)
         self.clock = np.array([s.time[0] for s in sequences])[self.sequence] + k * paths.dt
@@ -107,30 +107,30 @@ class FollowersEngine(TrafficEngine):
         self.unit = self.sequence
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, n)`` whitened residuals, the largest drawn in."""
-        away = self._away(system, rows)[0]
-        return drawn_in(self._whitened(away.transpose(2, 1, 0)), self.large)
+        """``(R, n)`` whitened residuals, with Huber's loss for large ones."""
+        difference = self._pseudo_residuals(system, rows)[0]
+        return huber_residuals(self._whitened(difference.transpose(2, 1, 0)), self.large)
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of the followers' positions after the first sample, with the deviations
         of drivers and starts that are most likely under this model."""
-        later = self._seen.numpy() & (np.arange(self._seen.shape[1]) > 0)
-        sequence = np.repeat(self._paths(STEP[2]).sequence, later.sum(1))
-        return Squares(self._left(system, row)[later] ** 2, sequence)
+        compared = self._observed.numpy() & (np.arange(self._observed.shape[1]) > 0)
+        sequence = np.repeat(self._paths(STEP[2]).sequence, compared.sum(1))
+        return Squares(self._position_errors(system, row)[compared] ** 2, sequence)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
-        """The followers of each sequence, with these deviations."""
-        left, paths = self._left(system, row), self._paths(STEP[2])
-        found: list[Simulation | None] = []
+        """The simulated followers of each sequence, with the deviations of :meth:`squares`."""
+        errors, paths = self._position_errors(system, row), self._paths(STEP[2])
+        simulations: list[Simulation | None] = []
         for b, s in enumerate(self.sequences):
             x = np.full_like(s.x[..., 0], np.nan)
             for f in np.flatnonzero(paths.sequence == b):
-                x[:, paths.place[f]] = paths.x[f, : len(x)] - left[f, : len(x)]
-            found.append(Simulation(s, x[..., None], skip=1))
-        return found
+                x[:, paths.place[f]] = paths.x[f, : len(x)] - errors[f, : len(x)]
+            simulations.append(Simulation(s, x[..., None], skip=1))
+        return simulations
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
-        """``(K, n)`` derivatives of the residuals, by differences."""
+        """``(K, n)`` derivatives of the residuals, by finite differences."""
         _, curve = _parts(system)
         run = self._run_of(system, row)
         theta = run.model.at(row.numpy()[: len(run.model.names)])
@@ -145,7 +145,7 @@ class FollowersEngine(TrafficEngine):
             higher, lower = self._simulated(system, sides)[1][:, 0].transpose(1, 2, 0)
             scale = ((higher - lower) / (2 * SCALE))[..., None]
             columns = np.concatenate([columns, scale], -1)
-        return self._moved(run, columns)
+        return self._residual_changes(run, columns)
 
     def screen_columns(
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
@@ -154,14 +154,14 @@ class FollowersEngine(TrafficEngine):
         response; of an effect with a memory, the change by it as a whole."""
         run, changes = self._run_of(system, row), []
         if effect.remembers():
-            changed, amount = changed_as_whole(run.system, effect, probe)
-            return self._moved(run, self._finite(run, changed)[..., None] / amount)
-        base = run.model.rates(run.own, run.states)
-        for changed, size in changed_by_each(run.system, effect, probe):
+            changed, amount = with_all_strengths(run.system, effect, probe)
+            return self._residual_changes(run, self._displacement(run, changed)[..., None] / amount)
+        base = run.model.rates(run.parameters, run.states)
+        for changed, size in with_each_strength(run.system, effect, probe):
             model = self._model(changed, ParameterVector(changed).row)
-            own = model.spread(model.start, self._deviations(model)[0])
-            changes.append((model.rates(own, run.states) - base) / size)
-        return self._moved(run, self._propagated(run, np.stack(changes, 2)))
+            parameters = model.spread(model.start, self._deviations(model)[0])
+            changes.append((model.rates(parameters, run.states) - base) / size)
+        return self._residual_changes(run, self._propagate(run, np.stack(changes, 2)))
 
     def response(
         self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
@@ -173,82 +173,83 @@ class FollowersEngine(TrafficEngine):
         """
         run = self._run_of(system, row)
         paths, (k, _, f) = run.model.paths, run.states.shape
-        speed = run.model.rates(run.own, run.states)[0]
+        speed = run.model.rates(run.parameters, run.states)[0]
         time = torch.arange(k, dtype=torch.float64).repeat_interleave(f) * paths.dt
         scene = side_by_side(self._scene(run.model), k, at_samples=True)
-        state = _seen(run.model, time, run.states[:, 0], speed, paths.ahead_at_samples, scene)
-        found = [one[:, 0, 0].reshape(k, f).numpy() for one in rates(state)]
-        source = np.zeros((run.model.lane.order, k, len(found), f))
-        source[-1] = np.stack(found, 1)
-        return self._moved(run, self._propagated(run, source))
+        state = _state_of(run.model, time, run.states[:, 0], speed, paths.ahead_at_samples, scene)
+        speeds = [rate[:, 0, 0].reshape(k, f).numpy() for rate in rates(state)]
+        source = np.zeros((run.model.lane.order, k, len(speeds), f))
+        source[-1] = np.stack(speeds, 1)
+        return self._residual_changes(run, self._propagate(run, source))
 
-    def of(self, sequences: list[Sequence]) -> FollowersEngine:
-        """An engine of other sequences, in which the estimates of this one hold."""
+    def on_sequences(self, sequences: list[Sequence]) -> FollowersEngine:
+        """An engine of other sequences, with the estimates of this one."""
         assert self.population is not None
-        found = FollowersEngine(sequences, large=np.inf, like=self)
+        engine = FollowersEngine(sequences, large=np.inf, like=self)
         model = self.population.model
-        found.settle(model.system, ParameterVector(model.system).row)
-        return found
+        engine.fit_whitening(model.system, ParameterVector(model.system).row)
+        return engine
 
-    def settle(self, system: System, row: Tensor) -> None:
+    def fit_whitening(self, system: System, row: Tensor) -> None:
         """Estimate drivers, starts, pushes and their variances, with the model's parameters."""
         if self._like is not None and self._like.population is not None:
-            there = self._like.population
-            system, values = there.model.system, there.model.natural(there.estimate.theta)
-            row = torch.from_numpy(values)
+            population = self._like.population
+            system = population.model.system
+            row = torch.from_numpy(population.model.natural(population.estimate.theta))
         fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
-        paths, last = self._paths(self._longest(fixed, row[None])), self.population
-        before = last
-        if before is None and self._like is not None:
-            before = self._like.population
-        if before is None:
-            self._take(fit_drivers(fixed, paths, pairs=0))
+        paths, previous = self._paths(self._longest(fixed, row[None])), self.population
+        start = previous
+        if start is None and self._like is not None:
+            start = self._like.population
+        if start is None:
+            self._set_population(fit_drivers(fixed, paths, pairs=0))
         else:
-            self._take(fit_again(before, fixed, paths, fixed=self._like is not None))
+            self._set_population(refit(start, fixed, paths, fixed=self._like is not None))
 
-    def settle_among(self, systems: list[System]) -> None:
-        """Estimate with each of some models, and keep what the best of them says, by Schwarz's
-        criterion: what a missing effect does would be taken for pushes that last, and hidden."""
-        best, level = self, -np.inf
+    def fit_whitening_among(self, systems: list[System]) -> None:
+        """Estimate with each of some models, and keep the estimate with the best BIC. The variances
+        of a model that lacks an effect would attribute it to autocorrelated pushes, which would
+        hide it."""
+        best, criterion = self, -np.inf
         for system in systems:
-            one = copy.copy(best)
+            trial = copy.copy(best)
             row = ParameterVector(system).row
-            one.settle(system, row)
-            assert one.population is not None
-            price = len(row) * np.log(max(len(one.population.estimate.agents), 2)) / 2
-            if (likelihood := one.population.marginal.loglik - price) > level:
-                best, level = one, likelihood
+            trial.fit_whitening(system, row)
+            assert trial.population is not None
+            penalty = len(row) * np.log(max(len(trial.population.estimate.agents), 2)) / 2
+            if (likelihood := trial.population.marginal.loglik - penalty) > criterion:
+                best, criterion = trial, likelihood
         assert best.population is not None
-        self._take(best.population)
+        self._set_population(best.population)
 
-    def drawn(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
-        """Engines of paths that a model would have had, with deviations of drivers, pushes and
-        errors of measurement as they were estimated under it: two draws of opposite signs."""
+    def simulated_engines(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
+        """Engines of paths simulated by a model, with deviations of drivers, pushes and measurement
+        errors as estimated under it: an antithetic pair of draws."""
         assert self.population is not None
         fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
         paths = self._paths(self._longest(fixed, row[None]))
-        null, found = fit_again(self.population, fixed, paths, fixed=True), []
-        for draw in opposite(seed):
-            one = copy.copy(self)
-            paths = null.model.drawn(null.estimate, draw)
-            one._known = {strides(paths.dt, 2 * paths.half + 1e-9): paths}
-            one._take(fit_again(null, fixed, paths, fixed=True))
-            found.append(one)
-        return found
+        refitted, engines = refit(self.population, fixed, paths, fixed=True), []
+        for draw in antithetic_draws(seed):
+            engine = copy.copy(self)
+            paths = refitted.model.simulated_paths(refitted.estimate, draw)
+            engine._paths_by_step = {strides(paths.dt, 2 * paths.half + 1e-9): paths}
+            engine._set_population(refit(refitted, fixed, paths, fixed=True))
+            engines.append(engine)
+        return engines
 
     # -- parts -----------------------------------------------------------------------------------
 
     def _paths(self, longest: float) -> Paths:
-        """The followers, for simulations of steps of at most so many s. Of a driver who belongs to
-        several clusters, nothing that they have in common is used: clusters are independent."""
+        """The followers, for simulations with steps of at most ``longest`` s. A driver in several
+        clusters counts as several drivers, because clusters must be independent."""
         key = strides(self.batch.dt, longest)
-        if key not in self._known:
+        if key not in self._paths_by_step:
             paths = paths_of(self.sequences, longest)
-            both = np.stack([paths.agent, self._label[paths.sequence]])
-            own, agent = np.unique(both, axis=1, return_inverse=True)
-            names = tuple(paths.names[i] for i in own[0])
-            self._known[key] = replace(paths, agent=agent.reshape(-1), names=names)
-        return self._known[key]
+            pairs = np.stack([paths.agent, self._label[paths.sequence]])
+            drivers, agent = np.unique(pairs, axis=1, return_inverse=True)
+            names = tuple(paths.names[i] for i in drivers[0])
+            self._paths_by_step[key] = replace(paths, agent=agent.reshape(-1), names=names)
+        return self._paths_by_step[key]
 
     def _model(self, system: System, row: Tensor) -> Followers:
         random = [] if self.population is None else self.population.random
@@ -261,123 +262,134 @@ class FollowersEngine(TrafficEngine):
     def _deviations(self, model: Followers) -> tuple[np.ndarray, np.ndarray]:
         """Estimated deviations of drivers ``(D, Q)`` and of starts ``(F, H)``; none for another
         law than the one they were estimated with."""
-        known, start = self.population, np.zeros((len(model.paths.agent), model.starts))
-        if known is None or len(known.model.random) != len(model.random):
+        population, start = self.population, np.zeros((len(model.paths.agent), model.starts))
+        if population is None or len(population.model.random) != len(model.random):
             return np.zeros((0, 0)), start
-        # what other terms remember at the start is nothing to this model's
-        same = model.starts == known.model.starts
-        shared = model.starts if same else model.lane.order
-        start[:, :shared] = known.estimate.start[:, :shared]
-        return known.estimate.agents, start
+        # initial memory states are not comparable between models with different terms
+        same_starts = model.starts == population.model.starts
+        shared = model.starts if same_starts else model.lane.order
+        start[:, :shared] = population.estimate.start[:, :shared]
+        return population.estimate.agents, start
 
     def _simulated(self, system: System, rows: Tensor) -> tuple[Followers, np.ndarray]:
         """``(K, M, R, F)`` states of R runs at the drivers' estimates."""
-        plain, curve = _parts(system)
-        model = self._model(plain, rows.amin(0)[: len(rows[0]) - (curve is not None)])
+        model_system, curve = _parts(system)
+        model = self._model(model_system, rows.amin(0)[: len(rows[0]) - (curve is not None)])
         agents, start = self._deviations(model)
-        number, begin = len(model.names), start.T
+        number, initial = len(model.names), start.T
         theta = [model.spread(model.at(row.numpy()[:number]), agents) for row in rows]
-        pushed = None if curve is None else self._pushed(model, curve, rows[:, -1])
-        return model, model.simulate(np.stack(theta), np.stack([begin] * len(rows)), pushed)
+        pushed = None if curve is None else self._curve_push(model, curve, rows[:, -1])
+        return model, model.simulate(np.stack(theta), np.stack([initial] * len(rows)), pushed)
 
-    def _away(self, system: System, rows: Tensor) -> tuple[np.ndarray, Followers, np.ndarray]:
+    def _pseudo_residuals(
+        self, system: System, rows: Tensor
+    ) -> tuple[np.ndarray, Followers, np.ndarray]:
         """``(R, F, K)`` y - f + Z b + H h; the model, and its states ``(K, M, R, F)``."""
         model, states = self._simulated(system, rows)
-        away = model.paths.x - states[:, 0].transpose(1, 2, 0)
+        difference = model.paths.x - states[:, 0].transpose(1, 2, 0)
         agents, start = self._deviations(model)
         if self.population is not None:
             data = self.population.estimate.data
-            both = min(data.start.shape[-1], start.shape[-1])
-            away = away + np.einsum("fkh,fh->fk", data.start[..., :both], start[:, :both])
+            n_common = min(data.start.shape[-1], start.shape[-1])
+            difference = difference + np.einsum(
+                "fkh,fh->fk", data.start[..., :n_common], start[:, :n_common]
+            )
             if agents.size:
-                away = away + np.einsum("fkq,fq->fk", data.random, agents[model.paths.agent])
-        return away, model, states
+                difference = difference + np.einsum(
+                    "fkq,fq->fk", data.random, agents[model.paths.agent]
+                )
+        return difference, model, states
 
-    def _take(self, population: Population) -> None:
-        found, own = population.estimate, population.estimate.variances
+    def _set_population(self, population: Population) -> None:
+        estimate, variances = population.estimate, population.estimate.variances
         self.population = population
-        self._whitening = Whitening(found.data, population.noise, own.noise, own.spread, own.start)
+        self._whitening = Whitening(
+            estimate.data, population.noise, variances.noise, variances.spread, variances.start
+        )
         self._last_run = None
 
-    def _left(self, system: System, row: Tensor) -> np.ndarray:
+    def _position_errors(self, system: System, row: Tensor) -> np.ndarray:
         """``(F, K)`` errors of positions, m, with deviations by generalised least squares."""
-        away, model, _ = self._away(system, row[None])
-        left: np.ndarray = away[0]
+        difference, model, _ = self._pseudo_residuals(system, row[None])
+        errors: np.ndarray = difference[0]
         if self._whitening is None or self.population is None:
-            return left
-        own = self.population.estimate.variances
+            return errors
+        variances = self.population.estimate.variances
         data = self.population.estimate.data
-        data = replace(data, residual=left, fixed=data.fixed[..., :0])
-        products = self.population.noise.products(data, own.noise)
-        found = marginal(data, products, own.spread, own.start)
-        left = left - np.einsum("fkh,fh->fk", data.start, found.start)
-        of_drivers = found.deviations[model.paths.agent]
-        return np.asarray(left - np.einsum("fkq,fq->fk", data.random, of_drivers))
+        data = replace(data, residual=errors, fixed=data.fixed[..., :0])
+        products = self.population.noise.products(data, variances.noise)
+        posterior = marginal(data, products, variances.spread, variances.start)
+        errors = errors - np.einsum("fkh,fh->fk", data.start, posterior.start)
+        driver_deviations = posterior.deviations[model.paths.agent]
+        return np.asarray(errors - np.einsum("fkq,fq->fk", data.random, driver_deviations))
 
     def _whitened(self, columns: np.ndarray) -> Tensor:
         """``(C, n)`` of columns ``(K, F, C)``."""
         columns = columns.transpose(1, 0, 2)
         white = columns if self._whitening is None else self._whitening(columns)
-        return torch.from_numpy(white)[self._seen].T
+        return torch.from_numpy(white)[self._observed].T
 
-    def _moved(self, run: _Run, columns: np.ndarray) -> Tensor:
-        """``(C, n)`` changes of the residuals by positions moved ``(F, K, C)``."""
+    def _residual_changes(self, run: _Run, columns: np.ndarray) -> Tensor:
+        """``(C, n)`` changes of the residuals by displacements ``(F, K, C)``."""
         white = self._whitened(-np.nan_to_num(columns).transpose(1, 0, 2))
         return torch.nan_to_num(white * run.weight)
 
     def _run_of(self, system: System, row: Tensor) -> _Run:
-        """A run, kept until another one is asked for."""
-        known = self._last_run
-        if known is not None and known[0] is system and torch.equal(known[1], row):
-            return known[2]
-        away, model, states = self._away(system, row[None])
+        """A run of a model; the last one is cached."""
+        cached = self._last_run
+        if cached is not None and cached[0] is system and torch.equal(cached[1], row):
+            return cached[2]
+        difference, model, states = self._pseudo_residuals(system, row[None])
         plain, _ = _parts(system)
         fixed = ParameterVector(copy.deepcopy(plain)).fill_(row[: len(model.names)])
-        own = model.spread(model.at(row.numpy()[: len(model.names)]), self._deviations(model)[0])
-        step, after = model.linear(own, states[:, :, 0])
-        weight = weights_of(self._whitened(away.transpose(2, 1, 0))[0], self.large)
-        found = _Run(fixed, model, own, states[:, :, 0], step, after, weight)
-        self._last_run = system, row.clone(), found
-        return found
+        parameters = model.spread(
+            model.at(row.numpy()[: len(model.names)]), self._deviations(model)[0]
+        )
+        step, after = model.linear(parameters, states[:, :, 0])
+        weight = weights_of(self._whitened(difference.transpose(2, 1, 0))[0], self.large)
+        run = _Run(fixed, model, parameters, states[:, :, 0], step, after, weight)
+        self._last_run = system, row.clone(), run
+        return run
 
-    def _propagated(self, run: _Run, source: np.ndarray) -> np.ndarray:
-        """``(F, K, C)`` positions moved by changes ``(W, K, C, F)`` of the first W rates."""
-        f, between, m, _ = run.after.shape
+    def _propagate(self, run: _Run, source: np.ndarray) -> np.ndarray:
+        """``(F, K, C)`` displacements by changes ``(W, K, C, F)`` of the first W rates."""
+        f, n_intervals, m, _ = run.after.shape
         source = source[:m]
-        both = (source[:, 1:] + source[:, :-1]).transpose(1, 3, 0, 2)
+        forcing = (source[:, 1:] + source[:, :-1]).transpose(1, 3, 0, 2)
         state = np.zeros((f, m, source.shape[2]))
-        found = np.zeros((between + 1, *state[:, 0].shape))
-        for k in range(between):
-            state = run.step[:, k] @ state + run.after[:, k, :, : len(source)] @ both[k]
-            found[k + 1] = state[:, 0]
-        return found.transpose(1, 0, 2)
+        positions = np.zeros((n_intervals + 1, *state[:, 0].shape))
+        for k in range(n_intervals):
+            state = run.step[:, k] @ state + run.after[:, k, :, : len(source)] @ forcing[k]
+            positions[k + 1] = state[:, 0]
+        return positions.transpose(1, 0, 2)
 
-    def _finite(self, run: _Run, changed: System) -> np.ndarray:
-        """``(F, K)`` by how much a changed model moves positions, m; zero where that is more than
-        all the road that was seen: that is no small change."""
+    def _displacement(self, run: _Run, changed: System) -> np.ndarray:
+        """``(F, K)`` displacements by a changed model, m; zero if they exceed the observed road,
+        because the change is then not small."""
         x = self._simulated(changed, ParameterVector(changed).row[None])[1][:, 0, 0]
         paths = run.model.paths
-        moved: np.ndarray = (x - run.states[:, 0]).T
-        if not float(np.abs(moved[paths.seen]).max()) <= float(np.ptp(paths.x[paths.seen])):
-            return np.zeros_like(moved)
-        return moved
+        displacement: np.ndarray = (x - run.states[:, 0]).T
+        largest, road = np.abs(displacement[paths.observed]).max(), np.ptp(paths.x[paths.observed])
+        if not largest <= road:
+            return np.zeros_like(displacement)
+        return displacement
 
     def _scene(self, model: Followers) -> Scene:
         return model.system.scene(model.paths.batch)
 
-    def _pushed(self, model: Followers, curve: Curve, scale: Tensor) -> Push:
-        """What a curve adds to the highest rate in runs of it with several scales."""
+    def _curve_push(self, model: Followers, curve: Curve, scale: Tensor) -> Push:
+        """The push of a curve on the highest rate, in runs with several scales."""
         paths = model.paths
         scene = side_by_side(self._scene(model), len(scale))
 
         def pushed(at: int, y: np.ndarray, rates: np.ndarray) -> np.ndarray:
             time = torch.tensor(at * paths.half, dtype=torch.float64)
             ahead = np.repeat(paths.ahead[at][None], len(scale), 0)
-            state = _seen(model, time, y[0], rates[0], ahead, scene)
+            state = _state_of(model, time, y[0], rates[0], ahead, scene)
             height = curve.variable.curve(curve.variable.value(state), curve.amounts)
             change = height[..., None] * curve.variable.direction(state)
-            found: np.ndarray = change[:, 0, 0].reshape(len(scale), -1).numpy()
-            return found * scale.numpy()[:, None]
+            push: np.ndarray = change[:, 0, 0].reshape(len(scale), -1).numpy()
+            return push * scale.numpy()[:, None]
 
         return pushed
 
@@ -392,7 +404,7 @@ def _parts(system: System) -> tuple[System, Curve | None]:
     return plain, last
 
 
-def _seen(
+def _state_of(
     model: Followers,
     time: Tensor,
     x: np.ndarray,
@@ -400,14 +412,16 @@ def _seen(
     ahead: np.ndarray,
     scene: Scene,
 ) -> State:
-    """What terms see of every follower and of the one or two vehicles ahead of him.
+    """The state of every follower with the one or two vehicles ahead, for terms.
 
     Args:
         time: s. x, speed: ``(L, F)`` of the followers, m and m/s. ahead: ``(L, 4, F)``.
     """
-    several = model.paths.batch.x.shape[2]
-    place = np.stack([x, ahead[:, 0], ahead[:, 2]][:several], -1)
-    rate = np.stack([speed, ahead[:, 1], ahead[:, 3]][:several], -1)
-    places, rates = (torch.from_numpy(one.reshape(-1, several, 1)) for one in (place, rate))
+    n_vehicles = model.paths.batch.x.shape[2]
+    place = np.stack([x, ahead[:, 0], ahead[:, 2]][:n_vehicles], -1)
+    rate = np.stack([speed, ahead[:, 1], ahead[:, 3]][:n_vehicles], -1)
+    places, rates = (
+        torch.from_numpy(values.reshape(-1, n_vehicles, 1)) for values in (place, rate)
+    )
     second = model.lane.order > 1
     return State(time, places, rates if second else None, scene, rate=rates)

@@ -1,4 +1,4 @@
-"""Residuals without memory: an autoregressive filter along time and along the platoon."""
+"""Whitening of platoons: an autoregressive filter along time and along the platoon."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from nnode.discover.rules import rules
 
 @dataclass
 class PlatoonFilter:
-    """What the past and the vehicle ahead tell of a residual, and how large the rest is.
+    """An autoregressive filter with the vehicle's own past and the vehicle ahead.
 
-    The rest is e_i(t) - sum_k own_k e_i(t - k) - sum_k ahead_k e_{i+1}(t - k), divided by its
-    standard deviation; samples before the first count as zero, and so do the leader's.
+    The innovation is e_i(t) - sum_k past_k e_i(t - k) - sum_k ahead_k e_{i+1}(t - k), divided by
+    its standard deviation. Samples before the first, and those of the leader, count as zero.
 
     Attributes:
-        own: ``(p,)`` weights of the vehicle's own p past samples.
+        past: ``(p,)`` weights of the vehicle's p past samples.
         ahead: ``(p + 1,)`` weights of the vehicle ahead, the present sample first.
-        scale: standard deviation of the rest, m.
+        scale: standard deviation of the innovations, m.
     """
 
-    own: np.ndarray
+    past: np.ndarray
     ahead: np.ndarray
     scale: float
 
@@ -35,10 +35,10 @@ class PlatoonFilter:
 
     @classmethod
     def fitted(cls, residual: Tensor, valid: Tensor, order: int) -> PlatoonFilter:
-        """The filter with the least mean square of the rest.
+        """The filter with the smallest mean square of the innovations.
 
-        What lasts is what is looked for: each vehicle's mean is taken out first, or the filter
-        would take it for noise with a long memory and take it out of the data.
+        The filter is fitted to residuals without each vehicle's mean. Otherwise it would absorb
+        constant offsets, which are what effects produce.
 
         Args:
             residual: ``(K, B, N)`` m; 0 where not valid.
@@ -46,29 +46,29 @@ class PlatoonFilter:
             order: p.
         """
         mean = torch.where(valid, residual, 0.0).sum(0) / valid.sum(0).clamp(min=1)
-        lively = torch.where(residual != 0, residual - mean, 0.0)
-        columns = _lagged(lively, order)
-        e, design = lively[valid].numpy(), torch.stack(columns, -1)[valid].numpy()
+        centred = torch.where(residual != 0, residual - mean, 0.0)
+        columns = _lagged(centred, order)
+        e, design = centred[valid].numpy(), torch.stack(columns, -1)[valid].numpy()
         gram = design.T @ design
         gram += max(rules().trust ** 2 * np.trace(gram) / len(gram), 1e-12) * np.eye(len(gram))
         weights = np.linalg.solve(gram, design.T @ e)
-        found = cls(weights[:order], weights[order:], 1.0)
-        scale = float(found(residual)[valid].square().mean().sqrt())
-        return replace(found, scale=max(scale, 1e-9))
+        unscaled = cls(weights[:order], weights[order:], 1.0)
+        scale = float(unscaled(residual)[valid].square().mean().sqrt())
+        return replace(unscaled, scale=max(scale, 1e-9))
 
     def __call__(self, residual: Tensor) -> Tensor:
         """``(..., K, B, N)`` whitened residuals of ``(..., K, B, N)``."""
-        rest, k = residual / self.scale, residual.shape[-3]
-        for late, weight in enumerate([0.0, *self.own]):
-            if weight and late < k:
+        whitened, k = residual / self.scale, residual.shape[-3]
+        for lag, weight in enumerate([0.0, *self.past]):
+            if weight and lag < k:
                 share = -float(weight) / self.scale
-                rest[..., late:, :, :].add_(residual[..., : k - late, :, :], alpha=share)
-        for late, weight in enumerate(self.ahead):
-            if weight and late < k:
+                whitened[..., lag:, :, :].add_(residual[..., : k - lag, :, :], alpha=share)
+        for lag, weight in enumerate(self.ahead):
+            if weight and lag < k:
                 share = -float(weight) / self.scale
-                own = rest[..., late:, :, :-1]
-                own.add_(residual[..., : k - late, :, 1:], alpha=share)
-        return rest
+                followers = whitened[..., lag:, :, :-1]
+                followers.add_(residual[..., : k - lag, :, 1:], alpha=share)
+        return whitened
 
 
 def _lagged(e: Tensor, order: int) -> list[Tensor]:

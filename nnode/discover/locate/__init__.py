@@ -1,1 +1,1 @@
-"""Where a model is wrong: curves of what it leaves, without a formula."""
+"""Where the model deviates from the data: nonparametric curves of the residuals."""

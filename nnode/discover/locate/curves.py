@@ -1,4 +1,4 @@
-"""How much of a deviation depends on each variable: curves without a formula."""
+"""Nonparametric curves of the deviations over each variable."""
 
 from __future__ import annotations
 
@@ -16,42 +16,40 @@ from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import ROUGH, Fit, grams, refine, sums
 from nnode.discover.residuals.variables import Curve, Curves, Variable
 from nnode.discover.rules import rules
-from nnode.discover.statistics.bias import made, mean_scores
+from nnode.discover.statistics.bias import mean_scores, simulated_fits
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
 from nnode.errors import SimulationError
 from nnode.model.system import System
 from nnode.model.term import State
 
-#: A curve may bend about so many times; several are tried.
+#: Approximate numbers of bends of a curve, which set the strengths of smoothing.
 BENDS = (2, 5, 12)
-#: Heights are drawn to zero by this share of their mean information.
+#: Ridge of the heights, as a share of their mean information.
 RIDGE = 1e-3
-#: Sign flips that p-values of curves come from: there are many curves.
+#: Number of sign flips of curves' p-values; it is large because there are many curves.
 FLIPS = 7999
-#: At most so many curves are calibrated with the model, those that predict best.
+#: Largest number of curves that are calibrated with the model, the best first.
 MOST = 6
-#: A share of the knowledge of a height that is none, but for rounding.
+#: Ridge against rounding, as a share of the total information.
 UNKNOWN = 1e-9
-#: Waves that are looked at together.
+#: Number of waves that are fitted at once.
 WAVES = 16
 
 
 def columns_of(engine: Engine, fit: Fit, variable: Variable) -> np.ndarray:
-    """``(n, M)`` changes of the residuals per unit of the curve's weights."""
+    """``(n, M)`` derivatives of the residuals by the curve's coefficients."""
 
     def rates(state: State) -> list[Tensor]:
-        weights, way = variable.weights(state), variable.direction(state)
-        return list((weights.movedim(-1, 0)[..., None] * way).unbind())
+        weights, direction = variable.weights(state), variable.direction(state)
+        return list((weights.movedim(-1, 0)[..., None] * direction).unbind())
 
-    found: np.ndarray = engine.response(fit.system, torch.from_numpy(fit.row), rates).numpy().T
-    return found
+    columns: np.ndarray = engine.response(fit.system, torch.from_numpy(fit.row), rates).numpy().T
+    return columns
 
 
 def curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int = 0) -> list[Curves]:
-    """The best curve or wave of every variable, the one that explains most first.
-
-    They are kept with the fit, which is looked at more than once.
+    """The best curve or wave of every variable, ordered by decreasing gain; cached in the fit.
 
     Args:
         seed: of the sign flips, see :mod:`nnode.discover.statistics.score`.
@@ -66,36 +64,36 @@ def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> l
         return []
     screen = Screen(fit, engine.cluster, seed, FLIPS)
     before = heldout(fit, engine.cluster)
-    looks = [_Look(engine, fit, screen, variable) for variable in variables]
-    every = np.stack([squares for look in looks for squares in look.squares])
+    fits = [_CurveFits(engine, fit, screen, variable) for variable in variables]
+    every = np.stack([squares for variable_fit in fits for squares in variable_fit.squares])
     share = np.stack([at_least(row) for row in every])
-    least = share.min(0)
-    found, first = [], 0
-    drawn: list[tuple[Engine, Fit]] | None = None
-    for look in looks:
-        own = share[first : first + len(look.squares), 0].min()
-        first += len(look.squares)
-        p_value = float((least <= own + 1e-12).mean())
-        if p_value < rules().sure and not look.variable.lengths:
-            drawn = made(engine, fit, seed) if drawn is None else drawn
-            columns = partial(columns_of, variable=look.variable)
-            bias = mean_scores(drawn, columns, engine.cluster)
-            again = _Look(engine, fit, screen, look.variable, bias)
-            own = min(at_least(row)[0] for row in again.squares)
-            p_value = max(p_value, float((least <= own + 1e-12).mean()))
-        found.append(look.best(before, p_value))
-    return sorted(found, key=lambda one: -one.gain.gain)
+    smallest = share.min(0)
+    best_curves, offset = [], 0
+    simulated: list[tuple[Engine, Fit]] | None = None
+    for variable_fit in fits:
+        p_curve = share[offset : offset + len(variable_fit.squares), 0].min()
+        offset += len(variable_fit.squares)
+        p_value = float((smallest <= p_curve + 1e-12).mean())
+        if p_value < rules().sure and not variable_fit.variable.lengths:
+            simulated = simulated_fits(engine, fit, seed) if simulated is None else simulated
+            columns = partial(columns_of, variable=variable_fit.variable)
+            bias = mean_scores(simulated, columns, engine.cluster)
+            corrected = _CurveFits(engine, fit, screen, variable_fit.variable, bias)
+            p_curve = min(at_least(row)[0] for row in corrected.squares)
+            p_value = max(p_value, float((smallest <= p_curve + 1e-12).mean()))
+        best_curves.append(variable_fit.best(before, p_value))
+    return sorted(best_curves, key=lambda curve: -curve.gain.gain)
 
 
-class _Look:
+class _CurveFits:
     """All curves of one variable.
 
     Args:
-        bias: ``(G, M)`` of the scores of a curve's weights.
+        bias: ``(G, M)`` bias of the scores of a curve's coefficients.
 
     Attributes:
-        squares: per kind of curve ``(F,)`` what it explains in the data and under sign flips:
-            of a curve one per strength of smoothing, of waves the largest of all.
+        squares: per kind of curve ``(F,)`` explained squares in the data and under sign flips: one
+            kind per strength of smoothing, or the best of all waves.
     """
 
     def __init__(
@@ -109,28 +107,28 @@ class _Look:
         self.engine, self.fit, self.variable, self.bias = engine, fit, variable, bias
         self.screen, self.squares = screen, list[np.ndarray]()
         if variable.lengths:
-            self._look_for_waves()
+            self._fit_waves()
         else:
-            self._look_for_curves()
-        # all variables' columns at once would fill the memory
+            self._fit_smooth_curves()
+        # the columns of all variables would need too much memory
         self.grams = grams(self.z, engine.cluster)
         del self.z
 
-    def _looked(self, variable: Variable) -> tuple[np.ndarray, np.ndarray]:
-        """Columns of a variable's weights, and their sums ``(F, M)`` under sign flips."""
+    def _null_scores(self, variable: Variable) -> tuple[np.ndarray, np.ndarray]:
+        """Columns of a variable's coefficients, and their scores ``(F, M)`` under sign flips."""
         columns = columns_of(self.engine, self.fit, variable)
-        self.z = self.screen.beyond(columns)
+        self.z = self.screen.adjusted(columns)
         parts = self.screen.parts(self.z, self.engine.cluster) - self.bias
         return columns, self.screen.flipped(parts)
 
-    def _settle(self, columns: np.ndarray) -> None:
-        """Keep what is said of the weights with these columns."""
+    def _store_scores(self, columns: np.ndarray) -> None:
+        """Store the scores of the coefficients with these columns."""
         self.parts = sums(self.z, self.engine.cluster, self.fit.residual) - self.bias
         self.absorbed = np.linalg.lstsq(self.fit.jacobian, columns, rcond=1e-9)[0]
 
-    def _look_for_curves(self) -> None:
-        columns, total = self._looked(self.variable)
-        self._settle(columns)
+    def _fit_smooth_curves(self) -> None:
+        columns, total = self._null_scores(self.variable)
+        self._store_scores(columns)
         whole = self.z.T @ self.z
         number = len(whole)
         bend = np.diff(np.eye(number), 2, axis=0)
@@ -142,38 +140,38 @@ class _Look:
             solved = np.linalg.solve(whole + self.penalties[-1], total.T)
             self.squares.append((total.T * solved).sum(0))
 
-    def _look_for_waves(self) -> None:
-        """Some at a time: there may be many, and only the best one is kept."""
-        every, best = self.variable.lengths, 0
-        largest, most = np.full(0, -np.inf), -np.inf
-        for first in range(0, len(every), WAVES):
-            some = replace(self.variable, lengths=every[first : first + WAVES])
-            squares = self._squares(self._looked(some)[1])
-            if squares[0].max() > most:
-                best, most = first + int(np.argmax(squares[0])), squares[0].max()
-            own = squares.max(1)
-            largest = np.maximum(largest, own) if len(largest) else own
+    def _fit_waves(self) -> None:
+        """Fit waves in blocks, because there may be many, and keep the best one."""
+        lengths, best = self.variable.lengths, 0
+        largest, best_square = np.full(0, -np.inf), -np.inf
+        for first in range(0, len(lengths), WAVES):
+            block = replace(self.variable, lengths=lengths[first : first + WAVES])
+            squares = self._squares(self._null_scores(block)[1])
+            if squares[0].max() > best_square:
+                best, best_square = first + int(np.argmax(squares[0])), squares[0].max()
+            squares_max = squares.max(1)
+            largest = np.maximum(largest, squares_max) if len(largest) else squares_max
         self.squares.append(largest)
         self.variable = self.variable.wave(best)
-        self._settle(self._looked(self.variable)[0])
+        self._store_scores(self._null_scores(self.variable)[0])
         self.penalties = [np.zeros((2, 2))]
 
     def _squares(self, total: np.ndarray) -> np.ndarray:
-        """``(F, waves)`` what waves explain under sign flips, of their sums ``(F, 2 waves)``."""
+        """``(F, waves)`` explained squares under sign flips, from the scores ``(F, 2 waves)``."""
         sine, cosine = self.z[:, ::2], self.z[:, 1::2]
         a, b = (sine**2).sum(0), (sine * cosine).sum(0)
         c = (cosine**2).sum(0)
         determinant = np.maximum(a * c - b**2, 1e-12 * (a * c + 1e-300))
         s, t = total[:, ::2], total[:, 1::2]
-        found: np.ndarray = (c * s**2 - 2 * b * s * t + a * t**2) / determinant
-        return found
+        explained: np.ndarray = (c * s**2 - 2 * b * s * t + a * t**2) / determinant
+        return explained
 
     def best(self, before: np.ndarray, p_value: float) -> Curves:
-        """With the smoothing that predicts best.
+        """The curve with the smoothing that predicts best.
 
         Args:
             before: ``(G,)`` held-out costs without a curve.
-            p_value: with regard to all variables.
+            p_value: corrected for all variables.
         """
         label = self.engine.cluster
         plain = sums(self.fit.residual**2, label)
@@ -181,21 +179,21 @@ class _Look:
         gram, score = self.grams, -self.parts
         whole, total = gram.sum(0), score.sum(0)
         change, penalty = np.full(count, np.inf), self.penalties[0]
-        for tried in self.penalties:
-            # what one cluster alone knows of cannot be predicted by the others
-            tried = tried + UNKNOWN * np.trace(whole) * np.eye(number)
-            heights = np.linalg.solve(whole - gram + tried, (total - score)[..., None])[..., 0]
+        for penalised in self.penalties:
+            # a direction that only one cluster identifies cannot be predicted by the others
+            penalised = penalised + UNKNOWN * np.trace(whole) * np.eye(number)
+            heights = np.linalg.solve(whole - gram + penalised, (total - score)[..., None])[..., 0]
             new = np.einsum("sm,smn,sn->s", heights, gram, heights) - 2 * (heights * score).sum(1)
             if new.sum() < change.sum():
-                change, penalty = new, tried
+                change, penalty = new, penalised
         # relative to the model's own held-out cost
         losses = before * np.maximum(1 + change / np.maximum(plain, 1e-300), 0.0)
         inverse = np.linalg.inv(whole + penalty)
         amounts = inverse @ total
         shape = self.variable.heights(np.eye(number))
-        rest = score - np.einsum("gmn,n->gm", gram, amounts)
-        rest = rest * np.sqrt(count / max(count - 1, 1))
-        cov = shape @ inverse @ (rest.T @ rest) @ inverse @ shape.T
+        residual_scores = score - np.einsum("gmn,n->gm", gram, amounts)
+        residual_scores = residual_scores * np.sqrt(count / max(count - 1, 1))
+        cov = shape @ inverse @ (residual_scores.T @ residual_scores) @ inverse @ shape.T
         return Curves(
             variable=self.variable,
             amounts=amounts,
@@ -209,37 +207,42 @@ class _Look:
 
 
 def with_curve(fit: Fit, curve: Curves) -> System:
-    """A model with a curve as one more term, its own parameters moved to make room for it."""
-    found = copy.deepcopy(fit.system)
-    vector = ParameterVector(found)
+    """A model with a curve as one more term, and its parameters changed accordingly."""
+    extended = copy.deepcopy(fit.system)
+    vector = ParameterVector(extended)
     vector.fill_(np.clip(fit.row + curve.shift, *vector.bounds))
-    found.terms.append(Curve(curve.variable, curve.amounts))
-    return found
+    extended.terms.append(Curve(curve.variable, curve.amounts))
+    return extended
 
 
-def weighed(engine: Engine, fit: Fit, found: list[Curves], alpha: float) -> list[Curves]:
-    """The curves that are no chance at probability ``alpha``, with what they remove.
+def significant_curves(
+    engine: Engine, fit: Fit, candidates: list[Curves], alpha: float
+) -> list[Curves]:
+    """The curves that are significant at level ``alpha``, with the shares that they remove.
 
-    The linear response overshoots where a curve is strong: its scale is calibrated with the
-    model.
+    The linear response overshoots if a curve is strong, so its scale is calibrated with the model.
     """
     before = square_of(engine, fit.system)
-    sure: list[Curves] = []
-    for one in found:
-        if one.p_value >= alpha or one.gain.gain <= 0:
+    significant: list[Curves] = []
+    for curve in candidates:
+        if curve.p_value >= alpha or curve.gain.gain <= 0:
             continue
-        if len(sure) == MOST:
+        if len(significant) == MOST:
             break
         try:
-            after = square_of(engine, refine(engine, with_curve(fit, one), tolerance=ROUGH).system)
+            after = square_of(
+                engine, refine(engine, with_curve(fit, curve), tolerance=ROUGH).system
+            )
         except SimulationError:
             continue
-        sure.append(replace(one, removed=1 - after / before))
-    return sorted(sure, key=lambda one: -one.removed)
+        significant.append(replace(curve, removed=1 - after / before))
+    return sorted(significant, key=lambda curve: -curve.removed)
 
 
-def tail(one: Curves, number: int) -> np.ndarray:
+def tail(curve: Curves, number: int) -> np.ndarray:
     """Two-sided p-values of a curve's heights by Student's t, corrected for ``number`` of them."""
-    degrees = max(one.clusters - 1, 1)
-    found: np.ndarray = np.minimum(1.0, 2 * stats.t.sf(np.abs(one.statistic), degrees) * number)
-    return found
+    degrees = max(curve.clusters - 1, 1)
+    p_values: np.ndarray = np.minimum(
+        1.0, 2 * stats.t.sf(np.abs(curve.statistic), degrees) * number
+    )
+    return p_values

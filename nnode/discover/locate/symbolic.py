@@ -1,4 +1,4 @@
-"""A simple formula for a curve: a hint, not a finding."""
+"""A simple formula that describes a curve, as a hint."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-#: Form to its columns beside a constant, of standardised places in [0, 1].
+#: Form to its columns in addition to a constant, at standardised places in [0, 1].
 FORMS: dict[str, Callable[[np.ndarray], list[np.ndarray]]] = {
     "constant": lambda u: [],
     "{a:+.3g} z": lambda u: [u],
@@ -29,7 +29,7 @@ def symbolic(name: str, at: np.ndarray, heights: np.ndarray, errors: np.ndarray)
     Args:
         name: of the variable.
         at: ``(M,)`` its values.
-        heights, errors: ``(M,)`` the curve there.
+        heights, errors: ``(M,)`` the curve at these values.
     """
     u = (at - at[0]) / (at[-1] - at[0])
     best = None
@@ -38,8 +38,8 @@ def symbolic(name: str, at: np.ndarray, heights: np.ndarray, errors: np.ndarray)
         if design.shape[1] >= len(u):
             continue
         weights, *_ = np.linalg.lstsq(design, heights / errors, rcond=None)
-        left = heights / errors - design @ weights
-        value = float(left @ left) + design.shape[1] * np.log(len(u))
+        residuals = heights / errors - design @ weights
+        value = float(residuals @ residuals) + design.shape[1] * np.log(len(u))
         if best is None or value < best[0]:
             best = value, form, weights
     assert best is not None

@@ -1,1 +1,1 @@
-"""Which effect of the catalogue it lacks: one after the other is added, or taken back."""
+"""Stepwise selection of the effects of the catalogue that a model lacks."""

@@ -1,4 +1,4 @@
-"""An effect that is added to a model, calibrated with it, and what can be said of it then."""
+"""Candidate effects: added to a model, calibrated with it, and tested."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import ROUGH, Fit, refine
-from nnode.discover.statistics.score import Score, Screen, minimal_of, traces
+from nnode.discover.statistics.score import Score, Screen, negligible_strengths, traces
 from nnode.errors import SimulationError
 from nnode.model.effects import Effect
 from nnode.model.extend import extended, place_of
 from nnode.model.system import System
 
-#: An interval is moved at most so many times.
+#: Largest number of shifts of an interval.
 SHIFTS = 3
 
 
@@ -25,19 +25,19 @@ class Candidate:
     """An effect that was added and calibrated with the model.
 
     Attributes:
-        score: that it was chosen by.
+        score: its score test.
         fit: of the extended model.
-        losses: ``(G,)`` held-out cost of each cluster that tells of the effect.
+        losses: ``(G,)`` held-out costs of the effect's clusters.
         gain: over the model without it.
-        there: p-value that held-out clusters do not lean its way.
-        removed: share of the first model's squared errors of positions that it removed.
+        presence_pvalue: of the one-sided score test on held-out clusters.
+        removed: share of the first model's squared errors of positions that it removes.
     """
 
     score: Score
     fit: Fit
     losses: np.ndarray
     gain: Comparison
-    there: float
+    presence_pvalue: float
     removed: float
 
     @property
@@ -47,40 +47,44 @@ class Candidate:
 
     @property
     def ordered(self) -> bool:
-        """Whether an interval has kept its ends in their order."""
+        """Whether the ends of an interval are in order."""
         if not self.score.effect.consecutive:
             return True
-        own = self.fit.system.terms[place_of(self.fit.system, self.name)]
-        first, last = (float(own.get_parameter(name).detach()) for name in ("a", "b"))
-        return first < last
+        term = self.fit.system.terms[place_of(self.fit.system, self.name)]
+        low, high = (float(term.get_parameter(name).detach()) for name in ("a", "b"))
+        return low < high
 
     def strength_excludes_neutral(self, cluster: np.ndarray, *, minimal: bool = False) -> bool:
-        """Whether the interval of any of its strengths excludes the neutral value; or, if asked,
-        all amounts that are taken for none."""
+        """Whether the interval of any of its strengths excludes the neutral value.
+
+        Args:
+            minimal: whether it must exclude all negligible strengths as well.
+        """
         intervals, effect = self.fit.jackknife_intervals(cluster), self.score.effect
         place = place_of(self.fit.system, self.name)
-        none = minimal_of(effect, len(effect.strengths)) * minimal
-        known = [
-            (strength.neutral, less, *intervals[self.fit.names.index(f"terms.{place}.{name}")])
-            for (name, strength), less in zip(effect.strengths.items(), none, strict=True)
+        negligible = negligible_strengths(effect, len(effect.strengths)) * minimal
+        bounds = [
+            (strength.neutral, margin, *intervals[self.fit.names.index(f"terms.{place}.{name}")])
+            for (name, strength), margin in zip(effect.strengths.items(), negligible, strict=True)
             if f"terms.{place}.{name}" in self.fit.names
         ]
-        return not known or any(
-            low > neutral + less or high < neutral - less for neutral, less, low, high in known
+        return not bounds or any(
+            low > neutral + margin or high < neutral - margin
+            for neutral, margin, low, high in bounds
         )
 
 
 def calibrated(
     engine: Engine, before: Fit, score: Score, hopeless: float, hints: list[System] | None = None
 ) -> Fit:
-    """The model with one more effect, from where its score found it and from hints.
+    """Calibrate the model with one more effect, from the score's settings and from hints.
 
     Args:
         hopeless: see :func:`~nnode.discover.residuals.fit.refine`.
         hints: the extended model with other parameters.
 
     Raises:
-        SimulationError: it blows up.
+        SimulationError: its simulation diverges from all starts.
     """
     system, place = extended(before.system, score.effect(**score.options))
     fits = []
@@ -91,9 +95,9 @@ def calibrated(
             continue
     if not fits:
         raise SimulationError(f"the model with {score.effect.name} blows up on these data")
-    fit = min(fits, key=lambda one: one.cost)
+    fit = min(fits, key=lambda candidate: candidate.cost)
     if score.effect.consecutive:
-        # a strong effect bends the paths, so that the interval of a weak one would be off
+        # strong effects change the paths, which shifts the interval of the linearised score
         for _ in range(SHIFTS):
             shifted = _shifted(engine, fit, score.effect, place)
             if shifted is None:
@@ -103,17 +107,17 @@ def calibrated(
 
 
 def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit | None:
-    """The fit with another interval, where the same effect once more would explain something."""
-    own = fit.system.terms[place]
-    assert isinstance(own, effect)
-    now = own.options()
+    """The fit with a better interval, if a second instance of the effect would explain more."""
+    term = fit.system.terms[place]
+    assert isinstance(term, effect)
+    options = term.options()
     (score,) = Screen(fit, engine.cluster).scores(traces(engine, fit, effect))
     if score.gain < ROUGH:
         return None
     low, high = score.options["a"], score.options["b"]
     trials = [
-        {**now, "a": min(now["a"], low), "b": max(now["b"], high)},
-        {**now, "a": max(low, now["a"]), "b": min(high, now["b"])},
+        {**options, "a": min(options["a"], low), "b": max(options["b"], high)},
+        {**options, "a": max(low, options["a"]), "b": min(high, options["b"])},
     ]
     best = None
     for values in trials:
@@ -122,9 +126,9 @@ def _shifted(engine: Engine, fit: Fit, effect: type[Effect], place: int) -> Fit 
         system = copy.deepcopy(fit.system)
         system.terms[place] = effect(**values)
         try:
-            found = refine(engine, system, tolerance=ROUGH, hopeless=fit.cost)
+            shifted = refine(engine, system, tolerance=ROUGH, hopeless=fit.cost)
         except SimulationError:
             continue
-        if found.cost < (1 - ROUGH) * (fit if best is None else best).cost:
-            best = found
+        if shifted.cost < (1 - ROUGH) * (fit if best is None else best).cost:
+            best = shifted
     return best

@@ -1,4 +1,4 @@
-"""Adding effects one after the other, and taking back those that are not needed."""
+"""Stepwise selection of effects: forward addition, then backward elimination."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.discover.residuals.variables import Variable
 from nnode.discover.rules import rules
-from nnode.discover.statistics.bias import Made, made, mean_scores
-from nnode.discover.statistics.paired import compare, heldout, outdone, there
-from nnode.discover.statistics.profile import moved
+from nnode.discover.statistics.bias import SimulatedFits, mean_scores, simulated_fits
+from nnode.discover.statistics.paired import compare, heldout, j_test, presence_pvalue
+from nnode.discover.statistics.profile import refined_edges
 from nnode.discover.statistics.score import Score, Screen, Trace, traces
 from nnode.errors import SimulationError
 from nnode.model.effects import Effect
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 #: A mean square error of positions, m², below which nothing is left to be explained: 1 mm.
 EXACT = 1e-6
-#: At most so many effects are calibrated in a round, and with variances of their own.
+#: At most so many effects are calibrated in a round, and so many with refitted variances.
 RIVALS, LIKELY = 5, 3
 
 
@@ -42,7 +42,7 @@ class Step:
 
     Attributes:
         chosen: the candidate.
-        rivals: candidates that the data cannot tell from it, with the test against each.
+        rivals: candidates that the data cannot distinguish from it, with the test against each.
     """
 
     chosen: Candidate
@@ -50,14 +50,14 @@ class Step:
 
 
 @dataclass
-class Search:
-    """How far a search for effects came.
+class Selection:
+    """The state of a selection of effects.
 
     Attributes:
         fit: of the model with all accepted effects.
         steps: in order of acceptance.
-        scores: of all effects that are left, against ``fit``.
-        screen: that they come from.
+        scores: the score tests of all other effects against ``fit``.
+        screen: the screen that computed them.
         first: the scores of all effects against the model as it was given.
         square: mean square error of positions of the model without any effect, m²; 0 until it
             is known.
@@ -71,12 +71,13 @@ class Search:
     square: float = 0.0
 
 
-def begun(engine: Engine, system: System) -> Fit | None:
-    """A model calibrated in the engine's residuals as they are, from the better of two starts: its
-    own parameters, and those near the measured rates. None where both blow up."""
-    near = getattr(engine, "near", None)
+def initial_fit(engine: Engine, system: System) -> Fit | None:
+    """A model calibrated to the engine's residuals with their present whitening, from the better of
+    two starts: its own parameters, and a regression on the measured rates. None if the simulations
+    of both diverge."""
+    regression = getattr(engine, "regression_start", None)
     fits = []
-    for start in (copy.deepcopy(system), *([] if near is None else [near(system)])):
+    for start in (copy.deepcopy(system), *([] if regression is None else [regression(system)])):
         try:
             fits.append(refine(engine, start, tolerance=ROUGH))
         except SimulationError:
@@ -84,11 +85,11 @@ def begun(engine: Engine, system: System) -> Fit | None:
     return min(fits, key=lambda fit: fit.cost, default=None)
 
 
-def wider(engine: Engine, fit: Fit, effects: list[type[Effect]]) -> list[System]:
-    """The model with the effect that explains most of residuals as they are, calibrated; nothing
-    where that cannot be simulated."""
-    look = [trace for effect in effects for trace in traces(engine, fit, effect)]
-    for score in Screen(fit, engine.cluster).scores(look)[:1]:
+def most_likely_extension(engine: Engine, fit: Fit, effects: list[type[Effect]]) -> list[System]:
+    """The model with the effect that explains most of the present residuals, calibrated; empty if
+    its simulation diverges."""
+    effect_traces = [trace for effect in effects for trace in traces(engine, fit, effect)]
+    for score in Screen(fit, engine.cluster).scores(effect_traces)[:1]:
         try:
             return [calibrated(engine, fit, score, 0.0).system]
         except SimulationError:
@@ -96,11 +97,11 @@ def wider(engine: Engine, fit: Fit, effects: list[type[Effect]]) -> list[System]
     return []
 
 
-def settled(engine: Engine, system: System, rounds: int = 2) -> Fit:
-    """Calibrate a model, and the engine's filter to what it leaves, in turns."""
+def converged_fit(engine: Engine, system: System, rounds: int = 2) -> Fit:
+    """Alternate between calibrating a model and fitting the engine's whitening to its residuals."""
     fit = refine(engine, system)
     for _ in range(rounds):
-        engine.settle(fit.system, ParameterVector(fit.system).row)
+        engine.fit_whitening(fit.system, ParameterVector(fit.system).row)
         fit = refine(engine, fit.system)
     return fit
 
@@ -111,252 +112,274 @@ def search(
     effects: list[type[Effect]],
     *,
     alpha: float = 0.05,
-    most: int = 4,
+    max_effects: int = 4,
     seed: int = 0,
     variables: list[Variable] | None = None,
     levels: dict[str, np.ndarray] | None = None,
     within: Callable[[float], None] = lambda part: None,
     hints: list[System] | None = None,
-) -> Search:
-    """Forwards until no effect passes, then backwards.
+) -> Selection:
+    """Add effects until none passes, then eliminate those that are not needed.
 
-    An effect that a curve outdoes is kept if a second one comes to it and no curve outdoes both:
-    of two effects that act at once, a curve may show one while the other comes first.
+    If a free curve predicts better than an effect, the effect is kept only if a second effect is
+    added and no curve predicts better than both. When two effects act at once, a curve may describe
+    one of them while the other is added first.
 
     Args:
-        engine: of the open sequences.
-        fit: the calibrated model, in the engine's filter.
-        effects: to look for.
-        alpha: probability of naming anything where nothing is hidden.
-        most: effects at most.
+        engine: of the exploration sequences.
+        fit: the calibrated model, with the engine's whitening fitted to its residuals.
+        effects: the candidates.
+        alpha: familywise error rate of the score tests.
+        max_effects: the largest number of effects that are added.
         seed: of the sign flips.
-        variables: no effect is accepted where a curve of one of these predicts better: it is a
-            sign of something that the catalogue lacks.
-        levels: by an effect's name the clusters ``(n,)`` that tell of it, where they are coarser
-            than the engine's.
-        within: is told, now and then, about which part of the search is done.
-        hints: models with effects, calibrated: the calibration of these effects begins from there
-            as well.
+        variables: no effect is accepted if a curve of one of these predicts better, because then
+            the catalogue lacks the true effect.
+        levels: by an effect's name the independent clusters ``(n,)`` of its test, if they are
+            coarser than the engine's.
+        within: called with the share of the search that is done.
+        hints: calibrated models with effects; the calibrations of these effects also start there.
     """
-    found, levels = Search(fit), levels or {}
-    doubtful: Search | None = None  # as it was before an effect that a curve outdoes
+    selection, levels = Selection(fit), levels or {}
+    # the state before an effect was added that predicts worse than a curve
+    doubtful: Selection | None = None
     while True:
-        screen = _screened(engine, found, effects, seed, levels, within, alpha)
-        found.first = found.first or found.scores
-        if len(found.steps) >= most:
+        screen = _screened(engine, selection, effects, seed, levels, within, alpha)
+        selection.first = selection.first or selection.scores
+        if len(selection.steps) >= max_effects:
             break
-        step = _round(engine, found, alpha, hints or [])
+        step = _next_step(engine, selection, alpha, hints or [])
         if step is None:
             break
-        if _outdone(engine, found.fit, step.chosen, variables or []):
+        if _curve_predicts_better(engine, selection.fit, step.chosen, variables or []):
             if doubtful is not None:
                 break
-            doubtful = replace(found, steps=[*found.steps])
+            doubtful = replace(selection, steps=[*selection.steps])
         elif doubtful is not None:
-            # in the filter of now
+            # the whitening has changed since
             before = refine(engine, doubtful.fit.system)
-            both = _candidate(step.chosen.score, step.chosen.fit, before, screen, 0.0)
-            if _outdone(engine, before, both, variables or []):
+            retested = _candidate(step.chosen.score, step.chosen.fit, before, screen, 0.0)
+            if _curve_predicts_better(engine, before, retested, variables or []):
                 break
             doubtful = None
-        found.steps.append(step)
-        found.fit = settled(engine, step.chosen.fit.system, rounds=1)
+        selection.steps.append(step)
+        selection.fit = converged_fit(engine, step.chosen.fit.system, rounds=1)
         if step.chosen.score.effect.consecutive:
-            found.fit = moved(engine, found.fit, step.chosen.name)
+            selection.fit = refined_edges(engine, selection.fit, step.chosen.name)
         log.info("added %s", step.chosen.name)
-    if doubtful is not None:  # the filter is that of a model with more effects
-        found = replace(doubtful, fit=settled(engine, doubtful.fit.system, rounds=1))
-        _screened(engine, found, effects, seed, levels, within, alpha)
-    return _pruned(engine, found)
+    if doubtful is not None:  # the whitening was fitted with more effects
+        selection = replace(doubtful, fit=converged_fit(engine, doubtful.fit.system, rounds=1))
+        _screened(engine, selection, effects, seed, levels, within, alpha)
+    return _eliminated(engine, selection)
 
 
 def _screened(
     engine: Engine,
-    found: Search,
+    selection: Selection,
     effects: list[type[Effect]],
     seed: int,
     levels: dict[str, np.ndarray],
     within: Callable[[float], None],
     alpha: float,
 ) -> Screen:
-    """Give all effects that a model lacks their scores."""
-    own = {effect.name for effect in effects_of(found.fit.system)}
-    begun = len(found.steps)
-    within(begun / (begun + 2))  # of most searches, the last but one round finds nothing more
-    left = [effect for effect in effects if effect.name not in own]
-    look = [trace for effect in left for trace in traces(engine, found.fit, effect)]
-    within((begun + 0.5) / (begun + 2))
-    found.screen = Screen(found.fit, engine.cluster, seed + begun, levels=levels)
-    found.scores = found.screen.scores(look)
-    shown = {score.effect.name for score in found.scores if score.p_value <= alpha}
-    if shown and (drawn := made(engine, found.fit, seed)):
-        for effect in left:
-            if effect.name in shown:
-                _unbiased(look, effect, drawn, found.screen)
-        again = Screen(found.fit, engine.cluster, seed + begun, levels=levels).scores(look)
-        least = {score.effect.name: score.p_value for score in again}
-        found.scores = [
-            replace(score, p_value=max(score.p_value, least.get(score.effect.name, 1.0)))
-            for score in found.scores
+    """Compute the score tests of all effects that the model lacks."""
+    present = {effect.name for effect in effects_of(selection.fit.system)}
+    n_steps = len(selection.steps)
+    within(n_steps / (n_steps + 2))  # most searches end in the round after this one
+    candidates = [effect for effect in effects if effect.name not in present]
+    effect_traces = [
+        trace for effect in candidates for trace in traces(engine, selection.fit, effect)
+    ]
+    within((n_steps + 0.5) / (n_steps + 2))
+    selection.screen = Screen(selection.fit, engine.cluster, seed + n_steps, levels=levels)
+    selection.scores = selection.screen.scores(effect_traces)
+    significant = {score.effect.name for score in selection.scores if score.p_value <= alpha}
+    if significant and (simulated := simulated_fits(engine, selection.fit, seed)):
+        for effect in candidates:
+            if effect.name in significant:
+                _set_bias(effect_traces, effect, simulated, selection.screen)
+        screen = Screen(selection.fit, engine.cluster, seed + n_steps, levels=levels)
+        corrected = {s.effect.name: s.p_value for s in screen.scores(effect_traces)}
+        selection.scores = [
+            replace(score, p_value=max(score.p_value, corrected.get(score.effect.name, 1.0)))
+            for score in selection.scores
         ]
-    return found.screen
+    return selection.screen
 
 
-def _unbiased(look: list[Trace], effect: type[Effect], drawn: Made, screen: Screen) -> None:
-    """Note in an effect's traces what they show in paths that the model has made."""
+def _set_bias(
+    effect_traces: list[Trace], effect: type[Effect], simulated: SimulatedFits, screen: Screen
+) -> None:
+    """Set the bias of an effect's traces: their mean scores in paths simulated by the model."""
     label = screen.label(effect.name)
-    again = {id(fit): traces(engine, fit, effect) for engine, fit in drawn}
-    for k, trace in enumerate(one for one in look if one.effect is effect):
-        columns = {own: every[k].columns for own, every in again.items()}
-        trace.bias = mean_scores(drawn, partial(_columns, columns), label)
+    simulated_traces = {id(fit): traces(engine, fit, effect) for engine, fit in simulated}
+    for k, trace in enumerate(t for t in effect_traces if t.effect is effect):
+        columns = {key: sample[k].columns for key, sample in simulated_traces.items()}
+        trace.bias = mean_scores(simulated, partial(_columns, columns), label)
 
 
-def _columns(known: dict[int, np.ndarray], _: Engine, fit: Fit) -> np.ndarray:
-    return known[id(fit)]
+def _columns(columns: dict[int, np.ndarray], _: Engine, fit: Fit) -> np.ndarray:
+    return columns[id(fit)]
 
 
-def _round(engine: Engine, found: Search, alpha: float, hints: list[System]) -> Step | None:
-    scores, screen = found.scores, found.screen
+def _next_step(
+    engine: Engine, selection: Selection, alpha: float, hints: list[System]
+) -> Step | None:
+    """The best effect that passes all tests, with its rivals; None if no effect passes."""
+    scores, screen = selection.scores, selection.screen
     assert screen is not None
     if not scores:
         return None
     scores = sorted(scores, key=lambda score: -score.gain)
-    shown = min(score.p_value for score in scores) <= alpha
-    if not shown and isinstance(engine, FollowersEngine):
-        return None  # strong effects show in the variances of the likeliest model
+    significant = min(score.p_value for score in scores) <= alpha
+    if not significant and isinstance(engine, FollowersEngine):
+        return None  # the variances were already fitted with the most likely extension
     hinted = {effect.name for hint in hints for effect in effects_of(hint)}
-    tried = [s for s in scores if s.gain >= rules().rival * scores[0].gain][:RIVALS]
-    tried += [score for score in scores if score.effect.name in hinted and score not in tried]
-    candidates = _in_order(engine, found, tried, hints, shown)
-    good = [
+    ranked = [s for s in scores if s.gain >= rules().rival * scores[0].gain][:RIVALS]
+    ranked += [score for score in scores if score.effect.name in hinted and score not in ranked]
+    candidates = _ranked(engine, selection, ranked, hints, significant)
+    eligible = [
         c
         for c in candidates
         if c.removed >= engine.least
         and c.gain.gain > 0
-        and c.there < rules().level
+        and c.presence_pvalue < rules().level
         and c.strength_excludes_neutral(screen.label(c.name))
         and c.ordered
     ]
-    passing = [c for c in good if c.score.p_value <= alpha]
+    passing = [c for c in eligible if c.score.p_value <= alpha]
     if not passing and not isinstance(engine, FollowersEngine):
-        passing = [c for c in good if _sure(c, screen, len(scores))]
+        passing = [c for c in eligible if _significant_held_out(c, screen, len(scores))]
     if not passing:
         return None
     best = _simplest(passing, screen)
     if best.score.p_value > alpha:
-        best.score = replace(best.score, p_value=best.there * len(scores))
-    tests = [(other, _between(other, best, screen)) for other in candidates if other is not best]
-    return Step(best, [(other, test) for other, test in tests if _rivals(best, other, test)])
+        best.score = replace(best.score, p_value=best.presence_pvalue * len(scores))
+    tests = [(rival, _j_test(rival, best, screen)) for rival in candidates if rival is not best]
+    return Step(best, [(rival, test) for rival, test in tests if _is_rival(best, rival, test)])
 
 
-def _in_order(
-    engine: Engine, found: Search, tried: list[Score], hints: list[System], shown: bool
+def _ranked(
+    engine: Engine,
+    selection: Selection,
+    ranked: list[Score],
+    hints: list[System],
+    significant: bool,
 ) -> list[Candidate]:
-    """Effects calibrated with the model, the best first; none where nothing is left to explain.
+    """The candidates calibrated with the model, the best first; none if the model fits exactly.
 
     Args:
-        shown: whether a score passes; otherwise only a leading effect that is sure is followed.
+        significant: whether any score test rejects. Otherwise further candidates are calibrated
+            only if the first one is significant on held-out clusters.
     """
-    screen, candidates = found.screen, list[Candidate]()
+    screen, candidates = selection.screen, list[Candidate]()
     assert screen is not None
-    square = square_of(engine, found.fit.system)
-    found.square = found.square or square
+    square = square_of(engine, selection.fit.system)
+    selection.square = selection.square or square
     if square < EXACT:
         return []
-    for score in tried:
-        least = min((c.fit.cost for c in candidates), default=0.0)
-        starts = _hinted(hints, found.fit.system, score.effect.name)
+    for score in ranked:
+        lowest_cost = min((c.fit.cost for c in candidates), default=0.0)
+        starts = _hinted(hints, selection.fit.system, score.effect.name)
         try:
-            fit = calibrated(engine, found.fit, score, least, starts)
+            fit = calibrated(engine, selection.fit, score, lowest_cost, starts)
         except SimulationError:
             continue
-        removed = (square - square_of(engine, fit.system)) / found.square
-        candidates.append(_candidate(score, fit, found.fit, screen, removed))
-        # a strong effect is far from linear: held-out clusters may be sure of what no score shows
-        leads = shown or len(candidates) > 1
-        if not leads and not _sure(candidates[0], screen, len(found.scores)):
+        removed = (square - square_of(engine, fit.system)) / selection.square
+        candidates.append(_candidate(score, fit, selection.fit, screen, removed))
+        # the linear score test can miss a strong, nonlinear effect
+        followed = significant or len(candidates) > 1
+        if not followed and not _significant_held_out(candidates[0], screen, len(selection.scores)):
             return []
     if isinstance(engine, FollowersEngine):
-        candidates = _in_best_variances(engine, candidates, found)
-    return _to_the_end(engine, sorted(candidates, key=lambda c: -c.gain.gain), found)
+        candidates = _with_refitted_variances(engine, candidates, selection)
+    return _refined(engine, sorted(candidates, key=lambda c: -c.gain.gain), selection)
 
 
-def _in_best_variances(
-    engine: FollowersEngine, candidates: list[Candidate], found: Search
+def _with_refitted_variances(
+    engine: FollowersEngine, candidates: list[Candidate], selection: Selection
 ) -> list[Candidate]:
-    """Candidates in the variances of the likeliest of them: in those of the model without it, a
-    strong effect is taken for pushes that last."""
-    assert found.screen is not None
-    likely = sorted(candidates, key=lambda c: c.fit.cost)[:LIKELY]
-    engine.settle_among([one.fit.system for one in likely])
-    found.fit = refine(engine, found.fit.system)
-    again = []
-    for one in candidates:
-        fit = refine(engine, one.fit.system, tolerance=ROUGH)
-        again.append(_candidate(one.score, fit, found.fit, found.screen, one.removed))
-    return again
+    """The candidates with variances refitted under the most likely of them. The variances of the
+    model without a strong effect would attribute it to autocorrelated pushes."""
+    assert selection.screen is not None
+    likeliest = sorted(candidates, key=lambda c: c.fit.cost)[:LIKELY]
+    engine.fit_whitening_among([candidate.fit.system for candidate in likeliest])
+    selection.fit = refine(engine, selection.fit.system)
+    refitted = []
+    for candidate in candidates:
+        fit = refine(engine, candidate.fit.system, tolerance=ROUGH)
+        refitted.append(
+            _candidate(candidate.score, fit, selection.fit, selection.screen, candidate.removed)
+        )
+    return refitted
 
 
-def _rivals(best: Candidate, other: Candidate, test: Comparison) -> bool:
-    """Whether a test does not tell another effect from the best one, and it is no larger one."""
-    return test.p_value > apart_at(best, other) and not _contains(other, best)
+def _is_rival(best: Candidate, rival: Candidate, test: Comparison) -> bool:
+    """Whether the test does not reject another effect that does not contain the best one."""
+    return test.p_value > apart_at(best, rival) and not _contains(rival, best)
 
 
-def _sure(one: Candidate, screen: Screen, tried: int) -> bool:
-    """Whether held-out clusters lean the way of one of ``tried`` effects beyond all doubt, and it
-    is more than what is taken for none."""
-    label = screen.label(one.name)
-    lean = one.there * tried <= rules().sure
-    return lean and one.strength_excludes_neutral(label, minimal=True)
+def _significant_held_out(candidate: Candidate, screen: Screen, n_tried: int) -> bool:
+    """Whether the held-out score of one of ``n_tried`` effects is significant, and its interval
+    excludes all negligible strengths."""
+    label = screen.label(candidate.name)
+    significant = candidate.presence_pvalue * n_tried <= rules().sure
+    return significant and candidate.strength_excludes_neutral(label, minimal=True)
 
 
-def apart_at(one: Candidate, other: Candidate) -> float:
-    """The level at which two effects are told apart."""
-    group = one.score.effect.confusable_group
-    return rules().sure if group and group == other.score.effect.confusable_group else rules().level
+def apart_at(first: Candidate, second: Candidate) -> float:
+    """The level of the test between two effects."""
+    group = first.score.effect.confusable_group
+    return (
+        rules().sure if group and group == second.score.effect.confusable_group else rules().level
+    )
 
 
 def _hinted(hints: list[System], system: System, name: str) -> list[System]:
-    """Hints that have all effects of a model and one more, each without its other effects."""
-    wanted, starts = {effect.name for effect in effects_of(system)} | {name}, []
+    """Hints that contain all effects of a model and one more, each without its other effects."""
+    required, starts = {effect.name for effect in effects_of(system)} | {name}, []
     for hint in hints:
-        known = {effect.name for effect in effects_of(hint)}
-        if wanted <= known:
-            starts.append(without(hint, *(known - wanted)))
+        present = {effect.name for effect in effects_of(hint)}
+        if required <= present:
+            starts.append(without(hint, *(present - required)))
     return starts
 
 
 def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, removed: float) -> Candidate:
-    """Compared with the model without it, on the clusters that tell of the effect."""
+    """A fitted candidate, compared on the effect's clusters with the model without it."""
     label = screen.label(score.effect.name)
     losses = heldout(fit, label)
     gain = compare(heldout(before, label), losses)
-    return Candidate(score, fit, losses, gain, there(before, fit, label), removed)
+    return Candidate(score, fit, losses, gain, presence_pvalue(before, fit, label), removed)
 
 
-def _between(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
-    """Whether the second candidate outdoes the first, on the coarser clusters of the two."""
+def _j_test(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
+    """The J test of the first candidate against the second, on the coarser clusters of the two."""
     label = min(
-        (screen.label(one.name) for one in (first, second)), key=lambda label: int(label.max())
+        (screen.label(candidate.name) for candidate in (first, second)),
+        key=lambda label: int(label.max()),
     )
-    return outdone(first.fit, second.fit, label)
+    return j_test(first.fit, second.fit, label)
 
 
-def _to_the_end(engine: Engine, candidates: list[Candidate], found: Search) -> list[Candidate]:
-    """Candidates in their order, calibrated to the end: kin differ by less than a rough calibration
-    leaves."""
-    assert found.screen is not None
+def _refined(engine: Engine, candidates: list[Candidate], selection: Selection) -> list[Candidate]:
+    """The candidates with converged calibrations, the best first. Similar effects differ by less
+    than the tolerance of the rough calibration."""
+    assert selection.screen is not None
     if not candidates or candidates[0].gain.gain <= 0:
         return candidates
-    ended = []
-    for one in candidates:
-        fit = refine(engine, one.fit.system, tolerance=FINE)
-        ended.append(_candidate(one.score, fit, found.fit, found.screen, one.removed))
-    return sorted(ended, key=lambda c: -c.gain.gain)
+    refined = []
+    for candidate in candidates:
+        fit = refine(engine, candidate.fit.system, tolerance=FINE)
+        refined.append(
+            _candidate(candidate.score, fit, selection.fit, selection.screen, candidate.removed)
+        )
+    return sorted(refined, key=lambda c: -c.gain.gain)
 
 
-def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable]) -> bool:
-    """Whether a curve without a formula predicts better than an effect."""
+def _curve_predicts_better(
+    engine: Engine, fit: Fit, best: Candidate, variables: list[Variable]
+) -> bool:
+    """Whether a nonparametric curve predicts better than an effect."""
     for curve in curves(engine, fit, variables) if variables else []:
         if curve.p_value < rules().level:
             test = compare(heldout(best.fit, engine.cluster), curve.losses)
@@ -366,16 +389,16 @@ def _outdone(engine: Engine, fit: Fit, best: Candidate, variables: list[Variable
 
 
 def _simplest(candidates: list[Candidate], screen: Screen) -> Candidate:
-    """The best candidate, or one that is as good and has fewer parameters, or as many and a
-    greater likelihood."""
+    """The best candidate, or one that is as good and has fewer parameters, or equally many and a
+    larger likelihood."""
     best = candidates[0]
-    for other in candidates[1:]:
-        number = len(other.fit.row), len(best.fit.row)
-        likelier = number[0] == number[1] and other.fit.cost < best.fit.cost
-        near = other.gain.gain >= rules().near * best.gain.gain
-        apart = _between(other, best, screen).p_value <= rules().level
-        if (number[0] < number[1] or likelier) and near and not apart:
-            best = other
+    for candidate in candidates[1:]:
+        sizes = len(candidate.fit.row), len(best.fit.row)
+        likelier = sizes[0] == sizes[1] and candidate.fit.cost < best.fit.cost
+        comparable = candidate.gain.gain >= rules().near * best.gain.gain
+        distinguishable = _j_test(candidate, best, screen).p_value <= rules().level
+        if (sizes[0] < sizes[1] or likelier) and comparable and not distinguishable:
+            best = candidate
     return best
 
 
@@ -384,60 +407,65 @@ def _contains(wider: Candidate, narrower: Candidate) -> bool:
     return narrower.name in wider.score.effect.contains
 
 
-def without_steps(engine: Engine, found: Search, steps: list[Step], base: System) -> Search:
-    """A search without some of its effects, calibrated anew.
+def without_steps(
+    engine: Engine, selection: Selection, steps: list[Step], base: System
+) -> Selection:
+    """A selection without some of its effects, recalibrated.
 
     Args:
-        base: the calibrated model without any.
+        base: the calibrated model without effects.
     """
     if not steps:
-        return found
-    kept = [step for step in found.steps if step not in steps]
+        return selection
+    kept = [step for step in selection.steps if step not in steps]
     names = [step.chosen.name for step in steps]
-    start = without(found.fit.system, *names) if kept else copy.deepcopy(base)
-    return replace(found, fit=settled(engine, start, rounds=1), steps=kept)
+    start = without(selection.fit.system, *names) if kept else copy.deepcopy(base)
+    return replace(selection, fit=converged_fit(engine, start, rounds=1), steps=kept)
 
 
-def _pruned(engine: Engine, found: Search) -> Search:
-    """Take back effects that the later ones have made needless, and rivals that are told apart
-    beside them. What held-out clusters need most comes first: beside it others are confirmed, and
-    alone they would drown in what it does."""
-    rest: list[tuple[Comparison, Step, Fit]] = []
-    while len(found.steps) > 1:
-        losses = heldout(found.fit, engine.cluster)
-        rest = []
-        for step in found.steps:
-            fit = refine(engine, without(found.fit.system, step.chosen.name))
-            rest.append((compare(heldout(fit, engine.cluster), losses), step, fit))
-        rest.sort(key=lambda one: -one[0].gain)
-        found.steps = [step for _, step, _ in rest]
+def _eliminated(engine: Engine, selection: Selection) -> Selection:
+    """Backward elimination: remove effects that are no longer needed, and rivals that can be
+    distinguished given the other effects. Effects are ordered by their held-out gain, so that
+    weaker ones are tested given stronger ones."""
+    reduced: list[tuple[Comparison, Step, Fit]] = []
+    while len(selection.steps) > 1:
+        losses = heldout(selection.fit, engine.cluster)
+        reduced = []
+        for step in selection.steps:
+            fit = refine(engine, without(selection.fit.system, step.chosen.name))
+            reduced.append((compare(heldout(fit, engine.cluster), losses), step, fit))
+        reduced.sort(key=lambda item: -item[0].gain)
+        selection.steps = [step for _, step, _ in reduced]
         needless = [
-            one
-            for one in rest
-            if one[0].gain <= 0 or there(one[2], found.fit, engine.cluster) > rules().level
+            item
+            for item in reduced
+            if item[0].gain <= 0
+            or presence_pvalue(item[2], selection.fit, engine.cluster) > rules().level
         ]
         if not needless:
             break
-        _, step, found.fit = needless[-1]
-        found.steps.remove(step)
+        _, step, selection.fit = needless[-1]
+        selection.steps.remove(step)
         log.info("took back %s", step.chosen.name)
-    if len(found.steps) > 1:
-        for _, step, before in rest:
-            step.rivals = _rivals_beside(engine, found, step, before)
-    return found
+    if len(selection.steps) > 1:
+        for _, step, before in reduced:
+            step.rivals = _rivals_given_others(engine, selection, step, before)
+    return selection
 
 
-def _rivals_beside(
-    engine: Engine, found: Search, step: Step, before: Fit
+def _rivals_given_others(
+    engine: Engine, selection: Selection, step: Step, before: Fit
 ) -> list[tuple[Candidate, Comparison]]:
-    """The rivals of an effect that are not told apart from it beside the other effects.
+    """The rivals of an effect that cannot be distinguished from it given the other effects.
 
     Args:
-        before: the model with the other effects alone.
+        before: the model with only the other effects.
     """
-    assert found.screen is not None
-    added = {one.chosen.name for one in found.steps}
-    one = _candidate(step.chosen.score, found.fit, before, found.screen, step.chosen.removed)
+    assert selection.screen is not None
+    added = {accepted.chosen.name for accepted in selection.steps}
+    chosen = _candidate(
+        step.chosen.score, selection.fit, before, selection.screen, step.chosen.removed
+    )
     rivals = []
     for rival, _ in step.rivals:
         if rival.name in added:
@@ -447,8 +475,8 @@ def _rivals_beside(
         except SimulationError:
             continue
         fit = refine(engine, fit.system, tolerance=FINE)
-        other = _candidate(rival.score, fit, before, found.screen, rival.removed)
-        test = _between(other, one, found.screen)
-        if test.p_value > apart_at(one, other):
-            rivals.append((other, test))
+        refitted = _candidate(rival.score, fit, before, selection.screen, rival.removed)
+        test = _j_test(refitted, chosen, selection.screen)
+        if test.p_value > apart_at(chosen, refitted):
+            rivals.append((refitted, test))
     return rivals

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis' page, with captions and words for those who cannot see them."""
+"""Figures of a diagnosis' page, with captions and alternative texts."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report.deviation import Deviation, deviation
 from nnode.discover.report.figures.maps import (
     approach_maps,
@@ -19,9 +19,9 @@ from nnode.discover.report.figures.maps import (
 )
 from nnode.discover.report.figures.marks import (
     coefficient_intervals,
+    confirmation_costs,
     flexible_curve,
     place_curves,
-    sealed_costs,
 )
 from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
 from nnode.discover.report.files import amount, individual, interval
@@ -33,16 +33,16 @@ from nnode.pages.replay import ReplayBlock
 from nnode.pages.tables import markdown
 from nnode.plots.quality import faults_figure
 
-#: Faulty sequences and variables that are drawn.
+#: Largest numbers of faulty sequences and of variables that are drawn.
 FAULTY, PLACES = 10, 9
 
-#: Of maps of deviations.
+#: Units of maps of deviations.
 UNITS = {"traffic": "m/s", "crowd": "m/s²"}
 
 
 @dataclass
 class Figures:
-    """What a page shows, by the section it belongs to."""
+    """The figures of a page, by section."""
 
     map: list[FigureBlock] = field(default_factory=list)
     effects: list[FigureBlock] = field(default_factory=list)
@@ -54,14 +54,14 @@ class Figures:
 
 
 def unit_of(system: System) -> str:
-    """Of what a law says: a speed, or an acceleration."""
+    """The unit of a law's rate: a speed, or an acceleration."""
     return "m/s" if system.order == 1 else "m/s²"
 
 
-def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
-    """Draw everything that the diagnosis gives occasion to."""
+def figures(inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions) -> Figures:
+    """Draw all figures of a diagnosis."""
     drawn = Figures()
-    d = found.diagnosis
+    d = outcome.diagnosis
     if d.effects:
         drawn.effects.append(
             FigureBlock(
@@ -73,27 +73,29 @@ def figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> Figures:
             )
         )
     if d.sealed:
-        drawn.gap.append(_sealed(found))
+        drawn.gap.append(_confirmation_errors(outcome))
     if inputs.faulty:
         drawn.faults.append(_faults(inputs))
-    drawn.places += _places(found)
-    maps = _map_figures(inputs, found, options)
+    drawn.places += _places(outcome)
+    maps = _map_figures(inputs, outcome, options)
     drawn.map, drawn.places = maps[:1], [*drawn.places, *maps[1:]]
     if d.unknown is not None and d.unknown.curve:
-        first = d.unknown.variables[0] if d.unknown.variables else "the first variable"
+        variable = d.unknown.variables[0] if d.unknown.variables else "the first variable"
         drawn.unknown.append(
             FigureBlock(
                 "unknown",
-                flexible_curve(d.unknown, unit_of(found.base)),
-                f"What a flexible fit adds, by {first}. A description, not an explanation.",
-                f"Curve of the missing term by {first}.",
+                flexible_curve(d.unknown, unit_of(outcome.base)),
+                f"What a flexible fit adds, by {variable}. A description, not an explanation.",
+                f"Curve of the missing term by {variable}.",
             )
         )
-    drawn.paths += _paths(found, options)
+    drawn.paths += _paths(outcome, options)
     return drawn
 
 
-def figure(which: str, inputs: Inputs, found: Found, options: DiscoverOptions) -> Figure:
+def figure(
+    which: str, inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions
+) -> Figure:
     """One figure of a diagnosis by its name on the page.
 
     Args:
@@ -103,29 +105,29 @@ def figure(which: str, inputs: Inputs, found: Found, options: DiscoverOptions) -
     Raises:
         ConfigError: the diagnosis has no such figure; names those that it has.
     """
-    drawn = figures(inputs, found, replace(options, replay=False))
+    drawn = figures(inputs, outcome, replace(options, replay=False))
     blocks = [*drawn.map, *drawn.gap, *drawn.effects, *drawn.places, *drawn.unknown]
-    every = {block.name: block.figure for block in blocks}
-    if which not in every:
-        raise ConfigError(f"there is no figure {which!r}; this diagnosis has {', '.join(every)}")
-    return every[which]
+    by_name = {block.name: block.figure for block in blocks}
+    if which not in by_name:
+        raise ConfigError(f"there is no figure {which!r}; this diagnosis has {', '.join(by_name)}")
+    return by_name[which]
 
 
-def _sealed(found: Found) -> FigureBlock:
-    d = found.diagnosis
+def _confirmation_errors(outcome: DiagnosisOutcome) -> FigureBlock:
+    d = outcome.diagnosis
     columns = ([row[key] for row in d.sealed] for key in ("name", "before", "after"))
     names, before, after = columns
     if not d.effects:
         return FigureBlock(
             "sealed",
-            sealed_costs([str(n) for n in names], before, None, d.gap.noise_floor),
+            confirmation_costs([str(n) for n in names], before, None, d.gap.noise_floor),
             "Mean square error of every sealed sequence.",
             f"Marks of {len(names)} sequences, from the largest error to the smallest.",
         )
     better = sum(a < b for a, b in zip(after, before, strict=True))
     return FigureBlock(
         "sealed",
-        sealed_costs([str(n) for n in names], before, after, d.gap.noise_floor),
+        confirmation_costs([str(n) for n in names], before, after, d.gap.noise_floor),
         f"Mean square error of every sealed sequence. {better} of {len(names)} errors are smaller "
         "with effects.",
         f"Paired marks of {len(names)} sequences; {better} lie lower after than before.",
@@ -143,10 +145,10 @@ def _faults(inputs: Inputs) -> FigureBlock:
     )
 
 
-def _places(found: Found) -> list[FigureBlock]:
-    unit = unit_of(found.base)
+def _places(outcome: DiagnosisOutcome) -> list[FigureBlock]:
+    unit = unit_of(outcome.base)
     blocks = []
-    curves = [place for place in found.diagnosis.places if place.curve][:PLACES]
+    curves = [place for place in outcome.diagnosis.places if place.curve][:PLACES]
     if curves:
         blocks.append(
             FigureBlock(
@@ -164,35 +166,37 @@ def _places(found: Found) -> list[FigureBlock]:
     return blocks
 
 
-def _map_figures(inputs: Inputs, found: Found, options: DiscoverOptions) -> list[FigureBlock]:
-    """Maps of deviations by place, and by the nearest agent; none where nothing was simulated."""
-    maps, unit = _maps(inputs, found, options), UNITS[inputs.domain]
+def _map_figures(
+    inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions
+) -> list[FigureBlock]:
+    """Maps of deviations by place, and by the nearest agent; none if nothing was simulated."""
+    maps, unit = _maps(inputs, outcome, options), UNITS[inputs.domain]
     if not len(next(iter(maps.values())).time):
         return []
-    said = ", ".join(f"{name}: {_spread(map_)} {unit} rms" for name, map_ in maps.items())
-    own = "".join(
+    spreads = ", ".join(f"{name}: {_spread(map_)} {unit} rms" for name, map_ in maps.items())
+    note = "".join(
         f" {effect} knows the agents of the open sequences and acts on them alone."
-        for effect in individual(found.extended)
+        for effect in individual(outcome.extended)
     )
     if inputs.domain == "traffic":
-        space, beside = time_space_maps(maps), approach_maps(maps)
+        space, neighbour_map = time_space_maps(maps), approach_maps(maps)
         words = (
             "Measured minus simulated speed in time and space, in all sequences; platoons are "
-            f"simulated for two seconds at a time. Grey: nobody was there.{_laid(inputs)}{own}",
+            f"simulated for two seconds at a time. Grey: nobody was there.{_laid(inputs)}{note}",
             "The same by gap and by how fast the vehicle ahead draws away.",
         )
     else:
         space = plane_maps(maps, inputs.sequences[0].walls)
-        beside = neighbour_maps(maps)
+        neighbour_map = neighbour_maps(maps)
         words = (
             "Mean of measured minus simulated acceleration by place, in all sequences; everyone is "
-            f"simulated for one second at a time. Walls are black.{own}",
+            f"simulated for one second at a time. Walls are black.{note}",
             "The same by where the nearest person is, seen in one's own way: the triangle walks "
             "to the right.",
         )
     return [
-        FigureBlock("map", space, words[0], f"Map of the deviations by place. {said}."),
-        FigureBlock("map_beside", beside, words[1], f"Map by the nearest agent. {said}."),
+        FigureBlock("map", space, words[0], f"Map of the deviations by place. {spreads}."),
+        FigureBlock("map_beside", neighbour_map, words[1], f"Map by the nearest agent. {spreads}."),
     ]
 
 
@@ -206,27 +210,29 @@ def _spread(map_: Deviation) -> str:
     return amount(float(np.sqrt(np.mean(sizes**2))), 2)
 
 
-def _maps(inputs: Inputs, found: Found, options: DiscoverOptions) -> dict[str, Deviation]:
+def _maps(
+    inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions
+) -> dict[str, Deviation]:
     titles = {"before": BEFORE, "after": AFTER}
-    systems = {"before": found.base, "after": found.extended}
-    if not found.diagnosis.effects:
+    systems = {"before": outcome.base, "after": outcome.extended}
+    if not outcome.diagnosis.effects:
         titles.pop("after")
     return {
-        title: found.maps.get(key) or deviation(systems[key], inputs.sequences, options.step)
+        title: outcome.maps.get(key) or deviation(systems[key], inputs.sequences, options.step)
         for key, title in titles.items()
     }
 
 
-def _paths(found: Found, options: DiscoverOptions) -> list[FigureBlock | ReplayBlock]:
-    every = scenes(found)
-    if not every:
+def _paths(outcome: DiagnosisOutcome, options: DiscoverOptions) -> list[FigureBlock | ReplayBlock]:
+    replayed = scenes(outcome)
+    if not replayed:
         return []
-    s = every[0].sequence
-    simulated = as_drawn(every[0])
-    errors = ", ".join(one.heading for one in simulated)
+    s = replayed[0].sequence
+    simulated = as_drawn(replayed[0])
+    errors = ", ".join(simulation.heading for simulation in simulated)
     name, plain = (f"the sealed sequence {n}" for n in (markdown(s.name), s.name))
-    which = "whose error falls most" if found.diagnosis.effects else "with the largest error"
-    moving = [player(found, every)] if options.replay else []
+    which = "whose error falls most" if outcome.diagnosis.effects else "with the largest error"
+    moving = [player(outcome, replayed)] if options.replay else []
     return [
         *moving,
         FigureBlock(

@@ -1,4 +1,4 @@
-"""Where simulation and measurement part, sample by sample: what residual maps are drawn of."""
+"""Deviations of the measurement from simulations, for residual maps."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from nnode.errors import SimulationError
 from nnode.model import System, Traffic
 from nnode.simulation import TorchdiffeqSolver
 
-#: Method and longest step, s: their error is to be seen in no picture.
+#: Method and longest step, s; their error is invisible in figures.
 METHOD = {"traffic": "rk4", "crowd": "midpoint"}
 STEP = {"traffic": 0.1, "crowd": 0.05}
 
-#: Length of the pieces that are simulated, s: shorter ones show the noise of the positions, in
-#: longer ones a deviation shows far from where it arises.
+#: Length of the simulated pieces, s. Shorter ones show the noise of the positions; in longer ones
+#: deviations appear far from their origin.
 SPAN = {"traffic": 2.0, "crowd": 1.0}
 
-#: How many pieces begin within the length of one, and the most pieces that are simulated,
-#: evenly chosen. A crowd has enough people in each, and they are dear.
+#: Number of pieces that start within the length of one, and the largest number of pieces that are
+#: simulated. In crowds, pieces contain many people and are expensive.
 WITHIN = {"traffic": 2, "crowd": 1}
 MOST = {"traffic": 5000, "crowd": 300}
 
-#: Half of the time over which a person's velocity is estimated, s.
+#: Half width of the window for a person's velocity, s.
 SMOOTH = 0.3
 
-#: Sequences that are simulated at once.
+#: Number of sequences that are simulated at once.
 TOGETHER = 64
 
 
@@ -41,8 +41,8 @@ class Deviation:
         time: ``(n,)`` s, on the recording's clock.
         position: ``(n, D)`` m, measured.
         value: ``(n, D)`` speed in m/s (traffic) or acceleration in m/s² (crowd).
-        own: ``(n, D)`` the same as ``value``, in a crowd ahead and left of one's own way.
-        beside: ``(n, 2)``. Traffic: gap in m, and the speed of the vehicle ahead minus one's own
+        own_frame: ``(n, D)`` ``value``, in a crowd along and left of the walking direction.
+        neighbour: ``(n, 2)``. Traffic: gap in m, and the speed of the vehicle ahead minus one's own
             in m/s. Crowd: the nearest person's place in m, ahead of and left of one's own way.
             NaN where there is nobody.
     """
@@ -50,8 +50,8 @@ class Deviation:
     time: np.ndarray
     position: np.ndarray
     value: np.ndarray
-    own: np.ndarray
-    beside: np.ndarray
+    own_frame: np.ndarray
+    neighbour: np.ndarray
 
 
 @torch.no_grad()
@@ -66,19 +66,19 @@ def simulate(
     Returns:
         None for a sequence whose simulation blows up.
     """
-    found: list[np.ndarray | None] = []
+    paths: list[np.ndarray | None] = []
     like = next(system.parameters(), torch.zeros((), dtype=torch.float64))
     for first in range(0, len(sequences), TOGETHER):
         part = sequences[first : first + TOGETHER]
         try:
-            found += _together(system, part, step, like)
+            paths += _together(system, part, step, like)
         except SimulationError:
             for sequence in part:
                 try:
-                    found += _together(system, [sequence], step, like)
+                    paths += _together(system, [sequence], step, like)
                 except SimulationError:
-                    found.append(None)
-    return found
+                    paths.append(None)
+    return paths
 
 
 def _together(
@@ -88,18 +88,18 @@ def _together(
     longest = STEP[system.domain] if step is None else step
     dt = batch.dt / max(1, math.ceil(batch.dt / longest - 1e-6))
     lane = system.formula if isinstance(system, Traffic) else None
-    # a law that names the length of a step has no stages within one
+    # a law that is a map from step to step cannot be evaluated within a step
     method = system.step if lane is not None and "dt" in lane.symbols else METHOD[system.domain]
     x = TorchdiffeqSolver(method, dt=dt)(system, batch).x.double().cpu().numpy()
     return [x[: s.n_samples, i, : s.n_agents] for i, s in enumerate(sequences)]
 
 
 def deviation(system: System, sequences: list[Sequence], step: float | None = None) -> Deviation:
-    """Where ``system`` and the sequences part.
+    """The deviations of the sequences from simulations of ``system``.
 
-    Sequences are cut into pieces of :data:`SPAN`, each simulated from its own first state. What
-    is missed at the end of a piece is expressed as a constant speed (traffic) or acceleration
-    (crowd). A leader whose path is given is left out.
+    Sequences are cut into pieces of :data:`SPAN`, each simulated from its first state. The error at
+    the end of a piece is expressed as a constant speed (traffic) or acceleration (crowd). A leader
+    with a given path is left out.
     """
     pieces = [piece for s in sequences for piece in _pieces(s, system)]
     pieces = pieces[:: max(1, -(-len(pieces) // MOST[system.domain]))]
@@ -123,9 +123,9 @@ def _traffic(s: Sequence, x: np.ndarray, number: int) -> Deviation:
     value = (s.x[-1] - x[-1]) / seconds
     place = (s.x[0] + s.x[-1])[:, 0] / 2
     speed = (s.x[-1] - s.x[0])[:, 0] / seconds
-    beside = np.stack([np.diff(place, append=np.nan), np.diff(speed, append=np.nan)], 1)
+    neighbour = np.stack([np.diff(place, append=np.nan), np.diff(speed, append=np.nan)], 1)
     time = np.full(s.n_agents, (s.time[0] + s.time[-1]) / 2)
-    columns = (time, place[:, None], value, value, beside)
+    columns = (time, place[:, None], value, value, neighbour)
     return Deviation(*(column[:number] for column in columns))
 
 
@@ -134,8 +134,8 @@ def _crowd(s: Sequence, x: np.ndarray, number: int) -> Deviation:
     seconds = s.time[-1] - s.time[0]
     value = 2 * (s.x[-1] - x[-1]) / seconds**2
     time = np.full(number, s.time.mean())
-    beside = nearest(s.x[0], s.v[0])
-    return Deviation(time, s.x.mean(0), value, in_own_frame(value, s.v[0]), beside)
+    neighbour = nearest(s.x[0], s.v[0])
+    return Deviation(time, s.x.mean(0), value, in_own_frame(value, s.v[0]), neighbour)
 
 
 def _pieces(s: Sequence, system: System) -> list[Sequence]:
@@ -143,7 +143,7 @@ def _pieces(s: Sequence, system: System) -> list[Sequence]:
 
     They keep its name, by which effects know its agents.
     """
-    # an acceleration shows in no single step
+    # an acceleration needs at least two steps
     n = min(max(system.order, round(SPAN[system.domain] / s.dt)), s.n_samples - 1)
     goal = s.x[-1] if s.destination is None else s.destination
     v = smooth_velocity(s)

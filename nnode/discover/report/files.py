@@ -15,7 +15,7 @@ from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.optimizers import build_optimizer
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.found import Found
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.result import Coefficient, Diagnosis, Laws, NamedEffect
 from nnode.files import write_text
 from nnode.model import FeedForward, System, build_model
@@ -26,11 +26,11 @@ REPORT = "report.json"
 MODEL = "model.yaml"
 CHECKPOINT = Path("checkpoints", "best.pt")
 
-#: Of ``report.json``, raised when a key changes its name or meaning. 2: the base model's parameters
-#: are told by term and name, ``lin.v0``.
+#: Version of ``report.json``, raised when a key changes its name or meaning. 2: the base model's
+#: parameters are named by term and name, ``lin.v0``.
 SCHEMA = 2
 
-#: The counters of a training that has not begun.
+#: The counters of a training that has not started.
 UNTRAINED: dict[str, float] = {
     "epoch": 0,
     "batch": 0,
@@ -45,10 +45,10 @@ UNTRAINED: dict[str, float] = {
 
 
 def plain_report(diagnosis: Diagnosis) -> dict[str, Any]:
-    """The content of ``report.json``: plain types, None for what is no number."""
-    found = _finite(diagnosis.plain())
-    assert isinstance(found, dict)
-    return {"schema": SCHEMA, **found}
+    """The content of ``report.json``: plain types, None for NaN and infinity."""
+    content = _finite(diagnosis.plain())
+    assert isinstance(content, dict)
+    return {"schema": SCHEMA, **content}
 
 
 def _finite(value: Any) -> Any:
@@ -64,12 +64,12 @@ def _finite(value: Any) -> Any:
 
 
 def write_report(report: dict[str, Any], path: Path) -> Path:
-    """Write a report as JSON that any reader takes."""
+    """Write a report as strict JSON."""
     return write_text(path, json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False))
 
 
 def amount(value: float | None, digits: int = 3) -> str:
-    """A number in words: few digits, a true minus, a dash for what is missing."""
+    """A number as text: few digits, a minus sign, a dash for missing values."""
     if value is None or math.isnan(value):
         return "–"
     short = float(f"{value:.{digits}g}")
@@ -77,7 +77,7 @@ def amount(value: float | None, digits: int = 3) -> str:
 
 
 def estimate(coefficient: Coefficient) -> tuple[str, str, str]:
-    """A coefficient and the ends of its interval, with the digits that the interval leaves."""
+    """A coefficient and the ends of its interval, with the significant digits."""
     c = coefficient
     width = max(c.high - c.value, c.value - c.low)
     if not (math.isfinite(width) and width > 0):
@@ -88,7 +88,7 @@ def estimate(coefficient: Coefficient) -> tuple[str, str, str]:
 
 
 def in_unit(unit: str) -> str:
-    """A unit as it follows a number: nothing for pure numbers."""
+    """A unit after a number; empty for dimensionless numbers."""
     return "" if unit in ("", "1") else f" {unit}"
 
 
@@ -102,33 +102,33 @@ def interval(effect: NamedEffect) -> str:
 
 
 def ranked(laws: Laws) -> str:
-    """The best laws in one line, and by how much they are behind."""
+    """The best laws in one line, with their excess costs."""
     return ", ".join(
-        one.name + (f" (+{100 * one.behind:.3g} %)" if one.behind > 0 else "")
-        for one in laws.ranking[:5]
+        law.name + (f" (+{100 * law.behind:.3g} %)" if law.behind > 0 else "")
+        for law in laws.ranking[:5]
     )
 
 
 def sentence(diagnosis: Diagnosis) -> str:
-    """The verdict in one sentence, one for a law that comes nearer, and one for the faults of the
+    """The verdict in one sentence, one for a better-fitting law, and one for the faults of the
     measurement."""
     return " ".join([verdict(diagnosis), *remarks(diagnosis)])
 
 
 def remarks(diagnosis: Diagnosis) -> list[str]:
-    """What must be known beside the verdict: a law that comes nearer, faults of the measurement."""
-    found, laws = [], diagnosis.laws_again or diagnosis.laws
+    """Remarks on the verdict: a better-fitting law, faults of the measurement."""
+    sentences, laws = [], diagnosis.laws_again or diagnosis.laws
     if laws is not None and laws.best not in ("", diagnosis.model):
-        beside = f" with {_listed(laws.effects)}" if laws.effects else ""
-        found.append(f"Of the laws that were compared, {laws.best}{beside} comes nearer.")
+        qualifier = f" with {_listed(laws.effects)}" if laws.effects else ""
+        sentences.append(f"Of the laws that were compared, {laws.best}{qualifier} comes nearer.")
     faults = diagnosis.data_faults
     if faults:
         where = len({fault.sequence for fault in faults})
-        found.append(
+        sentences.append(
             f"Beside that the measurement holds {_count(len(faults), 'fault')} in "
             f"{_count(where, 'sequence')}, which were left out."
         )
-    return found
+    return sentences
 
 
 def verdict(d: Diagnosis) -> str:
@@ -143,22 +143,25 @@ def verdict(d: Diagnosis) -> str:
         gain += (
             ", in the last part of each sequence, each agent's number being taken from the first"
         )
-    also = f" {_listed([one.name for one in d.leads])} was found too, but not confirmed."
+    unconfirmed = f" {_listed([e.name for e in d.leads])} was found too, but not confirmed."
     match d.verdict:
         case "named":
-            them = "it" if len(d.effects) == 1 else "them"
-            return f"The model {d.model} lacks {names}: with {them}, {gain}." + also * bool(d.leads)
+            pronoun = "it" if len(d.effects) == 1 else "them"
+            return (
+                f"The model {d.model} lacks {names}: with {pronoun}, {gain}."
+                + unconfirmed * bool(d.leads)
+            )
         case "indistinguishable":
             alternatives = {a.name for effect in d.effects for a in effect.alternatives}
-            beside = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
+            rivals = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
             return (
                 f"The model {d.model} lacks something, and these data cannot tell whether it is "
-                f"{names} or rather {beside}: with {names}, {gain}."
+                f"{names} or rather {rivals}: with {names}, {gain}."
             )
         case "unconfirmed":
             return (
                 f"Not confirmed: in the open data the model {d.model} seems to lack "
-                f"{_listed([one.name for one in d.leads])}, but {d.confirmation.reason}. It is not "
+                f"{_listed([e.name for e in d.leads])}, but {d.confirmation.reason}. It is not "
                 "added to the model."
             )
         case "not_testable":
@@ -169,11 +172,13 @@ def verdict(d: Diagnosis) -> str:
                 f"{c.why}), and about {c.enough} in all would do. Nothing is named."
             )
         case "unknown":
-            on = _listed(d.unknown.variables) if d.unknown else "variables that were not found"
-            first = f"Beyond {names} the" if d.effects else "The"
+            variables = (
+                _listed(d.unknown.variables) if d.unknown else "variables that were not found"
+            )
+            subject = f"Beyond {names} the" if d.effects else "The"
             return (
-                f"{first} model {d.model} lacks something that is not in the catalogue; it "
-                f"depends on {on}."
+                f"{subject} model {d.model} lacks something that is not in the catalogue; it "
+                f"depends on {variables}."
             )
         case "none":
             return (
@@ -206,12 +211,12 @@ def _listed(names: list[str], last: str = "and") -> str:
 def extended_options(options: Mapping[str, Any], system: System) -> dict[str, Any]:
     """The options of a model that give ``system``: effects, and parameters as start values.
 
-    Weights of networks are no options; only a checkpoint holds them.
+    Weights of networks are not options; only a checkpoint contains them.
 
     Args:
         options: what the model was built from before it was calibrated and extended.
     """
-    own = {
+    law_options = {
         name: float(getattr(term, name).detach())
         for term in system.terms
         if term not in effects_of(system)
@@ -223,23 +228,23 @@ def extended_options(options: Mapping[str, Any], system: System) -> dict[str, An
     name = "_".join([str(options["name"]).split("_with_")[0], "with", *names])
     if not effects:
         name = f"{options['name']}_calibrated"
-    rest = {key: value for key, value in options.items() if key != "effects"}
-    return {**rest, "name": name, **own, "effects": effects}
+    options_kept = {key: value for key, value in options.items() if key != "effects"}
+    return {**options_kept, "name": name, **law_options, "effects": effects}
 
 
 def individual(system: System) -> list[str]:
-    """The effects of a model that have a number for every agent."""
+    """The effects of a model with agent-specific parameters."""
     return [effect.name for effect in effects_of(system) if effect.individual]
 
 
 def has_network(system: System) -> bool:
-    """Whether a network is among what a model sums."""
+    """Whether a model contains a network."""
     return any(isinstance(module, FeedForward) for module in system.modules())
 
 
 def model_yaml(options: Mapping[str, Any], networks: bool) -> str:
     """A model's options as a file for ``conf/model``."""
-    # in a comment: a line break would end it
+    # the name appears in a comment, which a line break would end
     name = " ".join(str(options["name"]).split())
     lines = [
         f"# Made by nnode discover. Copy it to conf/model/{name}.yaml, "
@@ -258,22 +263,23 @@ def rebuilt(options: Mapping[str, Any], system: System) -> System:
     target = {effect.name: effect for effect in effects_of(model)}
     for effect in effects_of(system):
         target[effect.name].load_state_dict(effect.state_dict())
-    ours, theirs = (
+    model_terms, system_terms = (
         [term for term in s.terms if term not in effects_of(s)] for s in (model, system)
     )
-    for mine, given in zip(ours, theirs, strict=True):
-        mine.load_state_dict(given.state_dict())
+    for term, source in zip(model_terms, system_terms, strict=True):
+        term.load_state_dict(source.state_dict())
     return model
 
 
 def checkpoint_of(
-    found: Found,
+    outcome: DiagnosisOutcome,
     sequences: list[Sequence],
     config: dict[str, Any],
     manifest: dict[str, Any],
     optimizer: Any,
 ) -> Checkpoint:
-    """The extended model as a checkpoint: trained on the open, tested on the sealed sequences.
+    """The extended model as a checkpoint: the exploration sequences are its training set, the
+    confirmation sequences its test set.
 
     Args:
         config: a training's composed configuration in plain types, ``model`` that of the
@@ -281,13 +287,13 @@ def checkpoint_of(
         manifest: where the data come from.
         optimizer: options of the optimiser that training would go on with.
     """
-    model = rebuilt(config["model"], found.extended)
+    model = rebuilt(config["model"], outcome.extended)
     speed = None
     if model.domain == "traffic":
-        speed = best_common_speed([collate([sequences[i] for i in found.open])], model)
-    used = {*found.open, *found.sealed}
+        speed = best_common_speed([collate([sequences[i] for i in outcome.exploration])], model)
+    used = {*outcome.exploration, *outcome.confirmation}
     dropped = [i for i in range(len(sequences)) if i not in used]
-    parts = {"train": found.open, "heldout": found.sealed, "dropped": dropped}
+    parts = {"train": outcome.exploration, "heldout": outcome.confirmation, "dropped": dropped}
     return Checkpoint(
         config=config,
         manifest=manifest,

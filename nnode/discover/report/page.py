@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.logbook import Logbook
-from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report import tables
 from nnode.discover.report.captions import Figures, figures, unit_of
 from nnode.discover.report.files import (
@@ -46,7 +46,7 @@ _NETWORK = (
 
 def draw(
     inputs: Inputs,
-    found: Found,
+    outcome: DiagnosisOutcome,
     options: DiscoverOptions,
     config: dict[str, Any],
     commands: list[str],
@@ -62,37 +62,37 @@ def draw(
     Returns:
         What writes the page and the events into the folder and returns their paths.
     """
-    drawn = figures(inputs, found, options)
-    blocks = page_blocks(inputs, found, drawn, commands, folder)
-    title = f"Diagnosis of {found.diagnosis.model} on {config['data']['name']}"
+    drawn = figures(inputs, outcome, options)
+    blocks = page_blocks(inputs, outcome, drawn, commands, folder)
+    title = f"Diagnosis of {outcome.diagnosis.model} on {config['data']['name']}"
 
     def write() -> dict[str, Path]:
-        subtitle = verdict(found.diagnosis)
+        subtitle = verdict(outcome.diagnosis)
         page, *others = write_page(blocks, folder, title=title, subtitle=subtitle, stem="report")
         pictures = [path for path in others if path.suffix == ".png"]
-        events = write_events(found, pictures, config, folder / TENSORBOARD)
+        events = write_events(outcome, pictures, config, folder / TENSORBOARD)
         return {"page": page, "tensorboard": events}
 
     return write
 
 
 def page_blocks(
-    inputs: Inputs, found: Found, drawn: Figures, commands: list[str], folder: Path
+    inputs: Inputs, outcome: DiagnosisOutcome, drawn: Figures, commands: list[str], folder: Path
 ) -> list[Block]:
     """The page in the order of the diagnosis, the verdict first."""
-    d = found.diagnosis
-    unit = unit_of(found.base)
+    d = outcome.diagnosis
+    unit = unit_of(outcome.base)
     return [
         *_first(d),
         *_map(drawn),
         *_gap(d, drawn),
-        *_coefficients(d, drawn, found),
+        *_coefficients(d, drawn, outcome),
         *_agents(d),
         *_model(d),
         *_shown(d, drawn),
         *_places(d, drawn, unit),
         *_rest(d, drawn, unit),
-        *_usage(d, commands, folder, found),
+        *_usage(d, commands, folder, outcome),
         *_decided(d, drawn),
         *_data(d, drawn),
         *_laws(d),
@@ -102,7 +102,7 @@ def page_blocks(
 
 
 def _first(d: Diagnosis) -> list[Block]:
-    """What a reader must know beside the verdict."""
+    """Remarks on the verdict."""
     words = remarks(d)
     return [Text(" ".join(words))] if words else []
 
@@ -114,25 +114,25 @@ def _map(drawn: Figures) -> list[Block]:
 
 
 def _laws(d: Diagnosis) -> list[Block]:
-    """Which base law comes nearest, before anything is said to be missing."""
+    """The comparison of base laws."""
     if d.laws is None or not d.laws.ranking:
         return []
     compared = [d.laws] if d.laws_again is None else [d.laws, d.laws_again]
-    last = compared[-1]
-    own = next((one for one in last.ranking if one.name == d.model), None)
-    beside = f", with {', '.join(last.effects)}," if last.effects else ""
-    if last.best == d.model:
-        words = f"Of the laws that were compared, {d.model}{beside} comes nearest."
-    elif own is None:
-        words = f"{last.best}{beside} comes nearest; {d.model} was not compared."
+    latest = compared[-1]
+    asked = next((law for law in latest.ranking if law.name == d.model), None)
+    qualifier = f", with {', '.join(latest.effects)}," if latest.effects else ""
+    if latest.best == d.model:
+        words = f"Of the laws that were compared, {d.model}{qualifier} comes nearest."
+    elif asked is None:
+        words = f"{latest.best}{qualifier} comes nearest; {d.model} was not compared."
     else:
         words = (
-            f"**{last.best}{beside} comes nearer than {d.model}**, whose held-out cost is "
-            f"{100 * own.behind:.3g} % higher (p = {amount(own.p_value, 2)}). What {d.model} "
+            f"**{latest.best}{qualifier} comes nearer than {d.model}**, whose held-out cost is "
+            f"{100 * asked.behind:.3g} % higher (p = {amount(asked.p_value, 2)}). What {d.model} "
             f"lacks may be no effect but the other law: `nearest_law/` holds its diagnosis."
         )
     words += (
-        f" Costs are those of {last.clusters} open clusters that calibrations left out in turn."
+        f" Costs are those of {latest.clusters} open clusters that calibrations left out in turn."
     )
     if d.laws.refused:
         words += (
@@ -144,18 +144,19 @@ def _laws(d: Diagnosis) -> list[Block]:
     return [
         Heading("Which base law"),
         Text(words),
-        *(tables.laws_table(*one, d.domain) for one in zip(compared, names, strict=False)),
+        *(tables.laws_table(*law, d.domain) for law in zip(compared, names, strict=False)),
     ]
 
 
 def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
-    """The errors on sealed sequences: one definition for the whole page."""
-    sealed, opened = len(d.split.get("sealed", [])), len(d.split.get("open", []))
+    """The errors on the confirmation sequences, with the definition for the whole page."""
+    n_confirmation, n_exploration = len(d.split.get("sealed", [])), len(d.split.get("open", []))
     return [
         Heading("The error on sealed sequences"),
         Text(
-            f"{sealed} of {sealed + opened} sequences were sealed: they were held back, and "
-            f"neither calibration nor search used them. {d.gap.definition} {_gap_words(d)}".strip()
+            f"{n_confirmation} of {n_confirmation + n_exploration} sequences were sealed: they "
+            "were held back, and neither calibration nor search used them. "
+            f"{d.gap.definition} {_gap_words(d)}".strip()
         ),
         tables.gap_table(d),
     ]
@@ -167,9 +168,9 @@ def _gap_words(d: Diagnosis) -> str:
     return f"The effects close {closed(d)} of the gap between the model and the noise."
 
 
-def _coefficients(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
+def _coefficients(d: Diagnosis, drawn: Figures, outcome: DiagnosisOutcome) -> list[Block]:
     blocks: list[Block] = [Heading("What is missing")]
-    if has_network(found.base):
+    if has_network(outcome.base):
         blocks.append(Text(_NETWORK))
     if d.effects:
         blocks += [tables.coefficients_table(d.effects), *drawn.effects]
@@ -185,7 +186,7 @@ def _coefficients(d: Diagnosis, drawn: Figures, found: Found) -> list[Block]:
 
 
 def _decided(d: Diagnosis, drawn: Figures) -> list[Block]:
-    """What the verdict rests on."""
+    """The tests behind the verdict."""
     blocks: list[Block] = []
     if d.notes:
         blocks.append(Text("\n".join(f"- {markdown(note)}" for note in d.notes)))
@@ -204,7 +205,7 @@ def _decided(d: Diagnosis, drawn: Figures) -> list[Block]:
         ]
     blocks += drawn.gap
     if d.sealed:
-        blocks.append(tables.sealed_table(d))
+        blocks.append(tables.confirmation_table(d))
     return [Heading("How it was decided"), *blocks] if blocks else []
 
 
@@ -222,24 +223,24 @@ def _clusters(d: Diagnosis) -> list[Block]:
 
 
 def _agents(d: Diagnosis) -> list[Block]:
-    """Whether agents differ, beside the effects of the population."""
+    """The differences between agents, in addition to population effects."""
     if d.drivers:
         return [Heading("Do drivers differ?"), tables.drivers_table(d)]
     if not d.agents:
         return []
     words = [
-        f"- {one.name}: "
-        + ("named." if one.named else f"not named: {one.reason}.")
-        + f" What lasts longer than {amount(one.lasts, 2)} s cannot be told from a number of "
+        f"- {estimate.name}: "
+        + ("named." if estimate.named else f"not named: {estimate.reason}.")
+        + f" What lasts longer than {amount(estimate.lasts, 2)} s cannot be told from a number of "
         "one's own."
-        for one in d.agents
+        for estimate in d.agents
     ]
     blocks: list[Block] = [
         Heading("Do agents differ?"),
         Text("\n".join(words)),
         tables.agents_table(d),
     ]
-    if any(one.later for one in d.agents):
+    if any(estimate.later for estimate in d.agents):
         blocks.append(tables.later_table(d))
     return blocks
 
@@ -317,14 +318,16 @@ def _shown(d: Diagnosis, drawn: Figures) -> list[Block]:
     return [Heading("A sealed sequence"), *drawn.paths]
 
 
-def _usage(d: Diagnosis, commands: list[str], folder: Path, found: Found) -> list[Block]:
+def _usage(
+    d: Diagnosis, commands: list[str], folder: Path, outcome: DiagnosisOutcome
+) -> list[Block]:
     more = ""
-    if has_network(found.base):
+    if has_network(outcome.base):
         more += (
             " The weights of the network are in the checkpoint alone; trained from the "
             "configuration it starts anew."
         )
-    for name in individual(found.extended):
+    for name in individual(outcome.extended):
         more += (
             f" {name} knows the agents of the open sequences; for all others it does not act, so "
             "that the errors that the command `evaluate` gives on sealed sequences are those "
@@ -357,7 +360,9 @@ def _names(names: list[str]) -> str:
     return ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
 
 
-def write_events(found: Found, pictures: list[Path], config: dict[str, Any], folder: Path) -> Path:
+def write_events(
+    outcome: DiagnosisOutcome, pictures: list[Path], config: dict[str, Any], folder: Path
+) -> Path:
     """Write TensorBoard's events: step 0 is the model as it was given, step 1 the extended one.
 
     Events of an earlier run in the folder are replaced.
@@ -365,7 +370,7 @@ def write_events(found: Found, pictures: list[Path], config: dict[str, Any], fol
     Args:
         pictures: the page's figures.
     """
-    d = found.diagnosis
+    d = outcome.diagnosis
     shutil.rmtree(folder, ignore_errors=True)
     book = Logbook(folder, config)
     for step, (cost, key) in enumerate(((d.gap.before, "before"), (d.gap.after, "after"))):

@@ -1,4 +1,4 @@
-"""Sealed sequences in a player, with the place that was named shaded."""
+"""Confirmation sequences in a player, with the named place shaded."""
 
 from __future__ import annotations
 
@@ -6,85 +6,85 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from nnode.discover.found import Found
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report.files import amount
 from nnode.discover.result import Diagnosis, NamedEffect
 from nnode.pages.replay import ReplayBlock, Scene, Zone
 
-#: Sealed sequences in the player.
+#: Largest number of confirmation sequences in the player.
 SCENES = 16
-#: What the two models are called, here and in the figures.
+#: Names of the two models, also in the figures.
 BEFORE, AFTER = "without effects", "with effects"
 
 
-def telling(found: Found) -> list[int]:
+def by_improvement(outcome: DiagnosisOutcome) -> list[int]:
     """Rows of ``diagnosis.sealed``, first the one whose error falls most, or without effects the
     one with the largest error. Rows without two finite errors are left out."""
-    rows = found.diagnosis.sealed
+    rows = outcome.diagnosis.sealed
 
     def gain(i: int) -> float:
-        after = rows[i]["after"] if found.diagnosis.effects else 0.0
+        after = rows[i]["after"] if outcome.diagnosis.effects else 0.0
         return float(rows[i]["before"]) - float(after)
 
     finite = [i for i, row in enumerate(rows) if np.isfinite([row["before"], row["after"]]).all()]
     return sorted(finite, key=gain, reverse=True)
 
 
-def scenes(found: Found) -> list[Scene]:
-    """Sealed sequences and the simulations that their errors were computed from, without and with
-    effects, in the order of :func:`telling`.
+def scenes(outcome: DiagnosisOutcome) -> list[Scene]:
+    """Confirmation sequences with the simulations of their errors, without and with effects, in the
+    order of :func:`by_improvement`.
 
     The still figure has the first one; a crowd's player begins with the one with most people.
     """
-    every = []
-    for i in telling(found)[:SCENES]:
-        before, after = found.simulated[i]
+    replayed = []
+    for i in by_improvement(outcome)[:SCENES]:
+        before, after = outcome.simulated[i]
         if before is None or after is None:
             continue
-        row, paths = found.diagnosis.sealed[i], {BEFORE: before.x}
+        row, paths = outcome.diagnosis.sealed[i], {BEFORE: before.x}
         errors = {BEFORE: float(row["before"])}
-        if found.diagnosis.effects:
+        if outcome.diagnosis.effects:
             paths[AFTER], errors[AFTER] = after.x, float(row["after"])
         notes = {title: f"error {amount(error)} m²" for title, error in errors.items()}
-        every.append(Scene(before.sequence, paths, notes=notes, restart=before.restart))
-    return every
+        replayed.append(Scene(before.sequence, paths, notes=notes, restart=before.restart))
+    return replayed
 
 
-def player(found: Found, every: list[Scene]) -> ReplayBlock:
+def player(outcome: DiagnosisOutcome, replayed: list[Scene]) -> ReplayBlock:
     """The player of :func:`scenes`."""
-    sealed = len(found.sealed)
-    shaded = zones(found.diagnosis)
+    n_confirmation = len(outcome.confirmation)
+    shaded = zones(outcome.diagnosis)
     named = f" Shaded: {', '.join(zone.label for zone in shaded)}." if shaded else ""
     return ReplayBlock(
         "replay",
-        every,
+        replayed,
         "Sealed sequences, on which nothing was calibrated, as measured and in the simulations "
         "that the errors on this page were computed from. Outlines are where agents were measured; "
         "arrows, the residuals, go there from where they are simulated. Agents without a "
         "simulated position are given to the simulation and do not count in the error. The "
         "distance is the root mean square over the agents at the moment that is shown; the error "
-        f"is the mean of its square over the sequence.{_again(every)}{named}",
-        f"Player of {len(every)} sealed sequences: agents as measured, and as simulated by "
-        f"{len(every[0].simulated)} models.",
+        f"is the mean of its square over the sequence.{_restart_note(replayed)}{named}",
+        f"Player of {len(replayed)} sealed sequences: agents as measured, and as simulated by "
+        f"{len(replayed[0].simulated)} models.",
         shaded,
-        sealed,
+        n_confirmation,
     )
 
 
-def _again(every: list[Scene]) -> str:
-    """What must be said of simulations that start again."""
-    first = every[0]
-    if first.restart is None:
+def _restart_note(replayed: list[Scene]) -> str:
+    """A note on simulations that restart."""
+    scene = replayed[0]
+    if scene.restart is None:
         return ""
-    seconds = first.restart * first.sequence.dt
+    seconds = scene.restart * scene.sequence.dt
     return f" Simulations start again from the measurement every {seconds:.2g} s."
 
 
 def zones(d: Diagnosis) -> list[Zone]:
-    """Places and times of the effects that were named; without any, where the model parts most."""
-    found = [zone for effect in d.effects if (zone := _zone(effect)) is not None]
-    if found:
-        return found
+    """Places and times of the named effects; without any, the largest deviation."""
+    effect_zones = [zone for effect in d.effects if (zone := _zone(effect)) is not None]
+    if effect_zones:
+        return effect_zones
     for place in d.places:
         ends = (place.low, place.high)
         if not np.isfinite(ends).all():
@@ -100,9 +100,9 @@ def zones(d: Diagnosis) -> list[Zone]:
 
 
 def _zone(effect: NamedEffect) -> Zone | None:
-    found = effect.coefficients
-    at = {name: c.value for name, c in found.items()}
-    return zone_of(effect.name, at, found["a"].unit if "a" in found else "")
+    coefficients = effect.coefficients
+    values = {name: c.value for name, c in coefficients.items()}
+    return zone_of(effect.name, values, coefficients["a"].unit if "a" in coefficients else "")
 
 
 def zone_of(name: str, at: Mapping[str, float], unit: str) -> Zone | None:

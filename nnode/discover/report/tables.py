@@ -13,12 +13,12 @@ from nnode.discover.result import Alternative, Diagnosis, Laws, NamedEffect
 from nnode.model.term import short_names
 from nnode.pages.page import TableBlock
 
-#: Faults that the page lists; its CSV has all.
+#: Largest number of faults on the page; the CSV file contains all.
 LISTED = 30
 
 
-def _table(name: str, rows: list[dict[str, Any]], caption: str, **more: Any) -> TableBlock:
-    return TableBlock(name, pd.DataFrame(rows), caption, **more)
+def _table(name: str, rows: list[dict[str, Any]], caption: str, **options: Any) -> TableBlock:
+    return TableBlock(name, pd.DataFrame(rows), caption, **options)
 
 
 def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -> TableBlock:
@@ -52,32 +52,32 @@ def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
     """Base laws, the best first."""
     rows = [
         {
-            "law": one.name,
-            "parameters": one.parameters,
-            "held-out cost above the best (%)": amount(100 * one.behind),
-            "p": amount(one.p_value, 2),
-            "error on left-out open clusters (m²)": amount(one.error),
+            "law": law.name,
+            "parameters": law.parameters,
+            "held-out cost above the best (%)": amount(100 * law.behind),
+            "p": amount(law.p_value, 2),
+            "error on left-out open clusters (m²)": amount(law.error),
             "calibrated": ", ".join(
                 f"{name.partition('.')[2] or name} {amount(value)}{in_unit(unit)}"
-                for name, (value, unit) in one.values.items()
+                for name, (value, unit) in law.values.items()
             ),
         }
-        for one in laws.ranking
+        for law in laws.ranking
     ]
-    beside = ""
+    restriction = ""
     if laws.effects:
-        beside = f", those that have a place for it with {', '.join(laws.effects)}"
+        restriction = f", those that have a place for it with {', '.join(laws.effects)}"
     return _table(
         name,
         rows,
-        f"Base laws on the open sequences{beside}. *held-out cost*: of whitened "
+        f"Base laws on the open sequences{restriction}. *held-out cost*: of whitened "
         "residuals, mean of logarithms over clusters; *p*: one-sided, that the law is as good as "
         f"the first. {_ERRORS[domain]}",
     )
 
 
 def clusters_table(d: Diagnosis) -> TableBlock:
-    """How many clusters there are, and how many it takes."""
+    """The numbers of clusters, and the numbers that are needed."""
     c = d.clusters
     rows = [
         {"clusters": "open", "there are": c.open, "it takes": c.least, "to": "name any effect"},
@@ -87,19 +87,19 @@ def clusters_table(d: Diagnosis) -> TableBlock:
 
 
 def screen_table(d: Diagnosis) -> TableBlock:
-    """What explains most in the open sequences."""
+    """The effects that explain most in the exploration sequences."""
     rows = [
         {
-            "effect": one["name"],
-            "share of the squared residuals": _percent(one["share"]),
-            "p": amount(one["p_value"], 2),
+            "effect": score["name"],
+            "share of the squared residuals": _percent(score["share"]),
+            "p": amount(score["p_value"], 2),
             "about": ", ".join(
                 f"{name} {amount(value)}"
-                for name, value in one.items()
+                for name, value in score.items()
                 if name not in ("name", "share", "p_value")
             ),
         }
-        for one in d.screen.leads
+        for score in d.screen.leads
     ]
     return _table(
         "screen",
@@ -111,17 +111,17 @@ def screen_table(d: Diagnosis) -> TableBlock:
 
 
 def agents_table(d: Diagnosis) -> TableBlock:
-    """Numbers of agents, and what their variance belongs to."""
+    """Agent-specific parameters and their variance components."""
     rows = [
         {
-            "effect": one.name,
-            "strength": f"{amount(one.strength, 2)} [{amount(one.low, 2)}, {amount(one.high, 2)}]",
-            "unit": _unit(one.unit),
-            "p": amount(one.p_value, 2),
-            **{who: "–" if share is None else _percent(share) for who, share in one.share.items()},
-            "p on sealed clusters": amount(one.confirmed, 2),
+            "effect": a.name,
+            "strength": f"{amount(a.strength, 2)} [{amount(a.low, 2)}, {amount(a.high, 2)}]",
+            "unit": _unit(a.unit),
+            "p": amount(a.p_value, 2),
+            **{who: "–" if share is None else _percent(share) for who, share in a.share.items()},
+            "p on sealed clusters": amount(a.confirmed, 2),
         }
-        for one in d.agents
+        for a in d.agents
     ]
     return _table(
         "agents",
@@ -133,23 +133,23 @@ def agents_table(d: Diagnosis) -> TableBlock:
 
 
 def drivers_table(d: Diagnosis) -> TableBlock:
-    """What differs between drivers and over time."""
-    known = {
+    """Variances between drivers and over time."""
+    labels = {
         "push": "pushes",
         "push_time": "time that pushes last",
         "measurement": "measured positions",
     }
     rows = [
         {
-            "what": known.get(one.name, f"{one.name} between drivers"),
-            "standard deviation or time": amount(one.estimate),
+            "what": labels.get(variation.name, f"{variation.name} between drivers"),
+            "standard deviation or time": amount(variation.estimate),
             "95 % interval": "not estimable"
-            if math.isnan(one.lower)
-            else f"[{amount(one.lower)}, {amount(one.upper)}]",
-            "unit": _unit(one.unit),
-            "left open per driver": _percent(one.shrinkage),
+            if math.isnan(variation.lower)
+            else f"[{amount(variation.lower)}, {amount(variation.upper)}]",
+            "unit": _unit(variation.unit),
+            "left open per driver": _percent(variation.shrinkage),
         }
-        for one in d.drivers
+        for variation in d.drivers
     ]
     return _table(
         "drivers",
@@ -162,15 +162,15 @@ def drivers_table(d: Diagnosis) -> TableBlock:
 
 
 def later_table(d: Diagnosis) -> TableBlock:
-    """Who predicts the last part of sealed sequences."""
+    """Errors in the last part of the confirmation sequences, by model."""
     rows = [
         {
-            "effect": one.name,
+            "effect": estimate.name,
             "who predicts": "the model without effects" if who == "base" else who,
             "mean square error (m²)": amount(error),
         }
-        for one in d.agents
-        for who, error in one.later.items()
+        for estimate in d.agents
+        for who, error in estimate.later.items()
     ]
     return _table(
         "later",
@@ -204,18 +204,20 @@ def effects_table(d: Diagnosis) -> TableBlock:
 
 
 def alternatives_table(d: Diagnosis) -> TableBlock:
-    """What could stand in the place of an effect."""
+    """The alternatives to the named effects."""
     rows = [
         {
             "chosen": effect.name,
-            "as good": other.name,
-            "loss relative to the chosen": amount(other.loss, 4),
-            "p": amount(other.p_value, 2),
-            "what would tell them apart": _apart(other),
-            "or so many open clusters": "–" if other.clusters is None else other.clusters,
+            "as good": alternative.name,
+            "loss relative to the chosen": amount(alternative.loss, 4),
+            "p": amount(alternative.p_value, 2),
+            "what would tell them apart": _apart(alternative),
+            "or so many open clusters": "–"
+            if alternative.clusters is None
+            else alternative.clusters,
         }
         for effect in d.effects
-        for other in effect.alternatives
+        for alternative in effect.alternatives
     ]
     return _table(
         "alternatives",
@@ -229,8 +231,8 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
     )
 
 
-def _apart(other: Alternative) -> str:
-    profile = other.profile
+def _apart(alternative: Alternative) -> str:
+    profile = alternative.profile
     leader = (
         ""
         if profile is None
@@ -240,11 +242,11 @@ def _apart(other: Alternative) -> str:
             f"back every {profile.period:g} s"
         )
     )
-    return "; ".join(part for part in (other.separated_by, leader) if part) or "–"
+    return "; ".join(part for part in (alternative.separated_by, leader) if part) or "–"
 
 
 def gap_table(d: Diagnosis) -> TableBlock:
-    """The error on the sealed sequences."""
+    """The error on the confirmation sequences."""
     rows = [
         {"": what, "mean square error (m²)": amount(value)}
         for what, value in (
@@ -264,8 +266,8 @@ def gap_table(d: Diagnosis) -> TableBlock:
     )
 
 
-def sealed_table(d: Diagnosis) -> TableBlock:
-    """The errors of the single sealed sequences."""
+def confirmation_table(d: Diagnosis) -> TableBlock:
+    """The errors of the individual confirmation sequences."""
     rows = [
         {
             "sequence": row["name"],
@@ -286,7 +288,7 @@ def sealed_table(d: Diagnosis) -> TableBlock:
 
 
 def base_table(d: Diagnosis) -> TableBlock:
-    """How the model's own parameters move when effects join them."""
+    """The change of the model's parameters when effects are added."""
     short = short_names(d.base)
     rows = [
         {
@@ -329,7 +331,7 @@ def faults_table(d: Diagnosis) -> TableBlock:
 
 
 def places_table(d: Diagnosis, unit: str) -> TableBlock:
-    """Where simulation and measurement part."""
+    """Where the model deviates from the data."""
     rows = [
         {
             "variable": place.variable,
@@ -353,7 +355,7 @@ def places_table(d: Diagnosis, unit: str) -> TableBlock:
 
 
 def absent_table(d: Diagnosis) -> TableBlock:
-    """Effects that the data speak against."""
+    """Effects that are absent, with bounds."""
     rows = [
         {
             "effect": absence.name,
@@ -378,12 +380,12 @@ def absent_table(d: Diagnosis) -> TableBlock:
 
 
 def not_testable_table(d: Diagnosis) -> TableBlock:
-    """Effects about which the data say nothing."""
-    known = {absence.name: absence for absence in d.absences if not absence.testable}
-    names = list(dict.fromkeys([*known, *d.not_testable]))
+    """Effects that are not testable with these data."""
+    by_name = {absence.name: absence for absence in d.absences if not absence.testable}
+    names = list(dict.fromkeys([*by_name, *d.not_testable]))
     rows = []
     for name in names:
-        absence = known.get(name)
+        absence = by_name.get(name)
         needed = amount(absence.detectable) if absence else "–"
         rows.append(
             {

@@ -1,1 +1,1 @@
-"""What a model leaves of the measurement, and its calibration to that; the same in every domain."""
+"""Residuals of models, and calibration to them; the same in every domain."""

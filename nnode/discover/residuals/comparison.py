@@ -1,4 +1,4 @@
-"""What a comparison of two models came to, in plain numbers."""
+"""The result of a paired comparison of two models."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Comparison:
-    """Of two models on the same clusters.
+    """A paired comparison of two models on the same clusters.
 
     Attributes:
         gain: mean over the clusters of (first - second) / max(first, second).
         low, high: its interval of 95 %.
-        p_value: that the second is not better, one-sided.
+        p_value: one-sided, of the null hypothesis that the second is not better.
         clusters: their number.
     """
 

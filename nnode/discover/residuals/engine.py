@@ -1,4 +1,4 @@
-"""What a diagnosis needs to know of a domain: how a model's residuals come about."""
+"""The interface between a diagnosis and a domain: the residuals of models."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence
-from nnode.discover.found import Simulation
+from nnode.discover.outcome import Simulation
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.system import System
 from nnode.model.term import State
@@ -33,7 +33,7 @@ class Squares:
     sequence: np.ndarray
 
     def means(self) -> np.ndarray:
-        """``(S,)`` mean square error of each sequence; infinite where it blows up, NaN where
+        """``(S,)`` mean square error of each sequence; infinite if its simulation diverges, NaN if
         nothing of it is compared."""
         total = np.bincount(self.sequence, np.nan_to_num(self.value, nan=np.inf))
         number = np.bincount(self.sequence)
@@ -43,24 +43,23 @@ class Squares:
 class Engine(Protocol):
     """The residuals of models on some sequences.
 
-    A residual is a number that is zero where simulation and measurement agree: positions that
-    differ, in m, without what unknown start states explain, and whitened as far as a filter of
-    the residuals allows it. All models of a diagnosis are compared in the same residuals.
+    Residuals are whitened differences between measured and simulated positions; the part that
+    unknown start states explain is projected out. All models of a diagnosis are compared with the
+    same whitening.
 
     Attributes:
-        batch: the sequences, or windows of them that bear their names.
+        batch: the sequences, or windows of them with the same names.
         names: of the sequences.
         sequences: as they were given.
         sequence: ``(n,)`` position of each residual's sequence in ``names``.
         cluster: ``(n,)`` number of its cluster: see :mod:`nnode.data.clusters`.
         clock: ``(n,)`` its time in the recording, s.
-        component: ``(n,)`` residuals of one time and agent that have different numbers mean
-            different things.
-        unit: ``(n,)`` number of the agents whose own numbers are estimated together.
-        people: of each unit, per direction the sequence and the place of the agent it belongs
-            to; one entry where all directions belong to one agent.
-        least: share of the squared errors below which nothing is worth a name; none where tests
-            themselves ask for more than the least size that is of interest.
+        component: ``(n,)`` number of the component among the residuals of one time and agent.
+        unit: ``(n,)`` number of the unit: agents whose parameters are estimated jointly.
+        people: of each unit, per direction the sequence and the place of its agent; one entry if
+            all directions belong to one agent.
+        least: smallest share of the squared errors that is worth naming; -inf if the tests
+            themselves require a minimum effect size.
     """
 
     batch: Batch
@@ -75,7 +74,7 @@ class Engine(Protocol):
     least: float
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, n)`` residuals of R runs of one model; NaN where a run blows up.
+        """``(R, n)`` residuals of R runs of one model; NaN if a run diverges.
 
         Args:
             system: the model.
@@ -91,16 +90,16 @@ class Engine(Protocol):
     def screen_columns(
         self, system: System, row: Tensor, effect: type[Effect], probe: Probe
     ) -> Tensor:
-        """``(S, n)`` derivatives of the residuals with respect to the strengths of a probe; one
-        row for the effect as a whole where the probe varies none."""
+        """``(S, n)`` derivatives of the residuals with respect to the strengths of a probe; if it
+        varies none, one row with the change by the whole effect."""
         ...
 
     def response(
         self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
     ) -> Tensor:
-        """``(M, n)`` derivatives of the residuals with respect to factors of M further rates
-        ``(B, N, D)``, m/s or m/s², that are functions of the state; it may be of many times, each
-        as a simulation."""
+        """``(M, n)`` derivatives of the residuals with respect to factors of M additional rates
+        ``(B, N, D)``, m/s or m/s². The rates are functions of the state, which may stack many
+        times like simulations."""
         ...
 
     def individual(
@@ -109,25 +108,25 @@ class Engine(Protocol):
         """``(M, n)`` derivatives of the residuals with respect to M amounts of every unit."""
         ...
 
-    def settle(self, system: System, row: Tensor) -> None:
-        """Fit what the residuals are whitened and weighted with to what a model leaves."""
+    def fit_whitening(self, system: System, row: Tensor) -> None:
+        """Fit the whitening and the weights to the residuals of a model."""
         ...
 
     def noise_floor(self) -> float:
-        """Mean square error of positions that is noise of the measurement, m²."""
+        """Mean square error of positions due to measurement noise, m²."""
         ...
 
     def squares(self, system: System, row: Tensor) -> Squares:
-        """Squared errors of positions as they are, for the costs that are reported."""
+        """Squared errors of positions without whitening, for reports."""
         ...
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
-        """The simulations whose errors are :meth:`squares`, of each sequence; None where nothing
-        of it is compared. Of engines that compare whole sequences, and of those of people."""
+        """The simulations whose errors are :meth:`squares`, of each sequence; None if nothing of it
+        is compared. Not for engines with windows in lanes."""
         ...
 
     def variables(self) -> list[Variable]:
-        """What deviations may depend on."""
+        """The variables on which deviations may depend."""
         ...
 
 
@@ -138,11 +137,11 @@ def of_residuals(label: np.ndarray | None, sequence: np.ndarray) -> np.ndarray:
         label: ``(S,)`` of the sequences; None: every sequence is a cluster.
         sequence: ``(n,)`` of the residuals.
     """
-    own = sequence if label is None else np.asarray(label)[sequence]
-    found: np.ndarray = np.unique(own, return_inverse=True)[1].reshape(-1)
-    return found
+    clusters = sequence if label is None else np.asarray(label)[sequence]
+    numbered: np.ndarray = np.unique(clusters, return_inverse=True)[1].reshape(-1)
+    return numbered
 
 
 def square_of(engine: Engine, system: System) -> float:
-    """Mean square error of positions, m², every sequence alike."""
+    """Mean square error of positions, m², with equal weights of sequences."""
     return float(engine.squares(system, ParameterVector(system).row).means().mean())

@@ -20,10 +20,9 @@ from nnode.model.system import System
 if TYPE_CHECKING:
     from nnode.discover.residuals.variables import Curves
 
-#: Dampings that are tried side by side, relative to the curvature.
+#: Dampings that are tried in parallel, relative to the curvature.
 DAMPINGS = (1e-6, 1e-2, 1.0, 30.0)
-#: Tolerance of calibrations whose result is compared with others that are far off, and with
-#: others that are near.
+#: Tolerance of calibrations that are compared with very different ones, and with similar ones.
 ROUGH, FINE = 1e-3, 1e-6
 
 
@@ -38,8 +37,8 @@ class Fit:
         residual: ``(n,)``.
         jacobian: ``(n, K)`` derivatives of the residuals.
         free: ``(K,)`` False where a parameter is held at a bound.
-        curves: what a deviation depends on, once that was asked for.
-        simulated: ``(K,)`` standard errors of a correction by simulations; None without one.
+        curves: curves in the residuals, once they were computed.
+        simulated: ``(K,)`` standard errors of a bias correction by simulation; None without one.
     """
 
     system: System
@@ -62,7 +61,7 @@ class Fit:
         return self.jacobian[:, self.free]
 
     def influence(self, cluster: np.ndarray) -> ClusterInfluence:
-        """Of the clusters on the free parameters."""
+        """The influence of the clusters on the free parameters."""
         columns = self.tangents
         scores = sums(columns * self.residual[:, None], cluster)
         return ClusterInfluence(grams(columns, cluster), scores)
@@ -71,8 +70,8 @@ class Fit:
         """``(K,)`` standard errors that allow for any dependence within a cluster, by the
         jackknife.
 
-        NaN for parameters at a bound, for those of which one cluster alone tells, and where there
-        are fewer than three clusters.
+        NaN for parameters at a bound, for those that only one cluster identifies, and with fewer
+        than three clusters.
 
         Args:
             power: see :meth:`~nnode.calibrate.intervals.ClusterInfluence.covariance`.
@@ -80,14 +79,14 @@ class Fit:
         return self._errors(self.influence(cluster), cluster, power)
 
     def _errors(self, influence: ClusterInfluence, cluster: np.ndarray, power: float) -> np.ndarray:
-        found = np.full(len(self.row), np.nan)
+        errors = np.full(len(self.row), np.nan)
         if len(np.unique(cluster)) >= 3 and self.free.any():
             variance = np.diag(influence.covariance(power))
-            found[self.free] = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
-        return found if self.simulated is None else np.hypot(found, self.simulated)
+            errors[self.free] = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
+        return errors if self.simulated is None else np.hypot(errors, self.simulated)
 
     def jackknife_intervals(self, cluster: np.ndarray, level: float = LEVEL) -> np.ndarray:
-        """``(K, 2)`` cautious intervals that decide whether an effect is kept: :meth:`errors`
+        """``(K, 2)`` conservative intervals that decide whether an effect is kept: :meth:`errors`
         with Student's quantiles by the number of clusters."""
         number = len(np.unique(cluster))
         half = stats.t.ppf(0.5 + level / 2, max(number - 1, 1)) * self.errors(cluster)
@@ -108,8 +107,8 @@ def sums(values: np.ndarray, label: np.ndarray, weight: np.ndarray | None = None
     number, count = int(label.max()) + 1, len(label)
     weight = np.ones(count) if weight is None else weight
     member = csr_array((weight, (label, np.arange(count))), (number, count))
-    found: np.ndarray = member @ values
-    return found
+    totals: np.ndarray = member @ values
+    return totals
 
 
 def members(label: np.ndarray) -> list[np.ndarray]:
@@ -124,24 +123,24 @@ def grams(z: np.ndarray, label: np.ndarray) -> np.ndarray:
 
 
 class _EngineProblem:
-    """The residuals of an engine as a problem of least squares.
+    """The residuals of an engine as a least-squares problem.
 
-    The derivatives at the parameters that were tried first come from the same simulation.
+    The derivatives at the first trial parameters reuse its simulation.
     """
 
     def __init__(self, engine: Engine, system: System) -> None:
         self.engine, self.system = engine, system
         self.vector = ParameterVector(system)
         self.low, self.high = self.vector.bounds
-        self._rows, self._found = np.empty((0, len(self.low))), np.empty((0, 0))
+        self._rows, self._residuals = np.empty((0, len(self.low))), np.empty((0, 0))
         self._fit: Fit | None = None
 
     def costs(self, trials: np.ndarray) -> np.ndarray:
-        """``(T, 1)`` of trials ``(T, 1, K)``; inf where one blows up."""
+        """``(T, 1)`` costs of trials ``(T, 1, K)``; inf if one diverges."""
         self._rows = trials[:, 0]
-        self._found = self.engine.residuals(self.system, torch.from_numpy(self._rows)).numpy()
-        finite = np.isfinite(self._found).all(1)
-        return np.where(finite, (self._found**2).sum(1), np.inf)[:, None]
+        self._residuals = self.engine.residuals(self.system, torch.from_numpy(self._rows)).numpy()
+        finite = np.isfinite(self._residuals).all(1)
+        return np.where(finite, (self._residuals**2).sum(1), np.inf)[:, None]
 
     def __call__(self, rows: np.ndarray) -> Quadratic:
         """Costs and their derivatives ``(1, ...)``.
@@ -158,12 +157,12 @@ class _EngineProblem:
         return Quadratic(np.array([fit.cost]), 2 * gradient[None], 2 * curvature[None])
 
     def fit(self, row: np.ndarray) -> Fit:
-        """The model with parameters ``(K,)``; derivatives are zero where it blows up."""
+        """The model with parameters ``(K,)``; derivatives are zero if it diverges."""
         if self._fit is not None and np.array_equal(self._fit.row, row):
             return self._fit
         if not (self._rows == row).all(1).any():
             self.costs(row[None, None])
-        residual = self._found[np.flatnonzero((self._rows == row).all(1))[0]]
+        residual = self._residuals[np.flatnonzero((self._rows == row).all(1))[0]]
         jacobian = np.zeros((len(residual), len(row)))
         if np.isfinite(residual).all():
             jacobian = self.engine.tangents(self.system, torch.from_numpy(row)).numpy().T
@@ -185,15 +184,15 @@ def refine(
     """Calibrate from the system's own parameters, within their bounds.
 
     Args:
-        steps: simulations of all trials and derivatives at most.
-        tolerance: ends when a step lowers the cost by less than this share.
+        steps: largest number of simulations of all trials and derivatives.
+        tolerance: the search ends when a step lowers the cost by less than this share.
         hopeless: see :func:`~nnode.calibrate.least_squares.least_squares`.
 
     Raises:
         SimulationError: the start cannot be simulated.
     """
     problem = _EngineProblem(engine, system)
-    found = least_squares(
+    solution = least_squares(
         problem,
         problem.costs,
         problem.vector.row.numpy()[None],
@@ -204,10 +203,10 @@ def refine(
         dampings=DAMPINGS,
         hopeless=hopeless,
     )
-    problem.vector.fill_(found.row[0])
-    return problem.fit(found.row[0])
+    problem.vector.fill_(solution.row[0])
+    return problem.fit(solution.row[0])
 
 
 def evaluated(engine: Engine, system: System) -> Fit:
-    """A model as it is, in the residuals of an engine."""
+    """A model without calibration, in the residuals of an engine."""
     return _EngineProblem(engine, system).fit(ParameterVector(system).row.numpy())

@@ -1,1 +1,1 @@
-"""What is chance and what is not: scores, intervals, paired tests, agents who differ."""
+"""Score tests, J tests, intervals, power, and variance components between agents."""

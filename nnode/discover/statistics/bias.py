@@ -1,10 +1,10 @@
-"""Scores of effects where there are none, by simulation.
+"""Bias of scores under the null hypothesis, by parametric bootstrap.
 
-The linearisation at drivers' estimates and the errors of smoothed leaders shift scores a little,
-which many data would tell from nothing. So the calibrated model makes paths of its own; what is
-scored there is the shift. What is found must stand out with and without it: where a model is quite
-wrong, its paths are so, too. Draws come in pairs of opposite signs, in which what is linear in
-pushes, deviations and errors cancels.
+The linearisation at the drivers' modes and the errors of smoothed leaders bias scores slightly,
+which is significant in large data sets. The bias is the mean score in paths that the calibrated
+model simulates. An effect must be significant with and without this correction, because simulations
+of a very wrong model are wrong too. Draws are antithetic pairs, in which terms that are linear in
+pushes, deviations and errors cancel.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from nnode.discover.residuals.fit import Fit, evaluated, sums
 from nnode.discover.statistics.leverage import orthonormal
 from nnode.errors import SimulationError
 
-#: Engines of paths that a model has made, and what it leaves of them.
-Made = list[tuple[Engine, Fit]]
+#: Engines of simulated paths, and the model's fits to them.
+SimulatedFits = list[tuple[Engine, Fit]]
 
 
-def made(engine: Engine, fit: Fit, seed: int) -> Made:
-    """What a calibrated model leaves of paths that it has made; nothing where the engine makes
-    none, or where the model blows up.
+def simulated_fits(engine: Engine, fit: Fit, seed: int) -> SimulatedFits:
+    """Fits of a calibrated model to its own simulated paths; empty if the engine does not simulate
+    any, or if the simulation diverges.
 
     Args:
         seed: of the draws.
@@ -34,24 +34,25 @@ def made(engine: Engine, fit: Fit, seed: int) -> Made:
     if not isinstance(engine, FollowersEngine):
         return []
     try:
-        drawn = engine.drawn(fit.system, torch.from_numpy(fit.row), seed)
+        engines = engine.simulated_engines(fit.system, torch.from_numpy(fit.row), seed)
     except SimulationError:
         return []
-    found: Made = [(one, evaluated(one, fit.system)) for one in drawn]
-    return found if all(np.isfinite(own.residual).all() for _, own in found) else []
+    fits: SimulatedFits = [(simulated, evaluated(simulated, fit.system)) for simulated in engines]
+    finite = all(np.isfinite(simulated_fit.residual).all() for _, simulated_fit in fits)
+    return fits if finite else []
 
 
 def mean_scores(
-    drawn: Made, columns: Callable[[Engine, Fit], np.ndarray], label: np.ndarray
+    simulated: SimulatedFits, columns: Callable[[Engine, Fit], np.ndarray], label: np.ndarray
 ) -> np.ndarray | float:
-    """``(G, k)`` mean scores of directions by cluster in paths that a model has made.
+    """``(G, k)`` mean scores of directions by cluster in simulated paths.
 
     Args:
-        columns: of an engine and a fit the directions ``(n, k)``.
+        columns: the directions ``(n, k)`` of an engine and a fit.
         label: ``(n,)`` clusters.
     """
     parts = []
-    for engine, fit in drawn:
-        basis, every = orthonormal(fit.tangents), columns(engine, fit)
-        parts.append(sums(every - basis @ (basis.T @ every), label, fit.residual))
+    for engine, fit in simulated:
+        basis, effect_columns = orthonormal(fit.tangents), columns(engine, fit)
+        parts.append(sums(effect_columns - basis @ (basis.T @ effect_columns), label, fit.residual))
     return np.asarray(np.mean(parts, 0)) if parts else 0.0

@@ -1,4 +1,4 @@
-"""What the parameters of a fit take out of the residuals of each cluster.
+"""Leverage adjustment of the residuals of clusters.
 
 Source: Bell & McCaffrey 2002 (CR2).
 """
@@ -10,19 +10,19 @@ import numpy as np
 from nnode.discover.residuals.fit import grams, members
 
 
-def blown_up(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """``(n,)`` residuals times (1 - H)^-1/2 of each cluster's part H of the projection onto an
-    orthonormal basis; what one cluster alone determines stays as it is."""
-    found = residual.copy()
+def leverage_adjusted(residual: np.ndarray, basis: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """``(n,)`` residuals times (1 - H)^-1/2, where H is each cluster's block of the projection onto
+    an orthonormal basis. Directions that one cluster alone determines are not adjusted."""
+    adjusted = residual.copy()
     if not basis.shape[1]:
-        return found
+        return adjusted
     for part, gram in zip(members(label), grams(basis, label), strict=True):
         size, turn = np.linalg.eigh(gram)
-        known = (size > 1e-12) & (size < 1 - 1e-6)
-        size, turn = size[known], turn[:, known]
-        more = turn * ((1 / np.sqrt(1 - size) - 1) / size) @ turn.T
-        found[part] += basis[part] @ (more @ (basis[part].T @ residual[part]))
-    return found
+        invertible = (size > 1e-12) & (size < 1 - 1e-6)
+        size, turn = size[invertible], turn[:, invertible]
+        correction = turn * ((1 / np.sqrt(1 - size) - 1) / size) @ turn.T
+        adjusted[part] += basis[part] @ (correction @ (basis[part].T @ residual[part]))
+    return adjusted
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:

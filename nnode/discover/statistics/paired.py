@@ -12,46 +12,46 @@ from nnode.data.clusters import better
 from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.fit import Fit, sums
 
-#: What the other clusters know less of than this share of what all know is not changed by
-#: leaving one out: nothing follows from them.
+#: A direction in which the other clusters hold less than this share of the information is not
+#: changed by leaving a cluster out.
 ALONE = 0.02
 
 
 def heldout(fit: Fit, cluster: np.ndarray) -> np.ndarray:
-    """``(G,)`` cost of each cluster under the parameters that the other clusters give.
+    """``(G,)`` cost of each cluster with the parameters estimated from the other clusters.
 
     See :meth:`~nnode.calibrate.intervals.ClusterInfluence.moved`.
     """
     return sums(_left_out(fit, cluster) ** 2, cluster)
 
 
-def there(before: Fit, after: Fit, cluster: np.ndarray) -> float:
-    """One-sided p-value that held-out residuals of a model do not lean the way that another one,
-    an extension of it, bends its predictions; see :func:`leaning`."""
+def presence_pvalue(before: Fit, after: Fit, cluster: np.ndarray) -> float:
+    """One-sided p-value of the score test of a model toward its extension, on held-out residuals;
+    see :func:`score_toward`."""
     first, second = _left_out(before, cluster), _left_out(after, cluster)
-    return better(leaning(first, second, cluster))
+    return better(score_toward(first, second, cluster))
 
 
-def outdone(first: Fit, second: Fit, cluster: np.ndarray) -> Comparison:
-    """Of two models neither of which extends the other: whether held-out residuals of the first
-    lean towards the second's predictions, which they do not if the first one is true.
+def j_test(first: Fit, second: Fit, cluster: np.ndarray) -> Comparison:
+    """J test of non-nested models: whether held-out residuals of the first correlate with the
+    difference of the predictions, which they do not if the first one is true.
 
-    The p-value is that of sign flips. That the costs differ significantly is a question with half
-    the standardized distance, and its null hypothesis that both are equally wrong.
+    The p-value is that of sign flips. A test of different costs has half the standardised distance,
+    and its null hypothesis is that both models are equally wrong.
 
-    Source: Davidson & MacKinnon 1981 (tests of models against rivals that they do not contain).
+    Source: Davidson & MacKinnon 1981 (tests of non-nested models).
     """
-    lean = leaning(_left_out(first, cluster), _left_out(second, cluster), cluster)
-    return replace(_student(lean), p_value=better(lean))
+    scores = score_toward(_left_out(first, cluster), _left_out(second, cluster), cluster)
+    return replace(_student(scores), p_value=better(scores))
 
 
-def leaning(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
-    """``(G,)`` how far the residuals of a model lean towards another one's predictions, each
-    cluster's relative to its greater cost.
+def score_toward(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
+    """``(G,)`` scores of one model toward another by cluster: products of its residuals with the
+    change of predictions, relative to the cluster's larger cost.
 
-    The mean is above 0 where the second model bends predictions the right way. That they improve,
-    see :func:`gains`, asks for more than half of the bend to be true, with half the standardized
-    distance.
+    The mean is positive if the second model changes predictions in the right direction. Predictions
+    improve, see :func:`gains`, only if more than half of the change is true; that test has half the
+    standardised distance.
 
     Args:
         first, second: ``(n,)`` residuals of the two models. cluster: ``(n,)``.
@@ -59,10 +59,10 @@ def leaning(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.nd
     Source: Rao 1948 (scores).
     """
     with np.errstate(invalid="ignore"):
-        towards = 2 * sums(first * (first - second), cluster)
+        scores = 2 * sums(first * (first - second), cluster)
         larger = np.maximum(sums(first**2, cluster), sums(second**2, cluster))
-        found: np.ndarray = towards / np.where(larger > 0, larger, 1)
-    return found
+        relative: np.ndarray = scores / np.where(larger > 0, larger, 1)
+    return relative
 
 
 def _left_out(fit: Fit, cluster: np.ndarray) -> np.ndarray:
@@ -70,19 +70,21 @@ def _left_out(fit: Fit, cluster: np.ndarray) -> np.ndarray:
     if not columns.shape[1]:
         return residual
     moved = fit.influence(cluster).moved(1.0, ALONE)
-    found: np.ndarray = residual + (columns * moved[cluster]).sum(1)
-    return found
+    left_out: np.ndarray = residual + (columns * moved[cluster]).sum(1)
+    return left_out
 
 
 def gains(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """``(G,)`` (first - second) / max(first, second), 0 where both vanish."""
     larger = np.maximum(first, second)
-    found: np.ndarray = np.where(larger > 0, first - second, 0.0) / np.where(larger > 0, larger, 1)
-    return found
+    relative: np.ndarray = np.where(larger > 0, first - second, 0.0) / np.where(
+        larger > 0, larger, 1
+    )
+    return relative
 
 
 def compare(first: np.ndarray, second: np.ndarray) -> Comparison:
-    """Paired by cluster; each one's difference is relative to its greater cost, so that no
+    """Paired comparison by cluster; differences are relative to the larger cost, so that no
     cluster dominates.
 
     Args:
@@ -103,20 +105,20 @@ def _student(share: np.ndarray) -> Comparison:
 
 
 def clusters_to_tell(test: Comparison, level: float, power: float = 0.9) -> int | None:
-    """About how many clusters of the same kind tell two models apart with a probability, if the
+    """The approximate number of clusters that distinguishes two models with a given power, if the
     observed difference is the true one.
 
-    That of the one-sided t-test: (n mean²/variance)^½ is the sum of the quantiles of the level and
-    of the power, of Student's distribution with n - 1 degrees of freedom. The observed difference
-    is uncertain itself, and so is this number.
+    For the one-sided t-test, (n mean²/variance)^½ is the sum of Student's quantiles of the level
+    and of the power with n - 1 degrees of freedom. The number is as uncertain as the observed
+    difference.
 
     Args:
         test: of the two models.
         level: of the test.
-        power: the probability.
+        power: of the test.
 
     Returns:
-        None where the second model is no better: no number would.
+        The number; None if the second model is no better.
     """
     if test.clusters < 2 or not test.gain > 0 or not math.isfinite(test.high):
         return None
@@ -124,10 +126,10 @@ def clusters_to_tell(test: Comparison, level: float, power: float = 0.9) -> int 
     ratio = error**2 * test.clusters / test.gain**2
     number = 2
     for _ in range(50):  # the quantiles depend on the number
-        free = max(number - 1, 1)
-        quantiles = float(stats.t.ppf(1 - level, free) + stats.t.ppf(power, free))
-        wanted = max(2, math.ceil(ratio * quantiles**2))
-        if wanted == number:
+        degrees = max(number - 1, 1)
+        quantiles = float(stats.t.ppf(1 - level, degrees) + stats.t.ppf(power, degrees))
+        needed = max(2, math.ceil(ratio * quantiles**2))
+        if needed == number:
             break
-        number = max(wanted, 2) if wanted < number else (number + wanted + 1) // 2
+        number = max(needed, 2) if needed < number else (number + needed + 1) // 2
     return max(number, test.clusters)

@@ -1,16 +1,17 @@
-"""Efficient scores: which effect's trace is in what the calibrated model leaves.
+"""Score tests of missing effects by sign flips of clusters.
 
-The trace of an effect is the change of the residuals by a small strength of it. What
-recalibration of the model's own parameters can absorb is taken out of it, so that only the rest
-counts. Sums over clusters may change their sign without changing their distribution where nothing
-is hidden. Each effect's statistic is compared with its own distribution under such flips, and the
-least of these p-values over all effects with the distribution of the least: a search over many
-intervals, whose largest statistic is large by chance, does not raise the bar for the others.
+The trace of an effect is the derivative of the residuals by its strength. It is projected
+orthogonally to the tangents of the model's parameters (efficient scores), because recalibration
+would absorb the rest. Under the null hypothesis, the scores of clusters are symmetric, so their
+signs can be flipped. The statistic of each effect is compared with its own distribution under
+flips, and the smallest of these p-values with the distribution of the smallest (min-p). So an
+effect with many intervals, whose maximum is large by chance, does not reduce the power for the
+other effects.
 
-Residuals are not free of systematic errors: measured positions are smoothed, people are simulated
-among the measured paths of others who have reacted to them. Where nothing is hidden that makes
-some effects a twentieth of their least usual size, which many data would tell from nothing. So what
-is tested is whether an effect exceeds a tenth of that size.
+Residuals have small systematic errors: measured positions are smoothed, and people are simulated
+among the measured paths of others who have reacted to them. Under the null hypothesis, these errors
+amount to a twentieth of the minimum size of some effects, which is significant in large data sets.
+Therefore the tests are of a minimal effect: whether it exceeds a tenth of the minimum size.
 
 Source: Rao 1948 (scores); Canay, Romano & Shaikh 2017 (sign changes); Hemerik, Goeman & Finos 2020
 (of scores that are free of nuisance parameters); Westfall & Young 1993 (least p-value over
@@ -31,23 +32,23 @@ from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, sums
 from nnode.discover.residuals.fit import grams as grams_of
 from nnode.discover.rules import rules
-from nnode.discover.statistics.leverage import blown_up, orthonormal
-from nnode.discover.statistics.standard import joint, standardised, usual_of
+from nnode.discover.statistics.leverage import leverage_adjusted, orthonormal
+from nnode.discover.statistics.standard import cluster_variance_of, joint, standardised
 from nnode.model.effects import Effect, Probe
 
-#: Sign flips that a p-value comes from.
+#: Number of sign flips of a p-value.
 FLIPS = 1999
 
 
 @dataclass
 class Trace:
-    """What a weak effect does to the residuals.
+    """The linear response of the residuals to an effect.
 
     Attributes:
         effect: its class.
         probes: one; or the neighbouring cells of an effect on an interval.
         columns: ``(n, k)`` per unit of each strength of the probe, or per cell.
-        bias: ``(G, k)`` scores where there is no effect.
+        bias: ``(G, k)`` mean scores under the null hypothesis.
     """
 
     effect: type[Effect]
@@ -58,14 +59,14 @@ class Trace:
 
 @dataclass
 class Evidence:
-    """What the clusters tell of one direction.
+    """The scores of clusters in one direction.
 
     Attributes:
         options: of the probe.
-        size: of an effect with a memory, whose trace is that of a finite strength; otherwise 0.
+        size: the finite strength of the trace of an effect with memory; otherwise 0.
         parts, grams: ``(G,)`` scores and their information.
-        minimal: amount that is taken for none.
-        amount, error: the amount that explains most, and its standard error; of intervals.
+        minimal: the largest negligible strength.
+        amount, error: of intervals, the estimated strength and its standard error.
     """
 
     options: dict[str, Any]
@@ -79,18 +80,18 @@ class Evidence:
 
 @dataclass
 class Score:
-    """The best trace of an effect.
+    """The score test of an effect, for its best trace.
 
     Attributes:
         effect: its class.
-        options: where a calibration with this effect should start.
-        statistic: in units of a standard normal one.
-        p_value: of the maximum over all effects.
-        gain: share of the sum of squares that the trace explains beyond the model.
-        amount: strengths that explain most, less their neutral values.
+        options: start values for a calibration with this effect.
+        statistic: on the scale of a standard normal variable.
+        p_value: corrected for all effects (min-p).
+        gain: share of the sum of squares that the trace explains.
+        amount: estimated strengths minus their neutral values.
         error: standard errors of ``amount``.
-        evidence: of every strength; of an effect with a memory, or without a strength, of every
-            probe; of an effect on an interval, of every interval of the usual length.
+        evidence: of every strength; for an effect with memory, or without a strength, of every
+            probe; for an effect on an interval, of every interval of the usual length.
     """
 
     effect: type[Effect]
@@ -111,24 +112,26 @@ def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
     if effect.consecutive:
         # cells of one size are neighbours of each other
         sizes = [tuple(probe.steps.values()) for probe in probes]
-        found = []
+        effect_traces = []
         for size in dict.fromkeys(sizes):
-            own = [i for i, other in enumerate(sizes) if other == size]
-            parts = [columns[i] for i in own]
-            found.append(Trace(effect, [probes[i] for i in own], np.concatenate(parts, 1)))
-        return found
+            cells = [i for i, other_size in enumerate(sizes) if other_size == size]
+            parts = [columns[i] for i in cells]
+            effect_traces.append(
+                Trace(effect, [probes[i] for i in cells], np.concatenate(parts, 1))
+            )
+        return effect_traces
     return [Trace(effect, [p], c) for p, c in zip(probes, columns, strict=True)]
 
 
 class Screen:
-    """All traces against the residuals of one fit.
+    """Score tests of effects against the residuals of one fit.
 
     Args:
         fit: the calibrated model.
         cluster: ``(n,)`` see :class:`~nnode.discover.residuals.engine.Engine`.
         seed: of the sign flips.
-        flips: their number at most; with few clusters, all there are.
-        levels: by an effect's name the clusters ``(n,)`` that tell of it, where they are coarser.
+        flips: their largest number; with few clusters, all combinations are used.
+        levels: by an effect's name, the independent clusters ``(n,)`` of its test, if coarser.
     """
 
     def __init__(
@@ -144,111 +147,117 @@ class Screen:
         self.variance = fit.cost / len(fit.residual)
         self._basis = orthonormal(fit.tangents)
         self._rng = np.random.default_rng(seed)
-        #: ``(F, G)``, the data as they are first
+        #: ``(F, G)``; the first row is the data without flips
         self._signs = signs(int(cluster.max()) + 1, flips, self._rng)
-        #: of each effect's name the largest statistic of its probes under each flip
-        self._chance: dict[str, np.ndarray] = {}
+        #: by an effect's name, the largest statistic of its probes under each flip
+        self._null_statistics: dict[str, np.ndarray] = {}
         self._least = np.ones(len(self._signs))
-        self._blown: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._adjusted_residuals: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
-    def beyond(self, columns: np.ndarray) -> np.ndarray:
-        """``columns`` without what the model's own parameters can do."""
-        rest: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
-        return rest
+    def adjusted(self, columns: np.ndarray) -> np.ndarray:
+        """``columns`` projected orthogonally to the tangents of the model's parameters."""
+        adjusted: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
+        return adjusted
 
     def parts(self, z: np.ndarray, label: np.ndarray) -> np.ndarray:
-        """``(G, k)`` scores of directions that are free of the model's parameters.
+        """``(G, k)`` scores of directions that are orthogonal to the model's tangents.
 
-        What the parameters have taken out of the residuals makes the clusters' scores vary less
-        than the errors do; signs of those would promise too little chance. So each cluster's
-        residuals are blown up by its leverage, and the sum of the scores is kept.
+        Fitted residuals have smaller variances than the errors, so sign flips of their scores would
+        be anticonservative. Therefore each cluster's residuals are scaled up by its leverage, and
+        the sum of the scores is kept.
 
         Source: Bell & McCaffrey 2002 (CR2).
         """
-        own = id(label)
-        if own not in self._blown:
-            self._blown[own] = blown_up(self.residual, self._basis, label), label
+        key = id(label)
+        if key not in self._adjusted_residuals:
+            self._adjusted_residuals[key] = (
+                leverage_adjusted(self.residual, self._basis, label),
+                label,
+            )
         raw = z.T @ self.residual
-        found, size = sums(z, label, self._blown[own][0]), sums(z**2, label)
+        scores, size = sums(z, label, self._adjusted_residuals[key][0]), sums(z**2, label)
         share = size / np.maximum(size.sum(0), 1e-300)
-        spread: np.ndarray = found + (raw - found.sum(0)) * share
-        return spread
+        balanced: np.ndarray = scores + (raw - scores.sum(0)) * share
+        return balanced
 
     def flipped(self, parts: np.ndarray) -> np.ndarray:
-        """``(F, C)`` sums of the clusters ``(G, C)``, as they are and with every flip."""
+        """``(F, C)`` sums of the clusters ``(G, C)`` under every flip, the data first."""
         total: np.ndarray = self._signs @ parts
         return total
 
     def label(self, name: str) -> np.ndarray:
-        """``(n,)`` the clusters that tell of an effect."""
+        """``(n,)`` the independent clusters of an effect's test."""
         return self.levels.get(name, self.cluster)
 
-    def scores(self, found: Iterable[Trace]) -> list[Score]:
-        """The best trace of each effect, the one that explains most first."""
+    def scores(self, effect_traces: Iterable[Trace]) -> list[Score]:
+        """The score test of each effect, ordered by decreasing gain."""
         best: dict[str, Score] = {}
         largest: dict[str, float] = {}
-        for trace in found:
+        for trace in effect_traces:
             scores = self._interval(trace) if trace.effect.consecutive else [self._single(trace)]
             for score in scores:
-                name, known = score.effect.name, best.get(score.effect.name)
+                name, previous = score.effect.name, best.get(score.effect.name)
                 largest[name] = max(largest.get(name, 0.0), score.statistic)
-                every = (known.evidence if known else []) + score.evidence
-                if known is None or score.gain > known.gain:
+                all_evidence = (previous.evidence if previous else []) + score.evidence
+                if previous is None or score.gain > previous.gain:
                     best[name] = score
                 if trace.effect.remembers() or not trace.effect.strengths:
-                    best[name].evidence = every
+                    best[name].evidence = all_evidence
         if best:
             self._judge(best, largest)
         return sorted(best.values(), key=lambda score: -score.gain)
 
     def _judge(self, best: dict[str, Score], largest: dict[str, float]) -> None:
-        """P-values with regard to all effects."""
+        """Set the p-values, corrected for all effects."""
         # the data themselves are one of the flips
-        every = np.stack([np.append(largest[name], self._chance[name][1:]) for name in best])
-        share = np.stack([at_least(row) for row in every])
+        statistics = np.stack(
+            [np.append(largest[name], self._null_statistics[name][1:]) for name in best]
+        )
+        share = np.stack([at_least(row) for row in statistics])
         self._least = share.min(0)
-        for score, own in zip(best.values(), share[:, 0], strict=True):
-            score.p_value = float((self._least <= own + 1e-12).mean())
+        for score, p_value in zip(best.values(), share[:, 0], strict=True):
+            score.p_value = float((self._least <= p_value + 1e-12).mean())
 
     def critical(self, name: str, alpha: float = 0.05) -> float:
-        """The statistic of an effect that it passes where the least p-value of all does so with
-        probability ``alpha`` by chance."""
+        """The critical value of an effect's statistic at familywise level ``alpha``."""
         share = float(np.quantile(self._least, alpha))
-        return float(np.quantile(self._chance[name], 1 - share))
+        return float(np.quantile(self._null_statistics[name], 1 - share))
 
-    def statistic(self, one: Evidence, parts: np.ndarray) -> np.ndarray:
-        """``(R,)`` the statistic where the scores of a direction were ``parts`` ``(G, R)``."""
-        usual = usual_of(one.parts[:, None], one.grams[:, None], self.variance)
-        sizes = np.repeat(one.grams[:, None], parts.shape[1], 1)
-        amount = -parts.sum(0) / max(float(one.grams.sum()), 1e-300)
-        parts = parts + sizes * _less(amount, one.minimal)
-        return standardised(parts, sizes, np.ones((1, len(parts))), usual)[0]
+    def statistic(self, evidence: Evidence, parts: np.ndarray) -> np.ndarray:
+        """``(R,)`` the statistic of a direction if its scores were ``parts`` ``(G, R)``."""
+        cluster_variance = cluster_variance_of(
+            evidence.parts[:, None], evidence.grams[:, None], self.variance
+        )
+        sizes = np.repeat(evidence.grams[:, None], parts.shape[1], 1)
+        amount = -parts.sum(0) / max(float(evidence.grams.sum()), 1e-300)
+        parts = parts + sizes * _negligible(amount, evidence.minimal)
+        return standardised(parts, sizes, np.ones((1, len(parts))), cluster_variance)[0]
 
     def costs(self, name: str) -> np.ndarray:
-        """``(G,)`` sums of squared residuals of the clusters that tell of an effect."""
+        """``(G,)`` sums of squared residuals of the clusters of an effect's test."""
         return sums(self.residual**2, self.label(name))
 
-    def _by_chance(self, name: str, statistics: np.ndarray) -> None:
-        """Note an effect's statistics ``(F,)`` under the flips."""
-        self._chance[name] = np.maximum(self._chance.get(name, 0.0), statistics)
+    def _store_null(self, name: str, statistics: np.ndarray) -> None:
+        """Update an effect's largest statistics ``(F,)`` under the flips."""
+        self._null_statistics[name] = np.maximum(self._null_statistics.get(name, 0.0), statistics)
 
     def _flips(self, name: str) -> np.ndarray:
-        """``(F, G)`` signs of the clusters that tell of an effect, the data first."""
+        """``(F, G)`` signs of the clusters of an effect's test, the data first."""
         if name not in self.levels:
             return self._signs
         shape = len(self._signs), int(self.levels[name].max()) + 1
-        drawn: np.ndarray = self._rng.choice([-1.0, 1.0], shape)
-        drawn[0] = 1.0
-        return drawn
+        flips: np.ndarray = self._rng.choice([-1.0, 1.0], shape)
+        flips[0] = 1.0
+        return flips
 
     def _single(self, trace: Trace) -> Score:
-        z, label = self.beyond(trace.columns), self.label(trace.effect.name)
+        z, label = self.adjusted(trace.columns), self.label(trace.effect.name)
         parts = self.parts(z, label) - trace.bias
         grams = grams_of(z, label)
-        minimal = minimal_of(trace.effect, z.shape[1])
-        less = _less(-np.linalg.pinv(grams.sum(0), rcond=1e-10) @ parts.sum(0), minimal)
-        beyond = parts + grams @ less
-        chance = joint(beyond, grams, self._flips(trace.effect.name), self.variance)
+        minimal = negligible_strengths(trace.effect, z.shape[1])
+        margin = _negligible(-np.linalg.pinv(grams.sum(0), rcond=1e-10) @ parts.sum(0), minimal)
+        shifted = parts + grams @ margin
+        chance = joint(shifted, grams, self._flips(trace.effect.name), self.variance)
         statistic = float(chance[0])
         amount, error, gain = self._estimate(parts, grams)
         (probe,) = trace.probes
@@ -258,12 +267,12 @@ class Screen:
             options[name] = strength.at(value)
             amounts[name], errors[name] = float(value), float(width)
         if len(probe.steps) == 1 and value != 0:
-            # a strength that is not plausible speaks for something else
+            # an implausible strength indicates another effect
             share = float(np.clip((options[name] - strength.neutral) / value, 0.0, 1.0))
             if share < rules().forbidden:
                 statistic, gain = statistic * share, gain * share * (2 - share)
-        self._by_chance(trace.effect.name, chance)
-        # of an effect with a memory the trace is that of a finite strength, where it has one
+        self._store_null(trace.effect.name, chance)
+        # the trace of an effect with memory is that of a finite strength
         size = max(map(abs, probe.steps.values()), default=0.0) if trace.effect.remembers() else 0.0
         evidence = [
             Evidence(probe.options, size, parts[:, i], grams[:, i, i], minimal[i])
@@ -273,13 +282,13 @@ class Screen:
 
     def _interval(self, trace: Trace) -> list[Score]:
         """The best interval of neighbouring cells."""
-        z, label = self.beyond(trace.columns), self.label(trace.effect.name)
+        z, label = self.adjusted(trace.columns), self.label(trace.effect.name)
         parts = self.parts(z, label) - trace.bias
         grams = grams_of(z, label)
         cells = z.shape[1]
         first, last = np.triu_indices(cells)
         cumulative = np.concatenate([np.zeros((len(parts), 1)), parts.cumsum(1)], 1)
-        each = cumulative[:, last + 1] - cumulative[:, first]
+        interval_parts = cumulative[:, last + 1] - cumulative[:, first]
         square = np.zeros((len(parts), cells + 1, cells + 1))
         square[:, 1:, 1:] = grams.cumsum(1).cumsum(2)
         sizes = (
@@ -290,24 +299,25 @@ class Screen:
         )
         size = sizes.sum(0)
         usable = size > 1e-9 * max(size.max(), 1e-300)
-        each, sizes, size = each[:, usable], sizes[:, usable], size[usable]
+        interval_parts, sizes, size = interval_parts[:, usable], sizes[:, usable], size[usable]
         if not size.size:
             return []
         first, last = first[usable], last[usable]
-        usual = usual_of(parts, np.einsum("bii->bi", grams), self.variance)
-        (minimal,) = minimal_of(trace.effect, 1)
-        beyond = each + sizes * _less(-each.sum(0) / size, minimal)
-        flipped = standardised(beyond, sizes, self._flips(trace.effect.name), usual)
-        self._by_chance(trace.effect.name, flipped.max(1))
-        total = each.sum(0)
+        cluster_variance = cluster_variance_of(parts, np.einsum("bii->bi", grams), self.variance)
+        (minimal,) = negligible_strengths(trace.effect, 1)
+        shifted = interval_parts + sizes * _negligible(-interval_parts.sum(0) / size, minimal)
+        flipped = standardised(shifted, sizes, self._flips(trace.effect.name), cluster_variance)
+        self._store_null(trace.effect.name, flipped.max(1))
+        total = interval_parts.sum(0)
         gain = total**2 / size / (self.residual @ self.residual)
         (name,) = trace.effect.strengths
         strength = trace.effect.strengths[name]
         amount = -total / size
-        rest = ((each + amount * sizes) ** 2).sum(0)
+        residual_square = ((interval_parts + amount * sizes) ** 2).sum(0)
         blocks = size**2 / (sizes**2).sum(0)
         prior = rules().prior
-        error = np.sqrt((blocks * rest + prior * usual * size) / (blocks + prior)) / size
+        variance = (blocks * residual_square + prior * cluster_variance * size) / (blocks + prior)
+        error = np.sqrt(variance) / size
 
         def options(i: int) -> dict[str, Any]:
             ends = {"a": trace.probes[first[i]].options["a"]}
@@ -332,7 +342,7 @@ class Screen:
                     Evidence(
                         options(k),
                         0.0,
-                        each[:, k],
+                        interval_parts[:, k],
                         sizes[:, k],
                         minimal,
                         float(amount[k]),
@@ -349,27 +359,29 @@ class Screen:
         inverse = np.linalg.pinv(grams.sum(0), rcond=1e-10)
         total = parts.sum(0)
         amount = -inverse @ total
-        rest = parts + np.einsum("bij,j->bi", grams, amount)
-        cov = inverse @ (rest.T @ rest) @ inverse
+        residual_parts = parts + np.einsum("bij,j->bi", grams, amount)
+        cov = inverse @ (residual_parts.T @ residual_parts) @ inverse
         gain = float(total @ inverse @ total / (self.residual @ self.residual))
         return amount, np.sqrt(np.maximum(np.diag(cov), 0)), gain
 
 
-def minimal_of(effect: type[Effect], number: int) -> np.ndarray:
-    """``(k,)`` amounts of an effect's strengths that are taken for none; 0 where the effect does
-    not say what size is usual."""
-    found = [rules().minimal * (one.min_effect_size or 0.0) for one in effect.strengths.values()]
-    return np.array(found or [0.0] * number)[:number]
+def negligible_strengths(effect: type[Effect], number: int) -> np.ndarray:
+    """``(k,)`` the largest negligible strengths of an effect; 0 if it declares no minimum size."""
+    negligible = [
+        rules().minimal * (strength.min_effect_size or 0.0)
+        for strength in effect.strengths.values()
+    ]
+    return np.array(negligible or [0.0] * number)[:number]
 
 
-def _less(amount: np.ndarray, minimal: np.ndarray | float) -> np.ndarray:
-    """What is taken off amounts to bring them nearer to none."""
-    found: np.ndarray = np.sign(amount) * np.minimum(np.abs(amount), minimal)
-    return found
+def _negligible(amount: np.ndarray, minimal: np.ndarray | float) -> np.ndarray:
+    """The part of estimated strengths that is negligible, to be subtracted from them."""
+    negligible: np.ndarray = np.sign(amount) * np.minimum(np.abs(amount), minimal)
+    return negligible
 
 
 def at_least(values: np.ndarray) -> np.ndarray:
-    """``(F,)`` share of the values that are at least as large as each, but for rounding."""
+    """``(F,)`` share of the values that are at least as large as each, up to rounding."""
     order = np.sort(values)
     below = np.searchsorted(order, values * (1 - 1e-12), side="left")
     return 1 - below / len(values)

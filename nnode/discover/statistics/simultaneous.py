@@ -1,10 +1,10 @@
-"""Do agents behave alike who are there at one time but share nobody?
+"""Test whether simultaneous clusters without common agents are correlated.
 
-The mean residuals of two clusters of a site over the seconds that they have in common are
-multiplied. Where they have nothing to do with each other, the sum of these products is as large
-when each cluster is shifted along its own time, which keeps how long its residuals last. What all
-sequences have in common as functions of the time since their start is the model's and is taken out
-first; where all start at one time nothing can be told from it.
+The statistic is the sum of products of the mean residuals of two clusters of a site over their
+common seconds. Under independence, its distribution is invariant to circular shifts of each cluster
+along its own time, which preserve autocorrelation. The mean residual as a function of the time
+since the start is a misfit of the model and is subtracted first; if all sequences start at one
+time, the test has no power.
 
 Source: surrogates by circular shifts, as in Theiler et al. 1992 for other statistics.
 """
@@ -26,7 +26,7 @@ SHIFTS, ALPHA = 999, 0.05
 
 @dataclass(frozen=True)
 class Simultaneous:
-    """What the test said.
+    """The result of the test.
 
     Attributes:
         pairs: of clusters of a site that have at least two seconds in common.
@@ -40,7 +40,7 @@ class Simultaneous:
 
     @property
     def together(self) -> bool:
-        """Whether what is simultaneous is one cluster."""
+        """Whether simultaneous sequences are treated as one cluster."""
         return self.p_value <= ALPHA
 
     def plain(self) -> str:
@@ -58,49 +58,53 @@ def simultaneous(engine: Engine, fit: Fit, seed: int = 0) -> Simultaneous:
     """Test the clusters of an engine's sequences."""
     series = _series(engine, fit)
     rng = np.random.default_rng(seed)
-    pairs, own, size, chance = 0, 0.0, 0.0, np.zeros(SHIFTS)
+    pairs, observed, size, shifted = 0, 0.0, 0.0, np.zeros(SHIFTS)
     for site in sorted({name for name, _, _ in series}):
-        members = [(first, one) for name, first, one in series if name == site]
+        members = [(first, residuals) for name, first, residuals in series if name == site]
         number, length = _pairs(members)
         if not number:
             continue
         pairs, size = pairs + number, size + length
-        own += _products(members)
+        observed += _products(members)
         for k in range(SHIFTS):
-            chance[k] += _products(
-                [(first, np.roll(one, int(rng.integers(len(one))), 0)) for first, one in members]
+            shifted[k] += _products(
+                [
+                    (first, np.roll(residuals, int(rng.integers(len(residuals))), 0))
+                    for first, residuals in members
+                ]
             )
     if not pairs:
         return Simultaneous(0, float("nan"), 1.0)
-    p_value = float(1 + (chance >= own).sum()) / (1 + SHIFTS)
-    return Simultaneous(pairs, own / max(size, 1e-300), p_value)
+    p_value = float(1 + (shifted >= observed).sum()) / (1 + SHIFTS)
+    return Simultaneous(pairs, observed / max(size, 1e-300), p_value)
 
 
 _Member = tuple[int, np.ndarray]
 
 
 def _products(members: list[_Member]) -> float:
-    """Sum over all pairs of the products of what they have in common."""
+    """Sum over all pairs of the products of their residuals in common seconds."""
     start = min(first for first, _ in members)
-    length = max(first + len(one) for first, one in members) - start
+    length = max(first + len(residuals) for first, residuals in members) - start
     total = np.zeros((length, members[0][1].shape[1]))
     squares = 0.0
-    for first, one in members:
-        total[first - start : first - start + len(one)] += one
-        squares += float((one**2).sum())
+    for first, residuals in members:
+        total[first - start : first - start + len(residuals)] += residuals
+        squares += float((residuals**2).sum())
     return (float((total**2).sum()) - squares) / 2
 
 
 def _pairs(members: list[_Member]) -> tuple[int, float]:
-    """How many pairs have two seconds in common, and the sum of their sizes there."""
+    """The number of pairs with at least two common seconds, and the sum of their norms there."""
     number, size = 0, 0.0
-    for i, (first, one) in enumerate(members):
-        for second, other in members[i + 1 :]:
-            start, end = max(first, second), min(first + len(one), second + len(other))
+    for i, (start_a, a) in enumerate(members):
+        for start_b, b in members[i + 1 :]:
+            start, end = max(start_a, start_b), min(start_a + len(a), start_b + len(b))
             if end - start >= 2:
-                a, b = one[start - first : end - first], other[start - second : end - second]
+                overlap_a = a[start - start_a : end - start_a]
+                overlap_b = b[start - start_b : end - start_b]
                 number += 1
-                size += float(np.sqrt((a**2).sum() * (b**2).sum()))
+                size += float(np.sqrt((overlap_a**2).sum() * (overlap_b**2).sum()))
     return number, size
 
 
@@ -109,18 +113,18 @@ def _series(engine: Engine, fit: Fit) -> list[tuple[str, int, np.ndarray]]:
     second and component from then on; 0 where there is none."""
     second = np.floor(engine.clock / BIN).astype(int)
     kinds = int(engine.component.max()) + 1
-    begun = np.array([s.time[0] for s in engine.sequences])[engine.sequence]
-    since = np.floor((engine.clock - begun) / BIN).astype(int) * kinds + engine.component
-    usual = np.bincount(since, fit.residual) / np.maximum(np.bincount(since), 1)
-    residual = fit.residual - usual[since]
-    found = []
+    start = np.array([s.time[0] for s in engine.sequences])[engine.sequence]
+    since = np.floor((engine.clock - start) / BIN).astype(int) * kinds + engine.component
+    common = np.bincount(since, fit.residual) / np.maximum(np.bincount(since), 1)
+    residual = fit.residual - common[since]
+    series = []
     for label in range(int(engine.cluster.max()) + 1):
-        own = engine.cluster == label
-        first = int(second[own].min())
-        at = (second[own] - first) * kinds + engine.component[own]
-        number = (int(second[own].max()) - first + 1) * kinds
+        members = engine.cluster == label
+        first_second = int(second[members].min())
+        at = (second[members] - first_second) * kinds + engine.component[members]
+        number = (int(second[members].max()) - first_second + 1) * kinds
         count = np.bincount(at, minlength=number)
-        mean = np.bincount(at, residual[own], number) / np.maximum(count, 1)
-        one = engine.sequences[int(engine.sequence[own][0])]
-        found.append((one.site or one.recording, first, mean.reshape(-1, kinds)))
-    return found
+        mean = np.bincount(at, residual[members], number) / np.maximum(count, 1)
+        sequence = engine.sequences[int(engine.sequence[members][0])]
+        series.append((sequence.site or sequence.recording, first_second, mean.reshape(-1, kinds)))
+    return series

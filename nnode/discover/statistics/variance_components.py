@@ -1,4 +1,4 @@
-"""What numbers of agents, estimated in parts of their time, have in common at every lag.
+"""Variance components of agent-specific parameters, from their autocovariance over time.
 
 Source: Searle, Casella & McCulloch 1992 (variance components by products); Bell & McCaffrey 2002
 (the share that a mean takes along).
@@ -15,24 +15,24 @@ import numpy as np
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, grams, sums
 
-#: Parts of a sequence's time in which numbers are estimated.
+#: Number of parts of a sequence's time in which parameters are estimated.
 PARTS = 6
-#: Time constants that are tried, the longest of them this share of the longest lag.
+#: Number of time constants that are compared, and the longest as a share of the longest lag.
 TRIED, LONGEST = 30, 1 / 3
-#: Information below this share of the largest is none.
+#: Information below this share of the largest counts as zero.
 NONE = 1e-6
 
 
 @dataclass
-class Seen:
-    """Numbers of agents in parts of their time: O of them.
+class PeriodEstimates:
+    """O estimates of agents' parameters in parts of their time.
 
     Attributes:
-        agent, sequence, cluster, recording: ``(O,)`` whose; agents are the same in all sequences
-            of a recording that name them.
+        agent, sequence, cluster, recording: ``(O,)`` labels; an agent with an identifier is the
+            same in all sequences of a recording.
         time: ``(O,)`` s.
         value: ``(O, D)`` per direction.
-        info: ``(O,)`` inverse variance that the residuals leave to a value.
+        info: ``(O,)`` inverse variances of the estimates.
     """
 
     agent: np.ndarray
@@ -45,7 +45,7 @@ class Seen:
 
     @property
     def weight(self) -> np.ndarray:
-        """``(O,)`` with which products are known best."""
+        """``(O,)`` the weights that minimise the variance of products."""
         weight, noise = self.info, 1 / self.info
         square = (self.value**2).mean(1)
         for _ in range(3):
@@ -54,92 +54,94 @@ class Seen:
         return weight
 
 
-def seen_in(engine: Engine, fit: Fit, z: np.ndarray) -> Seen:
-    """The numbers of everybody in every part of his time."""
-    number = len(engine.sequences)
-    first, last = np.full(number, np.inf), np.full(number, -np.inf)
-    np.minimum.at(first, engine.sequence, engine.clock)
-    np.maximum.at(last, engine.sequence, engine.clock)
-    at = (engine.clock - first[engine.sequence]) / np.maximum(last - first, 1e-9)[engine.sequence]
-    part = np.minimum((PARTS * at).astype(int), PARTS - 1)
+def period_estimates(engine: Engine, fit: Fit, z: np.ndarray) -> PeriodEstimates:
+    """The parameters of all agents in every part of their time."""
+    n_sequences = len(engine.sequences)
+    begin, end = np.full(n_sequences, np.inf), np.full(n_sequences, -np.inf)
+    np.minimum.at(begin, engine.sequence, engine.clock)
+    np.maximum.at(end, engine.sequence, engine.clock)
+    duration = np.maximum(end - begin, 1e-9)
+    elapsed = (engine.clock - begin[engine.sequence]) / duration[engine.sequence]
+    part = np.minimum((PARTS * elapsed).astype(int), PARTS - 1)
     present, label = np.unique(PARTS * engine.unit + part, return_inverse=True)
     gram, score = grams(z, label), -sums(z * fit.residual[:, None], label)
     count = np.bincount(label)
     time = np.bincount(label, engine.clock) / count
     start = np.unique(label, return_index=True)[1]
     noise = fit.cost / len(fit.residual)
-    alone = len(engine.people[0]) == 1
-    least = NONE * float(np.einsum("umm->um", gram).max(initial=0.0))
+    single_agent = len(engine.people[0]) == 1
+    smallest = NONE * float(np.einsum("umm->um", gram).max(initial=0.0))
     identity = _Identity(engine)
     places: list[int] = []
     rows: list[tuple[int, int, int, int, float, np.ndarray, float]] = []
     for k, unit in enumerate(present // PARTS):
-        known = np.flatnonzero(np.diag(gram[k]) > least)
-        if not len(known) or (alone and len(known) < z.shape[1]):
+        identified = np.flatnonzero(np.diag(gram[k]) > smallest)
+        if not len(identified) or (single_agent and len(identified) < z.shape[1]):
             continue
-        inverse = np.linalg.pinv(gram[k][np.ix_(known, known)])
-        value, wide = inverse @ score[k][known], np.maximum(np.diag(inverse), 1e-300)
+        inverse = np.linalg.pinv(gram[k][np.ix_(identified, identified)])
+        value, variances = inverse @ score[k][identified], np.maximum(np.diag(inverse), 1e-300)
         cluster, people = int(engine.cluster[start[k]]), engine.people[unit]
-        if alone:
+        if single_agent:
             b, n = people[0]
-            own = (identity.agent(b, n), b, cluster, identity.recording[b], float(time[k]))
-            rows.append((*own, value, 1 / (noise * float(wide.mean()))))
+            labels = (identity.agent(b, n), b, cluster, identity.recording[b], float(time[k]))
+            rows.append((*labels, value, 1 / (noise * float(variances.mean()))))
             continue
-        for m, v, w in zip(known, value, wide, strict=True):
+        for m, v, w in zip(identified, value, variances, strict=True):
             b, n = people[m]
-            own = (identity.agent(b, n), b, cluster, identity.recording[b], float(time[k]))
-            rows.append((*own, np.array([v]), 1 / (noise * float(w))))
+            labels = (identity.agent(b, n), b, cluster, identity.recording[b], float(time[k]))
+            rows.append((*labels, np.array([v]), 1 / (noise * float(w))))
             places.append(engine.sequences[b].n_agents - n)
     columns = list(zip(*rows, strict=True)) or [()] * 7
     agent, sequence, cluster_of, recording, when, values, info = (np.array(c) for c in columns)
-    seen = Seen(agent, sequence, cluster_of, recording, when, values, info)
-    return seen if alone else _beyond_places(seen, np.array(places, dtype=int))
+    estimates = PeriodEstimates(agent, sequence, cluster_of, recording, when, values, info)
+    if single_agent:
+        return estimates
+    return _without_place_means(estimates, np.array(places, dtype=int))
 
 
-def _beyond_places(seen: Seen, place: np.ndarray) -> Seen:
-    """Numbers beyond what all at a place of the platoon have in common.
+def _without_place_means(estimates: PeriodEstimates, place: np.ndarray) -> PeriodEstimates:
+    """The estimates minus the mean of all at the same place of the platoon.
 
-    The mean of a place takes a part of every cluster's numbers along; the rest is enlarged by it
-    (as CR2 does, see :mod:`~nnode.discover.statistics.leverage`). Places that one cluster alone
-    tells of are left out.
+    The deviations are scaled up by the leverage of their cluster on this mean (as in CR2, see
+    :mod:`~nnode.discover.statistics.leverage`). Places that occur in only one cluster are left out.
     """
-    value, known = seen.value.copy(), np.zeros(len(place), dtype=bool)
-    weight = seen.weight if len(place) else seen.info
+    value, identified = estimates.value.copy(), np.zeros(len(place), dtype=bool)
+    weight = estimates.weight if len(place) else estimates.info
     for p in np.unique(place):
-        at = np.flatnonzero(place == p)
-        share = np.bincount(seen.cluster[at], weight[at])[seen.cluster[at]] / weight[at].sum()
-        away = seen.value[at] - weight[at] @ seen.value[at] / weight[at].sum()
-        known[at] = share < 1 - 1e-9
-        value[at] = away / np.sqrt(np.maximum(1 - share, 1e-9))[:, None]
-    kept = np.flatnonzero(known)
-    parts = {f.name: getattr(seen, f.name)[kept] for f in fields(seen)}
-    return Seen(**{**parts, "value": value[kept]})
+        members = np.flatnonzero(place == p)
+        cluster, w, v = estimates.cluster[members], weight[members], estimates.value[members]
+        share = np.bincount(cluster, w)[cluster] / w.sum()
+        centred = v - w @ v / w.sum()
+        identified[members] = share < 1 - 1e-9
+        value[members] = centred / np.sqrt(np.maximum(1 - share, 1e-9))[:, None]
+    kept = np.flatnonzero(identified)
+    parts = {f.name: getattr(estimates, f.name)[kept] for f in fields(estimates)}
+    return PeriodEstimates(**{**parts, "value": value[kept]})
 
 
 class _Identity:
-    """Who is the same in several sequences."""
+    """Identifies agents across sequences."""
 
     def __init__(self, engine: Engine) -> None:
         self.sequences = engine.sequences
         names = [s.recording for s in engine.sequences]
         self.recording = np.unique(names, return_inverse=True)[1].reshape(-1)
-        self._known: dict[tuple[Any, ...], int] = {}
+        self._numbers: dict[tuple[Any, ...], int] = {}
 
     def agent(self, b: int, n: int) -> int:
-        own = self.sequences[b]
-        key = (own.recording, own.agents[n]) if own.agents else (b, n, None)
-        return self._known.setdefault(key, len(self._known))
+        sequence = self.sequences[b]
+        key = (sequence.recording, sequence.agents[n]) if sequence.agents else (b, n, None)
+        return self._numbers.setdefault(key, len(self._numbers))
 
 
 @dataclass
 class Curve:
-    """What parts have in common at every lag.
+    """The autocovariance of parameters at every lag.
 
     Attributes:
         lags: ``(L,)`` s.
-        same, between: ``(2, G, L)`` sums of weighted products and of weights: of one agent's
-            parts, and of different agents of a sequence.
-        clusters: whose G.
+        same, between: ``(2, G, L)`` sums of weighted products and of weights in the G clusters:
+            within agents, and between different agents of a sequence.
     """
 
     lags: np.ndarray
@@ -147,32 +149,38 @@ class Curve:
     between: np.ndarray
 
     @classmethod
-    def of(cls, seen: Seen) -> Curve | None:
-        """None where there are fewer than three lags."""
-        weight = seen.weight
-        value = weight[:, None] * seen.value / np.sqrt(seen.value.shape[1])
+    def of(cls, estimates: PeriodEstimates) -> Curve | None:
+        """The autocovariance; None if there are fewer than three lags."""
+        weight = estimates.weight
+        value = weight[:, None] * estimates.value / np.sqrt(estimates.value.shape[1])
         steps = []
-        for s in np.unique(seen.sequence):
-            times = np.unique(seen.time[seen.sequence == s].round(6))
+        for s in np.unique(estimates.sequence):
+            times = np.unique(estimates.time[estimates.sequence == s].round(6))
             steps += list(np.diff(times))
         step = float(np.median(steps)) if steps else 0.0
         if not step > 0:
             return None
-        pairs = _pairs(seen.agent, seen.time, step, lambda i, j: i != j)
-        across = _pairs(seen.sequence, seen.time, step, lambda i, j: seen.agent[i] != seen.agent[j])
-        number = int(seen.cluster.max()) + 1
-        most = int(pairs[2].max(initial=0)) + 1
-        found = [
-            _collected(one, value, weight, seen.cluster, number, most) for one in (pairs, across)
+        pairs = _pairs(estimates.agent, estimates.time, step, lambda i, j: i != j)
+        across = _pairs(
+            estimates.sequence,
+            estimates.time,
+            step,
+            lambda i, j: estimates.agent[i] != estimates.agent[j],
+        )
+        n_clusters = int(estimates.cluster.max()) + 1
+        n_bins = int(pairs[2].max(initial=0)) + 1
+        collected = [
+            _collected(part, value, weight, estimates.cluster, n_clusters, n_bins)
+            for part in (pairs, across)
         ]
-        total = np.bincount(pairs[2], weight[pairs[0]] * weight[pairs[1]], most)
-        apart = np.abs(seen.time[pairs[0]] - seen.time[pairs[1]])
-        lags = np.bincount(pairs[2], apart * weight[pairs[0]] * weight[pairs[1]], most)
+        total = np.bincount(pairs[2], weight[pairs[0]] * weight[pairs[1]], n_bins)
+        apart = np.abs(estimates.time[pairs[0]] - estimates.time[pairs[1]])
+        lags = np.bincount(pairs[2], apart * weight[pairs[0]] * weight[pairs[1]], n_bins)
         kept = total > 0
         if kept.sum() < 3:
             return None
-        present = found[0][1].sum(1) > 0
-        same, between = (one[:, present][:, :, kept] for one in found)
+        present = collected[0][1].sum(1) > 0
+        same, between = (part[:, present][:, :, kept] for part in collected)
         return cls(lags[kept] / total[kept], same, between)
 
     def fitted(self, same: np.ndarray, between: np.ndarray) -> tuple[float, float, float]:
@@ -180,8 +188,8 @@ class Curve:
         return self.plateau(ratio(same) - ratio(between), same[1].sum(0))
 
     def plateau(self, common: np.ndarray, weight: np.ndarray) -> tuple[float, float, float]:
-        """The least squares of a constant and an exponential that falls with the lag; all 0 where
-        nothing is known of either."""
+        """Least squares fit of a constant plus an exponential decay over the lag; all 0 without
+        weights."""
         best = (np.inf, 0.0, 0.0, 0.0)
         if not weight.sum() > 0:
             return best[1:]
@@ -189,14 +197,14 @@ class Curve:
         for tau in np.geomspace(self.lags[0] / 3, LONGEST * self.lags[-1], TRIED):
             fall = np.exp(-self.lags / tau)
             mean = (weight * fall).sum() / weight.sum()
-            away = fall - mean
-            known = max(float((weight * away**2).sum()), 1e-300)
-            height = float((weight * away * common).sum()) / known
+            centred = fall - mean
+            curvature = max(float((weight * centred**2).sum()), 1e-300)
+            height = float((weight * centred * common).sum()) / curvature
             height = max(height, 0.0)
-            own = level - height * float(mean)
-            left = float((weight * (common - own - height * fall) ** 2).sum())
-            if left < best[0]:
-                best = left, own, height, float(tau)
+            constant = level - height * float(mean)
+            misfit = float((weight * (common - constant - height * fall) ** 2).sum())
+            if misfit < best[0]:
+                best = misfit, constant, height, float(tau)
         return best[1:]
 
 
@@ -213,10 +221,10 @@ def _pairs(
         seconds.append(members[j])
     first, second = np.concatenate(firsts), np.concatenate(seconds)
     lag = np.abs(time[first] - time[second]) / step
-    good = (lag > 0.5) & keep(first, second)
+    kept = (lag > 0.5) & keep(first, second)
     # bins of one step, and from the sixth on wider ones
     number = np.where(lag < 6.5, lag.round(), 6 + (6 * np.log2(np.maximum(lag, 6) / 6)).round())
-    return [first[good], second[good], number[good].astype(int)]
+    return [first[kept], second[kept], number[kept].astype(int)]
 
 
 def _collected(
@@ -224,51 +232,55 @@ def _collected(
     value: np.ndarray,
     weight: np.ndarray,
     cluster: np.ndarray,
-    number: int,
-    most: int,
+    n_clusters: int,
+    n_bins: int,
 ) -> np.ndarray:
     """``(2, G, L)``: see :class:`Curve`."""
     first, second, at = pairs
-    inside = at < most
+    inside = at < n_bins
     first, second, at = first[inside], second[inside], at[inside]
-    label = cluster[first] * most + at
+    label = cluster[first] * n_bins + at
     product = (value[first] * value[second]).sum(1)
-    both = [np.bincount(label, w, number * most) for w in (product, weight[first] * weight[second])]
-    found: np.ndarray = np.stack(both).reshape(2, number, most)
-    return found
+    weighted_sums = [
+        np.bincount(label, w, n_clusters * n_bins)
+        for w in (product, weight[first] * weight[second])
+    ]
+    stacked: np.ndarray = np.stack(weighted_sums).reshape(2, n_clusters, n_bins)
+    return stacked
 
 
 def ratio(sums_of: np.ndarray) -> np.ndarray:
-    found: np.ndarray = sums_of[0].sum(0) / np.maximum(sums_of[1].sum(0), 1e-300)
-    return found
+    ratios: np.ndarray = sums_of[0].sum(0) / np.maximum(sums_of[1].sum(0), 1e-300)
+    return ratios
 
 
-def shares(seen: Seen, curve: Curve, own: float, mood: float) -> dict[str, float | None]:
-    """Variance by what a number belongs to, as shares of their sum; negative ones are none."""
-    shared, passing, _ = curve.plateau(ratio(curve.between), curve.between[1].sum(0))
-    weight = seen.weight
+def shares(
+    estimates: PeriodEstimates, curve: Curve, agent_variance: float, transient_variance: float
+) -> dict[str, float | None]:
+    """Variance components as shares of their sum; negative estimates count as 0."""
+    shared, transient_common, _ = curve.plateau(ratio(curve.between), curve.between[1].sum(0))
+    weight = estimates.weight
     total, size = 0.0, 0.0
-    for r in np.unique(seen.recording):
-        parts = [
-            (weight[own_part] @ seen.value[own_part], weight[own_part].sum())
-            for c in np.unique(seen.cluster[seen.recording == r])
-            if len(own_part := np.flatnonzero((seen.recording == r) & (seen.cluster == c)))
-        ]
+    for r in np.unique(estimates.recording):
+        inside = estimates.recording == r
+        members = [inside & (estimates.cluster == c) for c in np.unique(estimates.cluster[inside])]
+        parts = [(weight[m] @ estimates.value[m], weight[m].sum()) for m in members]
         values, sizes = np.stack([v for v, _ in parts]), np.array([w for _, w in parts])
         total += float((values.sum(0) ** 2).sum() - (values**2).sum()) / values.shape[1]
         size += float(sizes.sum() ** 2 - (sizes**2).sum())
-    several = len(np.unique(seen.recording)) > 1 and size > 0
+    several = len(np.unique(estimates.recording)) > 1 and size > 0
     recording = total / size if several else 0.0
-    parts_of = {
+    components = {
         "recording": max(recording, 0.0),
         "sequence": max(shared - max(recording, 0.0), 0.0),
-        "agent": max(own, 0.0),
-        "mood": max(mood, 0.0) + max(passing, 0.0),
+        "agent": max(agent_variance, 0.0),
+        "mood": max(transient_variance, 0.0) + max(transient_common, 0.0),
     }
-    whole = sum(parts_of.values())
-    found: dict[str, float | None] = {
-        name: value / whole if whole > 0 else 0.0 for name, value in parts_of.items()
+    total_variance = sum(components.values())
+    share: dict[str, float | None] = {
+        name: value / total_variance if total_variance > 0 else 0.0
+        for name, value in components.items()
     }
     if not several:
-        found["recording"] = None
-    return found
+        share["recording"] = None
+    return share

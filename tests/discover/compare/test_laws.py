@@ -15,9 +15,9 @@ from nnode.app.python.inputs import model_options, table_options
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.readers.table import read_table
 from nnode.data.sequence import Sequence
-from nnode.discover.compare.laws import Nearer, compare_laws, imitated, with_effects
+from nnode.discover.compare.laws import BetterLaw, compare_laws, explained_by_law, with_effects
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.name.search import Search, Step, begun, settled, without_steps
+from nnode.discover.name.search import Selection, Step, converged_fit, initial_fit, without_steps
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.fit import refine
 from nnode.errors import ConfigError
@@ -113,24 +113,24 @@ def test_what_a_nearer_law_does_without_is_no_finding(tmp_path: Path) -> None:
     sequences = read_table(path, table_options(path, "traffic", None, tmp_path)[1])
     label = np.arange(len(sequences))
     engine = TrafficEngine(sequences, clusters=label)
-    base = settled(engine, begun(engine, law("lin").double()).system)
+    base = converged_fit(engine, initial_fit(engine, law("lin").double()).system)
 
-    def added(name: str) -> Search:
+    def added(name: str) -> Selection:
         kind = CATALOGUE.effects[name]
         fit = refine(engine, extended(base.system, kind())[0])
         chosen = SimpleNamespace(name=name, score=SimpleNamespace(effect=kind))
-        return Search(fit, [Step(chosen, [])])
+        return Selection(fit, [Step(chosen, [])])
 
-    other = begun(engine, law("ovm").double())
-    nearer = Nearer("ovm", other.system)
+    other = initial_fit(engine, law("ovm").double())
+    nearer = BetterLaw("ovm", other.system)
     ahead = added("multi_anticipation")
-    taken, p_value = imitated(engine, ahead, label, nearer)
+    taken, p_value = explained_by_law(engine, ahead, label, nearer)
     assert [step.chosen.name for step in taken] == ["multi_anticipation"]
     assert p_value < 0.05
-    assert imitated(engine, added("inertia"), label, nearer)[0] == []
+    assert explained_by_law(engine, added("inertia"), label, nearer)[0] == []
     # the other way round nothing is taken back: lin predicts no better than ovm
-    far = Nearer("lin", base.system)
-    assert imitated(engine, replace(ahead, fit=other), label, far)[0] == []
+    far = BetterLaw("lin", base.system)
+    assert explained_by_law(engine, replace(ahead, fit=other), label, far)[0] == []
     left = without_steps(engine, ahead, taken, base.system)
     assert left.steps == []
     assert effects_of(left.fit.system) == []

@@ -68,7 +68,7 @@ def plain() -> list[Sequence]:
 @pytest.fixture(scope="module")
 def engine(plain: list[Sequence]) -> CrowdEngine:
     found = CrowdEngine(plain)
-    found.settle(model(), ROW)
+    found.fit_whitening(model(), ROW)
     return found
 
 
@@ -164,8 +164,8 @@ def test_somebody_who_jumps_counts_little(plain: list[Sequence]) -> None:
     x = plain[0].x.copy()
     x[20:, 3] += 0.6
     found = CrowdEngine([replace(plain[0], x=x), *plain[1:]])
-    found.settle(model(), ROW)
-    weight = found._settled(model(), ROW).weight
+    found.fit_whitening(model(), ROW)
+    weight = found._fitted_whitening(model(), ROW).weight
     place = {(int(w), int(i)): k for k, (w, i) in enumerate(found.windows.person)}
     assert weight[place[1, 3]] < 0.1
     assert np.median(weight) > 0.8
@@ -190,7 +190,7 @@ def test_tangents_are_those_of_simulations(plain: list[Sequence]) -> None:
     row = ParameterVector(system).row
     row[1] = 50.0
     engine = CrowdEngine(plain)
-    engine.settle(system, row)
+    engine.fit_whitening(system, row)
     found = engine.tangents(system, row)
     step = torch.tensor([0.1, 1.0, 0.5, 0.02, 0.02])
     for k in range(len(row)):
@@ -293,9 +293,9 @@ def test_a_hidden_effect_scores_best_and_is_measured(
 ) -> None:
     engine = CrowdEngine(walkers.crowd(extra, seed=4, sequences=12, noise=0.002))
     start = model()
-    engine.settle(start, ROW)
+    engine.fit_whitening(start, ROW)
     fit = refine(engine, start)
-    engine.settle(fit.system, ParameterVector(fit.system).row)
+    engine.fit_whitening(fit.system, ParameterVector(fit.system).row)
     fit = refine(engine, fit.system)
     screen = Screen(fit, engine.cluster)
     effects = [

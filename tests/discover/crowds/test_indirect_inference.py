@@ -12,7 +12,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds import indirect_inference as module
 from nnode.discover.crowds.engine import CrowdEngine
-from nnode.discover.crowds.indirect_inference import unbiased
+from nnode.discover.crowds.indirect_inference import bias_corrected
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.errors import SimulationError
 from nnode.model import Crowd, make_law
@@ -46,7 +46,7 @@ def calibrated(
         [make_law("relaxation", tau=walkers.TAU), law, PreferredSpeed(c=C, v_pref=SPEED)]
     )
     engine = CrowdEngine(data)
-    engine.settle(system, ParameterVector(system).row)
+    engine.fit_whitening(system, ParameterVector(system).row)
     return refine(engine, system), data, engine
 
 
@@ -55,7 +55,7 @@ def test_a_bias_by_disturbances_is_taken_out() -> None:
     before, after = [], []
     for seed in range(3):
         fit, data, engine = calibrated(seed, 0.01)
-        found = unbiased(fit, data)
+        found = bias_corrected(fit, data)
         place = fit.names.index("terms.2.c")
         before.append(abs(fit.row[place] - C))
         after.append(abs(found.row[place] - C))
@@ -73,9 +73,9 @@ def test_the_same_seed_gives_the_same_numbers_and_bounds_hold() -> None:
     held = np.array([name == "terms.1.A" for name in fit.names])
     assert held.sum() == 1
     fit = replace(fit, free=fit.free & ~held)  # as at a bound
-    found = unbiased(fit, data, seed=7)
-    assert np.array_equal(found.row, unbiased(fit, data, seed=7).row)
-    assert not np.array_equal(found.row, unbiased(fit, data, seed=8).row)
+    found = bias_corrected(fit, data, seed=7)
+    assert np.array_equal(found.row, bias_corrected(fit, data, seed=7).row)
+    assert not np.array_equal(found.row, bias_corrected(fit, data, seed=8).row)
     assert np.array_equal(found.row[held], fit.row[held])
     assert (found.row[fit.free] != fit.row[fit.free]).any()
 
@@ -86,4 +86,4 @@ def test_crowds_that_cannot_be_calibrated_change_nothing(monkeypatch: pytest.Mon
 
     fit, data, _ = calibrated(1, 0.01, sequences=5)
     monkeypatch.setattr(module, "refine", fails)
-    assert unbiased(fit, data) is fit
+    assert bias_corrected(fit, data) is fit

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from nnode.app.python.inputs import model_options
-from nnode.discover.able import not_offered
 from nnode.discover.compare.laws import with_effects
+from nnode.discover.eligibility import not_offered
 from nnode.model import Crowd, build_model, make_law
 from nnode.model.effects import CATALOGUE
 from nnode.model.extend import effects_of

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nnode.discover.judge.measure_next import COMFORTABLE, POWER, advised, distance, tried
+from nnode.discover.judge.measure_next import (
+    COMFORTABLE,
+    POWER,
+    best_profile,
+    distance,
+    evaluated_profiles,
+)
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.name.search import settled
+from nnode.discover.name.search import converged_fit
 from nnode.model import System
 from nnode.model.build import add_effects, build_model
 from tests.discover.platoons import LENGTH, V0, platoons
@@ -32,7 +38,7 @@ INERTIA = {"name": "inertia", "tau_v": 0.3}
 @pytest.fixture(scope="module")
 def engine() -> TrafficEngine:
     found = TrafficEngine(platoons(driver=0.8))
-    settled(found, model())
+    converged_fit(found, model())
     return found
 
 
@@ -54,9 +60,9 @@ def test_the_number_of_platoons_tells_with_the_probability_that_is_asked_for(
     engine: TrafficEngine,
 ) -> None:
     first, second = model(**DELAY), model(**INERTIA)
-    found = list(tried(engine, first, second, 0.05))
-    best = advised(engine, first, second, 0.05)
-    surer = advised(engine, first, second, 0.01)
+    found = list(evaluated_profiles(engine, first, second, 0.05))
+    best = best_profile(engine, first, second, 0.05)
+    surer = best_profile(engine, first, second, 0.01)
     assert best is not None
     assert surer is not None
     assert surer.platoons > best.platoons

@@ -14,7 +14,7 @@ from nnode.discover.judge.verdict import _absence
 from nnode.discover.report.figures.marks import flexible_curve
 from nnode.discover.residuals.variables import Curves, Variable
 from nnode.discover.result import Absence, Coefficient
-from nnode.discover.statistics.power import Way
+from nnode.discover.statistics.power import PowerSimulation
 from nnode.discover.statistics.score import Evidence, Score
 from nnode.discover.statistics.standard import standardised as scaled
 from nnode.model.effects import CATALOGUE
@@ -91,7 +91,7 @@ def test_scores_are_on_the_scale_of_a_standard_normal_variable() -> None:
     signs = np.ones((1, 25))
 
     def standardised(factor: float) -> np.ndarray:
-        found = scaled(factor * parts, factor**2 * sizes, signs, usual=9.0)
+        found = scaled(factor * parts, factor**2 * sizes, signs, cluster_variance=9.0)
         return np.asarray(found[0])
 
     found = standardised(1.0)
@@ -137,7 +137,7 @@ def test_a_delay_is_bounded_where_it_was_tried(
 ) -> None:
     each = [evidence(size) for size in sizes]
     score = Score(ReactionDelay, {}, 1.0, 0.5, 0.0, {"T": 1e-4}, {"T": 1e-4}, each)
-    found = _absence(score, cast(Way, Known(sizes)))
+    found = _absence(score, cast(PowerSimulation, Known(sizes)))
     assert found.testable == testable
     assert found.detectable == pytest.approx(detectable)
     assert (found.bound is not None) == testable
@@ -148,7 +148,7 @@ def test_an_effect_is_tested_where_one_of_usual_size_would_be_named() -> None:
     def of(detectable: float, error: float = 0.05) -> Absence:
         one = [evidence(0.0)]
         score = Score(RelativeSpeed, {}, 1.0, 0.5, 0.0, {"kappa": 0.01}, {"kappa": error}, one)
-        return _absence(score, cast(Way, Known({0.0: detectable})))
+        return _absence(score, cast(PowerSimulation, Known({0.0: detectable})))
 
     assert of(0.19).testable
     # Student's quantile with 15 degrees
@@ -169,7 +169,7 @@ def test_a_cap_is_absent_down_to_the_weakest_that_would_be_named() -> None:
         # the higher the cap the less it does
         caps = [replace(evidence(0.0), options={"v_max": v}, grams=np.ones(16) / v) for v in powers]
         score = Score(FreeFlowSpeed, {}, 1.0, 0.5, 0.0, {}, {}, caps)
-        return _absence(score, cast(Way, Caps(powers)))
+        return _absence(score, cast(PowerSimulation, Caps(powers)))
 
     found = of({12.0: 1.0, 15.0: 0.85, 18.0: 0.6})
     assert (found.testable, found.detectable, found.bound) == (True, 15.0, 15.0)

@@ -9,9 +9,9 @@ import torch
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence
-from nnode.discover.lanes.engine import FORGET, LARGE, TrafficEngine, drawn_in
-from nnode.discover.locate.curves import curves, weighed
-from nnode.discover.name.search import search, settled
+from nnode.discover.lanes.engine import FORGET, LARGE, TrafficEngine, huber_residuals
+from nnode.discover.locate.curves import curves, significant_curves
+from nnode.discover.name.search import converged_fit, search
 from nnode.discover.residuals.fit import Fit, refine, sums
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import traces
@@ -76,7 +76,7 @@ def test_windows_share_out_what_is_compared() -> None:
 
 def test_large_residuals_are_drawn_in() -> None:
     r = torch.tensor([0.5, -LARGE, 10 * LARGE], dtype=torch.float64)
-    found = drawn_in(r)
+    found = huber_residuals(r)
     assert found[:2].tolist() == r[:2].tolist()
     # the square is Huber's loss
     assert float(found[2] ** 2) == pytest.approx(2 * LARGE * 10 * LARGE - LARGE**2)
@@ -109,7 +109,7 @@ def test_linear_response_agrees_with_differences(
 
 def test_traces_agree_with_simulated_effects(plain: list[Sequence]) -> None:
     engine = TrafficEngine(plain[:4])
-    fit = settled(engine, model())
+    fit = converged_fit(engine, model())
     (trace,) = traces(engine, fit, CATALOGUE.effects["relative_speed"])
     other = model({"name": "relative_speed", "kappa": 0.01})
     row = torch.cat([torch.from_numpy(fit.row), torch.tensor([0.01]).double()])
@@ -134,7 +134,7 @@ def test_a_delay_is_simulated_precisely() -> None:
 
 def test_a_hidden_effect_is_named_and_measured(reacting: list[Sequence]) -> None:
     engine = TrafficEngine(reacting)
-    base = settled(engine, model())
+    base = converged_fit(engine, model())
     found = search(engine, base, CATALOGUE.of("traffic"))
     assert [step.chosen.name for step in found.steps] == ["relative_speed"]
     i = found.fit.names.index("terms.1.kappa")
@@ -145,10 +145,10 @@ def test_a_hidden_effect_is_named_and_measured(reacting: list[Sequence]) -> None
 
 def test_nothing_is_named_where_nothing_is_hidden(plain: list[Sequence]) -> None:
     engine = TrafficEngine(plain)
-    base = settled(engine, model())
+    base = converged_fit(engine, model())
     found = search(engine, base, CATALOGUE.of("traffic"))
     assert not found.steps
-    assert not weighed(engine, base, curves(engine, base, engine.variables()), 0.01)
+    assert not significant_curves(engine, base, curves(engine, base, engine.variables()), 0.01)
     assert base.row == pytest.approx([V0, LENGTH], rel=0.05)
 
 
@@ -157,7 +157,7 @@ def test_curves_find_the_variable_of_an_effect() -> None:
         return law * np.where((x[:-1] > 250) & (x[:-1] < 330), 0.9, 1.0)
 
     engine = TrafficEngine(platoons(slow, driver=0.1))
-    fit = settled(engine, model())
+    fit = converged_fit(engine, model())
     best = curves(engine, fit, engine.variables())[0]
     assert best.variable.name == "position"
     assert best.gain.low > 0
@@ -168,7 +168,7 @@ def test_curves_find_the_variable_of_an_effect() -> None:
 
 def test_heldout_cost_is_that_of_a_refit(reacting: list[Sequence]) -> None:
     engine = TrafficEngine(reacting)
-    fit = settled(engine, model())
+    fit = converged_fit(engine, model())
     losses = heldout(fit, engine.cluster)
     rest = TrafficEngine(reacting[1:])
     rest.filter = engine.filter

@@ -150,7 +150,7 @@ def test_individual_effects(sequences: list[Sequence]) -> None:
 
 def test_a_model_with_a_memory_starts_where_it_is(sequences: list[Sequence]) -> None:
     system = model(LIN, "measured", ("inertia",))
-    found = TrafficEngine(sequences).near(system)
+    found = TrafficEngine(sequences).regression_start(system)
     assert ParameterVector(found).row.tolist() == ParameterVector(system).row.tolist()
 
 

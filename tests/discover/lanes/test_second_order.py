@@ -13,7 +13,7 @@ from torch import Tensor
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, collate
-from nnode.discover.able import not_offered
+from nnode.discover.eligibility import not_offered
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.variables import Curve
 from nnode.model import System, build_model
@@ -166,5 +166,5 @@ def test_a_start_near_the_measured_accelerations() -> None:
     system = model("helly")
     engine = TrafficEngine(platoons(number=4, noise=0.01))
     before = engine.squares(system, ParameterVector(system).row).means().mean()
-    found = engine.near(system)
+    found = engine.regression_start(system)
     assert engine.squares(found, ParameterVector(found).row).means().mean() < before

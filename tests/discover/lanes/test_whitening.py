@@ -31,7 +31,7 @@ def test_memory_along_time_and_along_the_platoon_is_found_and_taken_out() -> Non
     e = remembering(400, 30, 4)
     seen = followers(e)
     found = PlatoonFilter.fitted(e, seen, 1)
-    assert found.own == pytest.approx([OWN], abs=0.03)
+    assert found.past == pytest.approx([OWN], abs=0.03)
     assert found.ahead == pytest.approx([0.0, AHEAD], abs=0.03)
     assert found.scale == pytest.approx(SCALE, rel=0.03)
     white = found(e)

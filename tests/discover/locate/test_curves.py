@@ -10,8 +10,8 @@ import torch
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.locate.curves import columns_of, curves, weighed, with_curve
-from nnode.discover.name.search import search, settled
+from nnode.discover.locate.curves import columns_of, curves, significant_curves, with_curve
+from nnode.discover.name.search import converged_fit, search
 from nnode.discover.residuals.engine import square_of
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.variables import Variable, hats, lengths_of
@@ -30,12 +30,12 @@ def _wavy(x: np.ndarray, law: np.ndarray, lead: float) -> np.ndarray:
 def wavy() -> tuple[TrafficEngine, Fit]:
     # as many clusters as it takes to be sure of one curve among many
     engine = TrafficEngine(platoons(_wavy, number=16, driver=0.1))
-    return engine, settled(engine, model())
+    return engine, converged_fit(engine, model())
 
 
 def test_a_wave_along_the_road_is_found(wavy: tuple[TrafficEngine, Fit]) -> None:
     engine, fit = wavy
-    best = weighed(engine, fit, curves(engine, fit, engine.variables()), 0.01)[0]
+    best = significant_curves(engine, fit, curves(engine, fit, engine.variables()), 0.01)[0]
     assert best.variable.name == "waves of position"
     assert best.variable.lengths[0] == pytest.approx(WAVE, rel=0.05)
     assert best.removed > 0.5
@@ -68,7 +68,7 @@ def test_the_scale_of_a_curve_is_calibrated_before_it_is_weighed(
     wavy: tuple[TrafficEngine, Fit],
 ) -> None:
     engine, fit = wavy
-    best = weighed(engine, fit, curves(engine, fit, engine.variables()), 0.01)[0]
+    best = significant_curves(engine, fit, curves(engine, fit, engine.variables()), 0.01)[0]
     before, after = (square_of(engine, s) for s in (fit.system, with_curve(fit, best)))
     assert 0.5 < 1 - after / before <= best.removed < 1
 
@@ -81,7 +81,7 @@ def test_waves_are_those_that_the_data_tell_apart() -> None:
     turns = 600.0 / np.array(found)
     assert np.diff(turns) == pytest.approx(0.5)
     assert lengths_of(30.0, 300.0, 0.0) == ()
-    assert len(lengths_of(1.0, 300.0, 1e6, most=50)) == 50
+    assert len(lengths_of(1.0, 300.0, 1e6, max_number=50)) == 50
 
 
 def test_weights_of_a_curve_share_a_value_between_its_knots() -> None:

@@ -10,7 +10,7 @@ import pytest
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name import search as searching
-from nnode.discover.name.search import search, settled
+from nnode.discover.name.search import converged_fit, search
 from nnode.discover.rules import rules
 from nnode.discover.statistics.score import Score, Screen, Trace
 from nnode.model import build_model
@@ -39,7 +39,7 @@ def test_held_out_clusters_may_be_sure_of_what_no_score_shows(
 
     monkeypatch.setattr(Screen, "scores", blind)
     engine = TrafficEngine(platoons(effect=relative_speed(strength), number=16))
-    fit = settled(engine, build_model(LIN))
+    fit = converged_fit(engine, build_model(LIN))
     found = search(engine, fit, [CATALOGUE.effects[n] for n in ("relative_speed", "inertia")])
     assert [step.chosen.name for step in found.steps] == names
     assert all(step.chosen.score.p_value <= rules().sure for step in found.steps)
@@ -47,9 +47,9 @@ def test_held_out_clusters_may_be_sure_of_what_no_score_shows(
 
 def test_what_a_curve_outdoes_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     engine = TrafficEngine(platoons(effect=relative_speed(0.5), number=16))
-    fit = settled(engine, build_model(LIN))
+    fit = converged_fit(engine, build_model(LIN))
     asked: list[bool] = []
-    monkeypatch.setattr(searching, "_outdone", lambda *_: asked.append(True) or True)
+    monkeypatch.setattr(searching, "_curve_predicts_better", lambda *_: asked.append(True) or True)
     found = search(engine, fit, [CATALOGUE.effects[n] for n in ("relative_speed", "inertia")])
     assert asked  # an effect passed, and was doubted
     assert not found.steps

@@ -35,18 +35,18 @@ def test_the_deviation_of_a_law_in_equilibrium_is_its_error() -> None:
     gap = solve_ivp(lambda t, g: 18 - 20 * (1 - 8 / g), (0, 2), [40.0], rtol=1e-10)
     assert len(found.time) == found.position.size == 7  # of the follower alone
     assert found.value[:, 0] == pytest.approx((gap.y[0, -1] - 40) / 2, rel=1e-5)
-    assert found.beside[:, 0] == pytest.approx(40.0)
-    assert found.beside[:, 1] == pytest.approx(0.0, abs=1e-9)
+    assert found.neighbour[:, 0] == pytest.approx(40.0)
+    assert found.neighbour[:, 1] == pytest.approx(0.0, abs=1e-9)
     assert 100 < found.time.min() < found.time.max() < 108
 
 
 def test_a_leader_that_is_simulated_counts() -> None:
     system = Traffic([make_law("lin", v0=20.0, L=8.0)], leader="constant")
     found = deviation(system, [platoon(16.0, 17.0)])
-    leaders = np.isnan(found.beside[:, 0])
+    leaders = np.isnan(found.neighbour[:, 0])
     assert leaders.sum() == 7
     assert found.value[leaders, 0] == pytest.approx(17.0 - 20.0)
-    assert found.beside[~leaders, 1] == pytest.approx(1.0)
+    assert found.neighbour[~leaders, 1] == pytest.approx(1.0)
 
 
 def test_numbers_of_agents_act_in_every_piece() -> None:
@@ -70,7 +70,7 @@ def test_a_push_that_the_model_lacks_is_found_in_a_crowd() -> None:
     # tau is so long that the relaxation does nothing; what is left is the push itself
     found = deviation(Crowd([make_law("relaxation", tau=1e9)]), [person((0.2, -0.3))])
     assert found.value == pytest.approx(np.tile([0.2, -0.3], (len(found.time), 1)), abs=1e-6)
-    assert np.isnan(found.beside).all()  # nobody else is there
+    assert np.isnan(found.neighbour).all()  # nobody else is there
 
 
 def test_velocities_are_exact_for_parabolas() -> None:

@@ -17,9 +17,9 @@ import torch
 from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence
 from nnode.discover.diagnose import diagnose
-from nnode.discover.found import Found
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
+from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report.files import amount, plain_report, verdict, write_report
 from nnode.discover.report.page import draw
 from nnode.model import build_model
@@ -33,7 +33,7 @@ from tests.pages.test_replay import unpacked
 class Run:
     """A diagnosis and what was written of it."""
 
-    found: Found
+    found: DiagnosisOutcome
     sequences: list[Sequence]
     folder: Path
 

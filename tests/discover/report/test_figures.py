@@ -10,7 +10,7 @@ from nnode.data.sequence import Sequence
 from nnode.discover.report.deviation import Deviation
 from nnode.discover.report.figures import paths
 from nnode.discover.report.figures.maps import neighbour_maps, plane_maps, time_space_maps
-from nnode.discover.report.figures.marks import AFTER, BEFORE, sealed_costs
+from nnode.discover.report.figures.marks import AFTER, BEFORE, confirmation_costs
 from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
 from nnode.pages.replay import Scene
 
@@ -51,7 +51,7 @@ def test_maps_of_arrows_need_no_data_everywhere() -> None:
 
 
 def test_sealed_costs_are_paired_in_the_order_of_before() -> None:
-    figure = sealed_costs(["a", "b", "c"], [1.0, 4.0, 2.0], [0.5, 1.0, 2.5], 0.1)
+    figure = confirmation_costs(["a", "b", "c"], [1.0, 4.0, 2.0], [0.5, 1.0, 2.5], 0.1)
     ax = figure.axes[0]
     lines = {line.get_marker(): np.asarray(line.get_ydata()) for line in ax.lines}
     assert list(lines[BEFORE["marker"]]) == [4.0, 2.0, 1.0]

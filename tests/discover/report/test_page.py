@@ -14,11 +14,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nnode.data.quality import Fault
 from nnode.data.sequence import Sequence
 from nnode.discover.inputs import Inputs
-from nnode.discover.judge.sealed import defined
+from nnode.discover.judge.confirmation import defined
 from nnode.discover.report.captions import Figures
 from nnode.discover.report.files import verdict
 from nnode.discover.report.page import draw, page_blocks
-from nnode.discover.report.replay import telling, zones
+from nnode.discover.report.replay import by_improvement, zones
 from nnode.discover.result import Coefficient, Confirmation, DataFault
 from nnode.model import build_model
 from nnode.model.build import add_effects
@@ -202,17 +202,17 @@ def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> No
 
 def test_the_telling_sequence_is_where_most_was_gained(traffic: Case) -> None:
     found = deepcopy(traffic.found)
-    names = [traffic.inputs.sequences[i].name for i in found.sealed]
+    names = [traffic.inputs.sequences[i].name for i in found.confirmation]
     rows = [
         {"name": names[0], "before": 5.0, "after": 4.5},
         {"name": names[1], "before": 4.0, "after": 1.0},
     ]
     found.diagnosis = replace(found.diagnosis, sealed=rows)
-    assert telling(found) == [1, 0]
+    assert by_improvement(found) == [1, 0]
     found.diagnosis = replace(found.diagnosis, effects=[])
-    assert telling(found) == [0, 1]
+    assert by_improvement(found) == [0, 1]
     rows[0]["before"] = float("inf")  # a simulation that blew up is not shown
-    assert telling(found) == [1]
+    assert by_improvement(found) == [1]
 
 
 def test_the_named_place_is_shaded_and_else_where_they_part(traffic: Case) -> None:

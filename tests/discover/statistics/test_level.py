@@ -11,7 +11,7 @@ from scipy import stats
 
 from nnode.data.clusters import clusters, index_of
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.name.search import settled
+from nnode.discover.name.search import converged_fit
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.score import Screen, Trace, traces
 from nnode.model import System
@@ -37,7 +37,7 @@ def test_clusters_keep_the_level_where_windows_do_not() -> None:
         label = clusters(index_of(sequences))
         assert (len(sequences), label.max() + 1) == (80, 8)
         engine = TrafficEngine(sequences, clusters=label)
-        fit = settled(engine, model(), rounds=1)
+        fit = converged_fit(engine, model(), rounds=1)
         looked = traces(engine, fit, Truck)
         for name, own in (("clusters", engine.cluster), ("windows", engine.sequence)):
             (score,) = Screen(fit, own, seed).scores(looked)

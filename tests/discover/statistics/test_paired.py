@@ -8,7 +8,7 @@ from scipy import stats
 
 from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.fit import Fit
-from nnode.discover.statistics.paired import clusters_to_tell, compare, heldout, outdone
+from nnode.discover.statistics.paired import clusters_to_tell, compare, heldout, j_test
 from nnode.model.system import System
 
 
@@ -72,8 +72,8 @@ def test_a_wrong_rival_is_outdone_and_a_true_one_is_not() -> None:
     rejected: dict[str, list[bool]] = {"true": [], "wrong": [], "costs": []}
     for _ in range(400):
         one, other = rivals(rng, true=1)
-        rejected["wrong"].append(outdone(one, other, cluster).p_value <= 0.05)
-        rejected["true"].append(outdone(other, one, cluster).p_value <= 0.05)
+        rejected["wrong"].append(j_test(one, other, cluster).p_value <= 0.05)
+        rejected["true"].append(j_test(other, one, cluster).p_value <= 0.05)
         costs = compare(heldout(one, cluster), heldout(other, cluster))
         rejected["costs"].append(costs.p_value <= 0.05)
     share = {name: float(np.mean(one)) for name, one in rejected.items()}

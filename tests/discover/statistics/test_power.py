@@ -8,8 +8,8 @@ import pytest
 from nnode.data.clusters import better
 from nnode.discover.residuals.fit import Fit, sums
 from nnode.discover.rules import Rules
-from nnode.discover.statistics.paired import gains, heldout, leaning, there
-from nnode.discover.statistics.power import RUNS, Way
+from nnode.discover.statistics.paired import gains, heldout, presence_pvalue, score_toward
+from nnode.discover.statistics.power import RUNS, PowerSimulation
 from nnode.discover.statistics.score import Score, Screen, Trace
 from nnode.model import System
 from nnode.model.effects import Probe
@@ -55,7 +55,12 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
     wider = fitted(columns, fit.residual - fit.jacobian @ fit.row)
     nearer = heldout(fit, LABEL).sum() > heldout(wider, LABEL).sum()
     low, high = wider.intervals(LABEL)[1]
-    if score.p_value > ALPHA or not nearer or there(fit, wider, LABEL) >= LEVEL or low <= 0 <= high:
+    if (
+        score.p_value > ALPHA
+        or not nearer
+        or presence_pvalue(fit, wider, LABEL) >= LEVEL
+        or low <= 0 <= high
+    ):
         return False
     # sealed clusters are like the open ones
     picked = ROWS[rng.integers(0, OPEN, sealed)].ravel()
@@ -64,7 +69,7 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
     before = seen + columns[picked, 0] * fit.row[0]
     after = seen + columns[picked] @ wider.row
     likelier = gains(sums(before**2, label), sums(after**2, label)).mean() > 0
-    return bool(likelier) and better(leaning(before, after, label)) <= LEVEL
+    return bool(likelier) and better(score_toward(before, after, label)) <= LEVEL
 
 
 @pytest.mark.parametrize(("size", "sealed"), [(0.25, 5), (0.25, 16)])
@@ -75,7 +80,7 @@ def test_power_is_how_often_the_whole_search_names(size: float, sealed: int) -> 
     powers = []
     for seed in range(40):
         _, screen, score = scored(drawn(rng, LABEL), seed)
-        way = Way(screen, ALPHA, sealed)
+        way = PowerSimulation(screen, ALPHA, sealed)
         powers.append(way.power(score, score.evidence[0], size, seed))
     error = np.sqrt(often * (1 - often) / RUNS + np.var(powers, ddof=1) / len(powers))
     assert 0.05 < often < 0.95
@@ -84,7 +89,7 @@ def test_power_is_how_often_the_whole_search_names(size: float, sealed: int) -> 
 
 def test_four_sealed_clusters_leave_no_power() -> None:
     _, screen, score = scored(drawn(np.random.default_rng(2), LABEL))
-    one, many = (Way(screen, ALPHA, sealed) for sealed in (4, 5))
+    one, many = (PowerSimulation(screen, ALPHA, sealed) for sealed in (4, 5))
     assert one.power(score, score.evidence[0], 3.0) == 0.0
     assert one.detectable(score, score.evidence[0], 1.0) == np.inf
     assert many.power(score, score.evidence[0], 3.0) == 1.0
@@ -92,6 +97,6 @@ def test_four_sealed_clusters_leave_no_power() -> None:
 
 def test_the_detectable_size_is_found_with_the_power_that_is_asked_for() -> None:
     _, screen, score = scored(drawn(np.random.default_rng(3), LABEL))
-    way = Way(screen, ALPHA, 8)
+    way = PowerSimulation(screen, ALPHA, 8)
     size = way.detectable(score, score.evidence[0], 0.3)
     assert way.power(score, score.evidence[0], size, seed=5) == pytest.approx(0.8, abs=0.08)

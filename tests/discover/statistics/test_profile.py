@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.name.search import settled
+from nnode.discover.name.search import converged_fit
 from nnode.discover.residuals.fit import Fit, refine
-from nnode.discover.statistics.profile import Profile, intervals, moved, profiles
+from nnode.discover.statistics.profile import Profile, intervals, profiles, refined_edges
 from nnode.model.build import add_effects, build_model
 from tests.discover.platoons import LENGTH, V0, platoons
 
@@ -29,7 +29,7 @@ def fitted(engine: TrafficEngine, a: float, b: float) -> Fit:
     options = {"leader": "measured", "v0": V0, "L": LENGTH, "L_min": 1.0}
     system = build_model({"term": "lin", "name": "lin", **options})
     add_effects(system, [{"name": "speed_period", "alpha": 0.95, "a": a, "b": b}])
-    return settled(engine, system)
+    return converged_fit(engine, system)
 
 
 def test_an_edge_may_lie_anywhere_between_two_sequences(engine: TrafficEngine) -> None:
@@ -54,7 +54,7 @@ def test_an_edge_within_a_sequence_is_known_better(engine: TrafficEngine) -> Non
 
 def test_an_edge_leaves_a_wrong_place(engine: TrafficEngine) -> None:
     wrong = fitted(engine, 307.0, 560.0)
-    found = moved(engine, wrong, "speed_period")
+    found = refined_edges(engine, wrong, "speed_period")
     assert found.cost < wrong.cost
     names = [name.rsplit(".", 1)[1] for name in found.names]
     row = dict(zip(names, found.row, strict=True))
@@ -72,6 +72,6 @@ def test_the_ends_are_where_the_cost_has_risen() -> None:
 
 def test_a_fit_in_the_best_place_stays(engine: TrafficEngine) -> None:
     fit = fitted(engine, 250.0, 450.0)
-    assert moved(engine, fit, "speed_period").cost <= fit.cost
+    assert refined_edges(engine, fit, "speed_period").cost <= fit.cost
     again = refine(engine, copy.deepcopy(fit.system))
     assert again.cost == pytest.approx(fit.cost, rel=1e-3)

@@ -11,11 +11,15 @@ from scipy import stats
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import better, clusters, index_of
 from nnode.data.sequence import Sequence
-from nnode.discover.judge.held_out import MODELS, Later, later
+from nnode.discover.judge.held_out import MODELS, HeldOutErrors, held_out_errors
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.name.search import settled
+from nnode.discover.name.search import converged_fit
 from nnode.discover.residuals.fit import Fit
-from nnode.discover.statistics.random_effects import Individuals, individuals, numbers
+from nnode.discover.statistics.random_effects import (
+    IndividualEstimate,
+    agent_parameters,
+    estimate_individual,
+)
 from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.extend import extended
 from tests.discover.lanes.test_engine import model
@@ -31,11 +35,11 @@ def paced(own: np.ndarray) -> list[Sequence]:
     return made
 
 
-def who_differs(sequences: list[Sequence]) -> tuple[TrafficEngine, Fit, Individuals]:
+def who_differs(sequences: list[Sequence]) -> tuple[TrafficEngine, Fit, IndividualEstimate]:
     """What is found of different drivers."""
     engine = TrafficEngine(sequences, clusters=clusters(index_of(sequences)))
-    fit = settled(engine, model(), rounds=1)
-    found = individuals(engine, fit, DriverHeterogeneity)
+    fit = converged_fit(engine, model(), rounds=1)
+    found = estimate_individual(engine, fit, DriverHeterogeneity)
     assert found is not None
     return engine, fit, found
 
@@ -46,11 +50,11 @@ def test_drivers_who_differ_are_recognised() -> None:
     assert found.p_value < 0.01
     low, high = found.interval()
     assert 0.04 < low < 0.1 < high
-    own = numbers(engine, fit.system, found)
+    own = agent_parameters(engine, fit.system, found)
     got = np.array([own[f"r/{s}"][:4] for s in range(12)])
     assert np.corrcoef(got.ravel(), pace.ravel())[0, 1] > 0.95
     # one number for all of a sequence is the mean of theirs
-    shared = numbers(engine, fit.system, found, common=True)
+    shared = agent_parameters(engine, fit.system, found, common=True)
     assert all(len(set(shared[f"r/{s}"][:4])) == 1 for s in range(12))
 
 
@@ -91,7 +95,7 @@ def test_a_mood_is_no_number_of_one_s_own() -> None:
     for seed in range(CASES):
         *_, found = who_differs(streams(seconds=60.0, mood=0.3, lasts=6.0, seed=seed))
         alarms += found.p_value <= 0.05
-        assert found.mood[0] > max(found.variance, 0.0)
+        assert found.transient[0] > max(found.variance, 0.0)
         assert (found.share["mood"] or 0.0) > 0.5
     assert alarms <= stats.binom.ppf(0.975, CASES, 0.05)
 
@@ -113,14 +117,14 @@ def test_true_paces_are_found_among_moods() -> None:
 # -- held out --------------------------------------------------------------------------------
 
 
-def held_out(pace: float, variance: float | None = None) -> tuple[Later, list[Sequence]]:
+def held_out(pace: float, variance: float | None = None) -> tuple[HeldOutErrors, list[Sequence]]:
     """Half of the streams are open, the others are divided in time; ``variance`` is taken in
     place of the one that was found."""
     sequences = streams(number=16, window=40.0, pace=pace, mood=0.3, lasts=3.0, seed=3)
     _, fit, one = who_differs(sequences[:8])
     if variance is not None:
         one = replace(one, variance=variance)
-    found = later("traffic", model(), fit.system, one, sequences[8:], np.arange(8))
+    found = held_out_errors("traffic", model(), fit.system, one, sequences[8:], np.arange(8))
     assert found is not None
     return found, sequences[8:]
 
@@ -130,7 +134,7 @@ def test_numbers_of_the_first_part_predict_the_last() -> None:
     plain, own, shared = (found.costs[name].mean() for name in MODELS)
     assert own < 0.6 * plain
     assert own < 0.7 * shared
-    assert max(better(found.leaning[name]) for name in (MODELS[0], MODELS[2])) <= 0.05
+    assert max(better(found.score_toward[name]) for name in (MODELS[0], MODELS[2])) <= 0.05
     # near the noise and the moods that nobody can know; by far nearer than without any law
     assert found.floor < own < 0.1 * found.costs["constant velocity"].mean()
 
@@ -138,7 +142,7 @@ def test_numbers_of_the_first_part_predict_the_last() -> None:
 def test_moods_of_the_first_part_predict_nothing() -> None:
     found, _ = held_out(0.0, variance=0.05**2)
     assert found.costs[MODELS[1]].mean() > 0.9 * found.costs[MODELS[0]].mean()
-    assert better(found.leaning[MODELS[0]]) > 0.05
+    assert better(found.score_toward[MODELS[0]]) > 0.05
 
 
 def test_who_knows_no_law_gets_the_same_first_part() -> None:

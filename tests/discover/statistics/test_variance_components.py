@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nnode.discover.statistics.variance_components import Curve, Seen, shares
+from nnode.discover.statistics.variance_components import Curve, PeriodEstimates, shares
 
 SEQUENCES, AGENTS, PARTS, STEP, LASTS, NOISE = 10, 6, 12, 2.0, 4.0, 0.02
 #: Standard deviations of what belongs to recordings, sequences, agents, and moods of 4 s.
 Components = tuple[float, float, float, float]
 
 
-def seen(sd: Components, seed: int, recordings: int = 8) -> Seen:
+def seen(sd: Components, seed: int, recordings: int = 8) -> PeriodEstimates:
     """Numbers of agents in twelve parts of their time."""
     rng = np.random.default_rng(seed)
     number = recordings * SEQUENCES * AGENTS
@@ -26,7 +26,7 @@ def seen(sd: Components, seed: int, recordings: int = 8) -> Seen:
     value = NOISE * rng.normal(size=len(agent)) + sd[3] * np.stack(mood, 1).ravel()
     for size, label in zip(sd, (recording, sequence, agent), strict=False):
         value += size * rng.normal(size=int(label.max()) + 1)[label]
-    return Seen(
+    return PeriodEstimates(
         agent=agent,
         sequence=sequence,
         cluster=sequence,
@@ -37,7 +37,7 @@ def seen(sd: Components, seed: int, recordings: int = 8) -> Seen:
     )
 
 
-def shared_out(one: Seen) -> dict[str, float | None]:
+def shared_out(one: PeriodEstimates) -> dict[str, float | None]:
     curve = Curve.of(one)
     assert curve is not None
     own, mood, _ = curve.fitted(curve.same, curve.between)
@@ -90,4 +90,4 @@ def test_two_lags_tell_no_fall_from_a_constant() -> None:
     one = seen((0.0, 0.0, 0.05, 0.0), 0)
     early = one.time % 1000 <= 2 * STEP
     parts = {name: value[early] for name, value in vars(one).items()}
-    assert Curve.of(Seen(**parts)) is None
+    assert Curve.of(PeriodEstimates(**parts)) is None

@@ -1,1 +1,1 @@
-"""Figures of a diagnosis: where a model parts from measurement, before and after."""
+"""Figures of a diagnosis: deviations of the model from the data, before and after."""

@@ -1,4 +1,4 @@
-"""Residual maps: where measurement and simulation part, before and after effects were added."""
+"""Residual maps: deviations of the model from the data, before and after effects were added."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from nnode.discover.report.deviation import Deviation
 from nnode.plots.style import DIVERGING, FONT, GREY, SEQUENTIAL, SMALL_FONT, dress, new_figure
 
-#: Fewest and most cells along a side of a coloured map: about PER_CELL values make up one.
+#: Smallest and largest number of cells along a side of a coloured map, with about PER_CELL values
+#: in each.
 CELLS, PER_CELL = (12, 48), 3
 #: A mean of fewer values is not shown in maps of arrows.
 LEAST = 3
@@ -41,14 +42,14 @@ def time_space_maps(maps: Mapping[str, Deviation]) -> Figure:
 def approach_maps(maps: Mapping[str, Deviation]) -> Figure:
     """Measured minus simulated speed by the gap and by how fast the vehicle ahead draws away."""
     first = next(iter(maps.values()))
-    # few extreme values would leave the bulk a few cells
+    # extreme values would leave few cells for most of the data
     cells = min(_number(first), 24)
     edges = tuple(
         _edges(np.clip(c, *np.nanpercentile(c, [1, 99])) if np.isfinite(c).any() else c, cells)
-        for c in first.beside.T
+        for c in first.neighbour.T
     )
     return _coloured(
-        {name: (*d.beside.T, d.value[:, 0]) for name, d in maps.items()},
+        {name: (*d.neighbour.T, d.value[:, 0]) for name, d in maps.items()},
         (edges[0], edges[1]),
         ("gap (m)", "speed of the vehicle ahead minus own (m/s)"),
     )
@@ -68,8 +69,8 @@ def plane_maps(maps: Mapping[str, Deviation], walls: np.ndarray | None) -> Figur
 
 def neighbour_maps(maps: Mapping[str, Deviation]) -> Figure:
     """Mean deviation of acceleration by where the nearest person is, seen in one's own way."""
-    near = {name: np.abs(d.beside).max(1, initial=0) <= 3 for name, d in maps.items()}
-    panels = {name: (d.beside[near[name]], d.own[near[name]]) for name, d in maps.items()}
+    near = {name: np.abs(d.neighbour).max(1, initial=0) <= 3 for name, d in maps.items()}
+    panels = {name: (d.neighbour[near[name]], d.own_frame[near[name]]) for name, d in maps.items()}
     places = next(iter(panels.values()))[0]
     labels = ("nearest person ahead (m)", "nearest person on the left (m)")
     return _arrows(panels, places, labels, person=True)

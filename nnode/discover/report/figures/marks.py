@@ -1,4 +1,4 @@
-"""What a diagnosis found, as marks: curves by variable, intervals, costs by sequence."""
+"""Figures of results: curves by variable, intervals of coefficients, costs by sequence."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nnode.model.effects import CATALOGUE
 from nnode.plots.style import GREY, OKABE_ITO, SMALL_FONT, dress, new_figure
 
 COLUMNS = 3
-#: Sequences that are named one by one.
+#: Largest number of sequences with labels.
 NAMED = 24
 
 #: Colour and marker of the model before and after, the same in all figures.
@@ -63,7 +63,7 @@ def place_curves(places: Sequence[Place], unit: str) -> Figure:
 
 
 def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
-    """Coefficients with their 95 % intervals, each on a scale of its own.
+    """Coefficients with their 95 % intervals, each on a separate scale.
 
     A dotted line stands at the value without the effect, where it has one.
     """
@@ -71,8 +71,12 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
     figure = new_figure(6.4, 0.75 * len(rows) + 0.35)
     axes = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
     for ax, (effect, name, c) in zip(axes, rows, strict=True):
-        known = CATALOGUE.effects.get(effect.name)
-        neutral = known.strengths[name].neutral if known and name in known.strengths else None
+        catalogued = CATALOGUE.effects.get(effect.name)
+        neutral = (
+            catalogued.strengths[name].neutral
+            if catalogued and name in catalogued.strengths
+            else None
+        )
         if neutral is not None:
             ax.axvline(neutral, color=GREY, linestyle=":", linewidth=1.4)
         ends = np.array([[c.value - c.low], [c.high - c.value]])
@@ -97,17 +101,19 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
     return figure
 
 
-def sealed_costs(
+def confirmation_costs(
     names: Sequence[str], before: Sequence[float], after: Sequence[float] | None, floor: float
 ) -> Figure:
-    """Mean square error of every sealed sequence, before and after, m².
+    """Mean square error of every confirmation sequence, before and after, m².
 
     Args:
         after: None where no effect was added.
         floor: of the measurement's noise, m².
     """
     order = np.argsort(before)[::-1]
-    b, a = (np.asarray(one, float)[order] for one in (before, before if after is None else after))
+    b, a = (
+        np.asarray(costs, float)[order] for costs in (before, before if after is None else after)
+    )
     place = np.arange(len(order))
     figure = new_figure(7.2, 3.2)
     ax = figure.subplots()
@@ -137,7 +143,7 @@ def sealed_costs(
 
 
 def flexible_curve(structure: Structure, unit: str) -> Figure:
-    """What a flexible fit makes of the first variable that is left."""
+    """The nonparametric fit of unexplained structure over its first variable."""
     figure = new_figure(4.8, 3.0)
     ax: Axes = figure.subplots()
     ax.axhline(0, color=GREY, linewidth=0.8)

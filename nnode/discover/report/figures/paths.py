@@ -70,15 +70,15 @@ def _lines(s: Sequence, simulated: list[Simulated]) -> Figure:
     axes = figure.subplots(
         2, len(simulated), sharex=True, sharey="row", squeeze=False, height_ratios=[1.6, 1]
     )
-    for (top, below), one in zip(axes.T, simulated, strict=True):
-        colour = one.style["color"]
+    for (top, lower), simulation in zip(axes.T, simulated, strict=True):
+        colour = simulation.style["color"]
         top.plot(s.time, s.x[..., 0], color=GREY, linewidth=2.2, alpha=0.55)
-        top.plot(s.time, one.x[..., 0], color=colour, linewidth=0.9)
-        below.axhline(0, color=GREY, linewidth=0.8)
-        below.plot(s.time, (one.x - s.x)[..., 0], color=colour, linewidth=0.9)
-        dress(top, y="position (m)", title=one.heading)
-        dress(below, x="clock time (s)", y="simulated −\nmeasured (m)")
-        for ax in (top, below):
+        top.plot(s.time, simulation.x[..., 0], color=colour, linewidth=0.9)
+        lower.axhline(0, color=GREY, linewidth=0.8)
+        lower.plot(s.time, (simulation.x - s.x)[..., 0], color=colour, linewidth=0.9)
+        dress(top, y="position (m)", title=simulation.heading)
+        dress(lower, x="clock time (s)", y="simulated −\nmeasured (m)")
+        for ax in (top, lower):
             ax.label_outer()
     figure.legend(handles=_handles(simulated, True), **_LEGEND)
     return figure
@@ -87,20 +87,20 @@ def _lines(s: Sequence, simulated: list[Simulated]) -> Figure:
 def _paths(s: Sequence, simulated: list[Simulated]) -> Figure:
     low, high = _view(s)
     figure, axes = _planes(low, high, len(simulated))
-    for ax, one in zip(axes, simulated, strict=True):
-        colour = one.style["color"]
+    for ax, simulation in zip(axes, simulated, strict=True):
+        colour = simulation.style["color"]
         draw_walls(ax, s.walls)
         ax.plot(s.x[..., 0], s.x[..., 1], color=GREY, linewidth=2.2, alpha=0.55)
-        starts = range(0, s.n_samples, one.restart or s.n_samples)
-        for first in starts:
-            part = slice(first, first + (one.restart or s.n_samples))
-            ax.plot(*one.x[part].transpose(2, 0, 1), color=colour, linewidth=0.9)
-            ends = np.stack([s.x[part][-1], one.x[part][-1]], 1)
+        starts = range(0, s.n_samples, simulation.restart or s.n_samples)
+        for start in starts:
+            part = slice(start, start + (simulation.restart or s.n_samples))
+            ax.plot(*simulation.x[part].transpose(2, 0, 1), color=colour, linewidth=0.9)
+            ends = np.stack([s.x[part][-1], simulation.x[part][-1]], 1)
             ax.add_collection(LineCollection(list(ends), colors="black", linewidths=0.7))
         ax.plot(*s.x[-1].T, linestyle="", markersize=4, **_MEASURED)
-        ax.plot(*one.x[-1].T, linestyle="", markersize=4, **one.style)
+        ax.plot(*simulation.x[-1].T, linestyle="", markersize=4, **simulation.style)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        dress(ax, x="x (m)", y="y (m)", title=one.heading)
+        dress(ax, x="x (m)", y="y (m)", title=simulation.heading)
         ax.label_outer()
     figure.legend(handles=_handles(simulated, True), **_LEGEND)
     return figure
@@ -119,17 +119,20 @@ def _handles(simulated: list[Simulated], lines: bool) -> list[Line2D]:
     measured: dict[str, Any] = {"linewidth": 2.2, "alpha": 0.55} if lines else {"fillstyle": "none"}
     return [
         Line2D([], [], label="measured", **{**_MEASURED, **style, **measured}),
-        *(Line2D([], [], label=one.title, **{**one.style, **style}) for one in simulated),
+        *(
+            Line2D([], [], label=simulation.title, **{**simulation.style, **style})
+            for simulation in simulated
+        ),
     ]
 
 
 def _view(s: Sequence) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of what a plane shows: where people walk, and walls not far from there."""
+    """Corners of the view: where people walk, and nearby walls."""
     low, high = s.x.min((0, 1)) - 0.5, s.x.max((0, 1)) + 0.5
     if s.walls is not None and len(s.walls):
         ends = s.walls.reshape(-1, 2)
         near = ((ends > low - 1.5) & (ends < high + 1.5)).all(1)
-        # a long wall beside the way has its ends far off, but its place across is near
+        # a long wall along the path has distant ends, but a small distance across
         for axis in (0, 1):
             flat = np.abs(s.walls[:, axis] - s.walls[:, axis + 2]) < 1e-9
             at = s.walls[flat, axis]
@@ -156,27 +159,27 @@ def _planes(
     return figure, list(grid.ravel())
 
 
-def _moment(ax: Axes, s: Sequence, one: Simulated, k: int) -> None:
+def _moment(ax: Axes, s: Sequence, simulation: Simulated, k: int) -> None:
     """Measured and simulated agents at sample k, joined by lines."""
     if s.x.shape[2] == 1:
-        # cars are shown from a car that drives along in their midst, the scale that of all moments
+        # cars are shown relative to their mean position, with one scale for all moments
         frame = s.x.mean((1, 2))
-        half = max(np.nanmax(np.abs(x[..., 0] - frame[:, None])) for x in (s.x, one.x))
+        half = max(np.nanmax(np.abs(x[..., 0] - frame[:, None])) for x in (s.x, simulation.x))
         ax.set(xlim=(-1.06 * half, 1.06 * half), ylim=(-0.6, 1.6))
         ax.set_yticks([0, 1], ["simulated", "measured"])
         real, model = (
             np.stack([x[k, :, 0] - frame[k], np.full(x.shape[1], y)], 1)
-            for x, y in ((s.x, 1.0), (one.x, 0.0))
+            for x, y in ((s.x, 1.0), (simulation.x, 0.0))
         )
     else:
         low, high = _view(s)
         draw_walls(ax, s.walls)
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        real, model = s.x[k], one.x[k]
+        real, model = s.x[k], simulation.x[k]
     joined = list(np.stack([real, model], 1))
     ax.add_collection(LineCollection(joined, colors="black", linewidths=0.7))
     ax.plot(*real.T, linestyle="", markersize=5.5, fillstyle="none", **_MEASURED)
-    ax.plot(*model.T, linestyle="", markersize=5, alpha=0.85, **one.style)
+    ax.plot(*model.T, linestyle="", markersize=5, alpha=0.85, **simulation.style)
 
 
 def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
@@ -191,12 +194,12 @@ def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
     figure = new_figure(width * len(simulated) + 0.6, (width * ratio + 0.2) * len(moments) + 0.8)
     axes = figure.subplots(len(moments), len(simulated), sharex=True, sharey="col", squeeze=False)
     for row, k in zip(axes, moments, strict=True):
-        for i, (ax, one) in enumerate(zip(row, simulated, strict=True)):
-            _moment(ax, s, one, int(k))
+        for i, (ax, simulation) in enumerate(zip(row, simulated, strict=True)):
+            _moment(ax, s, simulation, int(k))
             last, seconds = k == moments[-1], s.time[k] - s.time[0]
             across = f"{seconds:.1f} s" if traffic else f"{seconds:.1f} s: y (m)"
             along = "position seen from the platoon's middle (m)" if traffic else "x (m)"
-            title = one.title if k == moments[0] else ""
+            title = simulation.title if k == moments[0] else ""
             dress(ax, x=along if last else "", y=across if i == 0 else "", title=title)
             if i:
                 ax.tick_params(labelleft=False)

@@ -1,4 +1,4 @@
-"""What the engines cannot diagnose, refused before any work begins."""
+"""Checks whether the engines can diagnose a model and test an effect, before any work begins."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nnode.model.terms import SMALLEST
 
 
 def check_effect(effect: type[Effect]) -> None:
-    """Refuse an effect that the engine of its domain cannot look for.
+    """Refuse an effect that the engine of its domain cannot test.
 
     Raises:
         ConfigError: names it and what to do.
@@ -31,7 +31,7 @@ def check_effect(effect: type[Effect]) -> None:
 
 
 def not_offered(effect: type[Effect], system: System, differ: bool = False) -> str:
-    """Why an effect cannot act on a model; empty: it can.
+    """Why an effect is not tested in a model; empty: it is.
 
     Args:
         differ: see :func:`~nnode.population.followers.drivers_differ`.
@@ -69,17 +69,17 @@ def check_model(system: System) -> None:
             "evaluated, but not diagnosed; take another law, such as model=sf"
         )
     lane = system.formula if isinstance(system, Traffic) else None
-    added = [] if lane is None else list(lane.rates.values())[lane.order :]
-    if "dt" in symbols(added):
+    added_rates = [] if lane is None else list(lane.rates.values())[lane.order :]
+    if "dt" in symbols(added_rates):
         raise ConfigError(
             "the model remembers something step by step, and the diagnosis of lanes takes other "
             "steps; it can be trained and evaluated, but not diagnosed"
         )
     names = [effect.name for effect in effects_of(system)]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
         raise ConfigError(
-            f"the model has the effect {', '.join(twice)} twice, and a diagnosis tells effects "
+            f"the model has the effect {', '.join(repeated)} twice, and a diagnosis tells effects "
             "by their names; leave one out"
         )
     if not any(p.requires_grad and p.numel() for p in system.parameters()):

@@ -29,7 +29,7 @@ KAPPA = 0.4
 def turned() -> list[Sequence]:
     """Platoons whose sealed ones react the other way round."""
     forth, back = (platoons(relative_speed(s * KAPPA), **MANY) for s in (1, -1))
-    sealed = divide(forth, OPTIONS).sealed
+    sealed = divide(forth, OPTIONS).confirmation
     return [back[i] if i in sealed else one for i, one in enumerate(forth)]
 
 
@@ -114,7 +114,10 @@ def test_with_too_few_clusters_nothing_is_named_and_it_says_how_many_would_do() 
     for number, do in ((d.clusters.enough, True), (d.clusters.enough - 3, False)):
         parts = divide(platoons(number=number, seconds=1.0), DiscoverOptions())
         least = d.clusters.least, d.clusters.least_sealed
-        enough = parts.number(parts.open) >= least[0] and parts.number(parts.sealed) >= least[1]
+        enough = (
+            parts.number(parts.exploration) >= least[0]
+            and parts.number(parts.confirmation) >= least[1]
+        )
         assert enough == do
     # what one would look at first is told all the same
     assert d.screen.leads[0]["name"] in ("relative_speed", "asymmetric_response")

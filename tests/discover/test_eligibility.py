@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.discover.able import check_effect, check_model
 from nnode.discover.crowds.engine import CrowdEngine
+from nnode.discover.eligibility import check_effect, check_model
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.name.search import settled
+from nnode.discover.name.search import converged_fit
 from nnode.discover.options import DiscoverOptions, check_options
 from nnode.discover.residuals.fit import evaluated
-from nnode.discover.statistics.random_effects import individuals
+from nnode.discover.statistics.random_effects import estimate_individual
 from nnode.discover.statistics.score import traces
 from nnode.errors import ConfigError
 from nnode.model import Crowd, System, Traffic, make_law
@@ -127,14 +127,14 @@ def crowd(*more: Term) -> Crowd:
 @pytest.fixture(scope="module")
 def platoon_engine() -> TrafficEngine:
     engine = TrafficEngine(platoons(number=4, driver=0.2))
-    engine.settle(lane(), ParameterVector(lane()).row)
+    engine.fit_whitening(lane(), ParameterVector(lane()).row)
     return engine
 
 
 @pytest.fixture(scope="module")
 def crowd_engine() -> CrowdEngine:
     engine = CrowdEngine(walkers.crowd(sequences=3))
-    engine.settle(crowd(), ParameterVector(crowd()).row)
+    engine.fit_whitening(crowd(), ParameterVector(crowd()).row)
     return engine
 
 
@@ -202,11 +202,11 @@ def test_a_crowd_looks_for_an_effect_without_strengths(crowd_engine: CrowdEngine
 
 def test_a_law_of_another_kind_is_diagnosed_in_a_lane() -> None:
     engine = TrafficEngine(platoons(number=4, driver=0.2))
-    fit = settled(engine, Traffic([Optimal()], leader="measured"), rounds=1)
+    fit = converged_fit(engine, Traffic([Optimal()], leader="measured"), rounds=1)
     found = []
     for effect in CATALOGUE.of("traffic"):
         if issubclass(effect, IndividualEffect):
-            found.append(individuals(engine, fit, effect) is not None)
+            found.append(estimate_individual(engine, fit, effect) is not None)
         else:
             found.append(bool(traces(engine, fit, effect)))
     looked_for = [e.name for e, there in zip(CATALOGUE.of("traffic"), found, strict=True) if there]
