@@ -16,19 +16,14 @@ import pandas as pd
 
 from nnode.app.check import check_file
 from nnode.data.identity import identify
-from nnode.data.options import (
-    DataOptions,
-    HighDOptions,
-    NgsimOptions,
-    OpenAccOptions,
-    SumoOptions,
-    WalkwayOptions,
-)
-from nnode.data.policy import drop_absent
+from nnode.data.options import DataOptions
 from nnode.data.prepare import FORMATS
-from nnode.data.quality import find_faults
-from nnode.data.readers.highd import RECORDING_META, TRACKS, TRACKS_META
-from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE
+from nnode.data.quality import drop_absent, find_faults
+from nnode.data.readers.highd import RECORDING_META, TRACKS, TRACKS_META, HighDOptions
+from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, WalkwayOptions
+from nnode.data.readers.ngsim import NgsimOptions
+from nnode.data.readers.openacc import OpenAccOptions
+from nnode.data.readers.sumo import SumoOptions
 from nnode.data.sequence import Domain
 from nnode.data.sequences import Sequences
 

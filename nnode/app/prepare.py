@@ -10,8 +10,8 @@ from nnode.app.cli.recognised import with_recognised
 from nnode.data.clusters import clusters, relation
 from nnode.data.dataset import noise_of
 from nnode.data.options import DataOptions
-from nnode.data.policy import told_filled
 from nnode.data.prepare import prepare
+from nnode.data.quality import interpolated_text
 from nnode.plots.quality import plot_faults
 
 
@@ -32,7 +32,7 @@ def prepare_data(config: DictConfig, folder: Path) -> None:
         listed = ", ".join(f"{kind} in {number}" for kind, number in sorted(reasons.items()))
         print(f"faults: {listed} sequences; pictures in {folder / 'faults'}")
     if store.manifest["filled"]:
-        print(told_filled(store.manifest["filled"]))
+        print(interpolated_text(store.manifest["filled"]))
     print(noise_of(store))
     gap = options.split.gap
     number = int(clusters(store.index, gap).max()) + 1

@@ -11,7 +11,7 @@ told apart by where the agents are:
 - Otherwise there is one clock, and an identifier that turns up again where its agent cannot have
   got to since is another agent's.
 
-Places are the same within the error that :mod:`nnode.data.quality` grants a single position;
+Places are the same within the error that :mod:`nnode.data.limits` grants a single position;
 windows of one recording repeat the same rows and do not need it. Most agents, not all, because a
 single one at another place is what a fault of the measurement looks like.
 """
@@ -26,8 +26,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from nnode.data.limits import LIMITS
 from nnode.data.options import Agents
-from nnode.data.quality import LIMITS
 from nnode.data.sequence import Domain, Sequence
 
 #: Sampling times are counted up to this number: it is exact, and adding to it as well.
@@ -293,7 +293,7 @@ def reachable(
     """Whether an agent at ``start`` can be at ``end`` (..., D; m) ``gap`` seconds later.
 
     No faster than the greatest possible speed, and a vehicle no further back than a path's reach
-    (see :class:`~nnode.data.quality.Limits`); what is not known is possible.
+    (see :class:`~nnode.data.limits.Limits`); what is not known is possible.
     """
     limits = LIMITS[domain]
     step = np.asarray(end - start)

@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,36 +21,37 @@ from omegaconf.errors import MissingMandatoryValue
 from nnode.data.cut import Reading
 from nnode.data.download import sha256
 from nnode.data.identity import identify
-from nnode.data.options import (
-    DataOptions,
-    EsimasOptions,
-    HighDOptions,
-    JuelichOptions,
-    NgsimOptions,
-    OpenAccOptions,
-    PairOptions,
-    Starts,
-    SumoOptions,
-    TableOptions,
-    VehicleTableOptions,
-    WalkwayOptions,
-    with_present_names,
+from nnode.data.options import DataOptions, Starts, with_present_names
+from nnode.data.quality import (
+    Fault,
+    apply_policy,
+    by_recording,
+    described,
+    drop_absent,
+    find_faults,
+    interpolated,
+    interpolated_text,
+    left_out_texts,
 )
-from nnode.data.policy import apply_policy, by_recording, drop_absent, told_filled, without
-from nnode.data.quality import Fault, find_faults
 from nnode.data.readers.columns import Table, quoted
-from nnode.data.readers.esimas import esimas_files, read_esimas
-from nnode.data.readers.highd import highd_files, read_highd
-from nnode.data.readers.juelich import juelich_files, read_juelich
-from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files
-from nnode.data.readers.ngsim import read_ngsim
-from nnode.data.readers.openacc import openacc_files, read_openacc
-from nnode.data.readers.pairs import pair_files, read_pairs
+from nnode.data.readers.esimas import EsimasOptions, esimas_files, read_esimas
+from nnode.data.readers.highd import HighDOptions, highd_files, read_highd
+from nnode.data.readers.juelich import JuelichOptions, juelich_files, read_juelich
+from nnode.data.readers.jupedsim import (
+    GEOMETRY,
+    PEOPLE,
+    WalkwayOptions,
+    read_walkway,
+    walkway_files,
+)
+from nnode.data.readers.ngsim import NgsimOptions, read_ngsim
+from nnode.data.readers.openacc import OpenAccOptions, openacc_files, read_openacc
+from nnode.data.readers.pairs import PairOptions, pair_files, read_pairs
 from nnode.data.readers.recordings import reading
-from nnode.data.readers.sumo import read_sumo, sumo_files
+from nnode.data.readers.sumo import SumoOptions, read_sumo, sumo_files
 from nnode.data.readers.table import TABLE as TIDY
-from nnode.data.readers.table import WALLS, read_table, table_files
-from nnode.data.readers.vehicles import read_vehicles, vehicle_files
+from nnode.data.readers.table import WALLS, TableOptions, read_table, table_files
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles, vehicle_files
 from nnode.data.sequence import Domain, Sequence, check_interval
 from nnode.data.smooth import measured_noise, start_smoothed
 from nnode.data.store import Store, write_store
@@ -216,7 +217,7 @@ def judge(
         if stages is not None:
             stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
-    for text in [*read.notes, *without(read, dropped, read.left_out)]:
+    for text in [*read.notes, *left_out_texts(len(read), dropped, read.left_out)]:
         log.warning("%s", text)
     # faults are told with the source's own identifiers, and of faulty sequences they are looked
     # at as well: through them one of those agents may go on
@@ -225,9 +226,8 @@ def judge(
     kept = [unique[s.name] for s in kept]
     if options.start_speeds is Starts.smoothed:
         kept = [start_smoothed(s) for s in kept]
-    filled = [{"sequence": s.name, "samples": s.filled} for s in kept if s.filled]
-    if filled:
-        log.info("%s", told_filled(filled))
+    if filled := interpolated(kept):
+        log.info("%s", interpolated_text(filled))
     if notes:
         more = f" (and {len(notes) - 1} more recordings)" if len(notes) > 1 else ""
         log.info("%s%s; data.agents decides by hand", notes[0], more)
@@ -247,7 +247,7 @@ def judge(
         "notes": read.notes,
         "filled": filled,
         "noise": noise.plain(),
-        "faults": [_account(fault, s) for s in sequences for fault in faults[s.name]],
+        "faults": [described(fault, s) for s in sequences for fault in faults[s.name]],
     }
     return Judged(domain, sequences, faults, kept, manifest)
 
@@ -338,12 +338,6 @@ def plain(options: DataOptions) -> dict[str, Any]:
     """Options as a dict that JSON can hold, as the manifest remembers them."""
     container = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
     return cast(dict[str, Any], json.loads(json.dumps(container)))
-
-
-def _account(fault: Fault, sequence: Sequence) -> dict[str, Any]:
-    """A fault as the manifest remembers it: with the agents' identifiers, where there are such."""
-    names = [sequence.agents[i] for i in fault.agents] if sequence.agents else []
-    return {**asdict(fault), "names": names}
 
 
 def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:

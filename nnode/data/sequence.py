@@ -16,6 +16,10 @@ Domain = Literal["traffic", "crowd"]
 
 #: Seconds by unit of time.
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+#: Metres by unit of length.
+LENGTH_UNITS = {"m": 1.0, "ft": 0.3048, "cm": 0.01, "km": 1000.0}
+#: m/s by unit of speed.
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
 #: s; a sampling interval is at least the first and below the second. Cameras, radar and satellite
 #: navigation take up to some hundred samples in a second. In ten seconds a car at 20 m/s drives
 #: 200 m and a person walks 13 m, past everything that either reacts to. Times in milliseconds of
@@ -23,8 +27,6 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: microseconds, nanoseconds, and, below it, days.
 SHORTEST, LONGEST = 1e-3, 10.0
 
-#: Share of the sampling interval by which a time may miss equal steps.
-UNEVEN = 0.01
 #: Distance (m) between the padding vehicles that stand in front of a shorter platoon.
 PADDING_GAP = 1e5
 #: Fields of a batch that are positions. They stay in float64: numbers of float32 are 0.5 m apart

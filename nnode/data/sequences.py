@@ -16,10 +16,10 @@ import pandas as pd
 from platformdirs import user_cache_path
 
 from nnode.data._arrow import to_table
-from nnode.data.check.recognise import recognised
-from nnode.data.check.source import Recognised
+from nnode.data.check.recognise import Recognised, recognised
 from nnode.data.clusters import clusters, index_of
-from nnode.data.options import DataOptions, LaneOptions
+from nnode.data.cut import LaneOptions
+from nnode.data.options import DataOptions
 from nnode.data.prepare import FORMATS, judge
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import reading

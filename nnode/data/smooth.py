@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from scipy.signal import savgol_coeffs, savgol_filter
 
+from nnode.data.limits import BEARABLE
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 
@@ -32,13 +33,6 @@ LEAST = 9
 #: s, windows of ``data.smooth`` that are suggested.
 WINDOWS = (1.0, 1.5, 2.0, 3.0, 4.0)
 
-#: m/s; first speeds that are wrong by more are not taken from single samples. A follower forgets
-#: its first speed within about 2.5 s (idm with T = 1.4 s, a = 1.2 m/s²), so that 0.2 m/s move its
-#: path by 0.5 m, the error that a single position may have (nnode.data.quality). In simulations
-#: of idm, 40 followers for 40 s, errors of 0.07 m/s leave all parameters within 1 %, those of
-#: 0.28 m/s lead to errors of 1 % of v0 and 5 % of s0, those of 0.7 m/s of 2 % and 13 % (table in
-#: docs/data.md).
-BEARABLE = 0.2
 #: Median of the size of a standard normal variable, and the sum of squares of 1, 4, 6, 4, 1.
 _MEDIAN, _FOURTH = 0.6745, 70.0
 

@@ -19,15 +19,12 @@ import numpy as np
 import pandas as pd
 
 from nnode.data.identity import LATEST, given_anew, numbered
+from nnode.data.limits import HOLE, UNEVEN
 from nnode.data.options import positive
-from nnode.data.sequence import UNEVEN
 from nnode.data.smooth import across, smooth
 from nnode.errors import DataError
 
 log = logging.getLogger(__name__)
-
-#: A step longer than so many usual ones is a hole.
-HOLE = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
 from nnode.data.dataset import Source, noise_of
 from nnode.data.options import DataOptions, Faults
-from nnode.data.policy import told_filled
 from nnode.data.prepare import open_data
-from nnode.data.quality import Fault
+from nnode.data.quality import Fault, interpolated_text, kinds_text
 from nnode.data.readers.recordings import natural
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.result import DataFault
@@ -108,7 +106,7 @@ def _measured(store: Source) -> list[str]:
     text = f"The {noise}."
     if noise.beyond:
         text = text[:-1] + "; starts and measured leaders are those of smoothed paths."
-    return [text] + ([f"{told_filled(filled)}."] if filled else [])
+    return [text] + ([f"{interpolated_text(filled)}."] if filled else [])
 
 
 def _check_enough(
@@ -123,8 +121,7 @@ def _check_enough(
             )
     if len(sound) >= LEAST:
         return
-    counts = Counter(kind for found in faults.values() for kind in {f.kind for f in found})
-    why = ", ".join(f"{kind} in {n}" for kind, n in counts.most_common())
+    why = kinds_text(faults.values())
     raise DataError(
         f"data={options.name}: {len(sound)} of {read} sequences are without a fault"
         f"{f' ({why})' if why else ''}; a diagnosis needs at least {LEAST}, some to calibrate on "

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from nnode.data.check import findings as find
 from nnode.data.check.columns import (
     Meaning,
     are_pairs,
@@ -18,19 +17,27 @@ from nnode.data.check.columns import (
     meanings,
     rivals,
 )
-from nnode.data.check.findings import Finding
 from nnode.data.check.raw import Raw, read_raw
+from nnode.data.check.recognise import Recognised, native_source, source_of, source_of_native
 from nnode.data.check.rows import scaled
-from nnode.data.check.scale import LIKELY, SURE, Medians, Scale, medians
-from nnode.data.check.source import Recognised, native_source, source_of, source_of_native
 from nnode.data.cut import Reading
-from nnode.data.policy import without
 from nnode.data.prepare import FORMATS
-from nnode.data.quality import Fault, find_faults
+from nnode.data.quality import (
+    Fault,
+    Finding,
+    cell_findings,
+    find_faults,
+    left_out_texts,
+    order_findings,
+    row_findings,
+    sequence_findings,
+    time_findings,
+)
 from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
 from nnode.data.trajectories import Trajectories
+from nnode.data.units import Medians, Scale, medians
 from nnode.errors import NNodeError
 
 #: Sequences in which faults are looked for.
@@ -74,13 +81,6 @@ class Examination:
     def scale(self) -> Scale:
         """The units that are taken."""
         return self.scales[0]
-
-
-def sure(probability: float) -> str:
-    """A probability in words."""
-    if probability >= SURE:
-        return "sure"
-    return "likely" if probability >= LIKELY else "a guess"
 
 
 def examine(path: Path, domain: Domain | None = None, rate: float | None = None) -> Examination:
@@ -172,9 +172,9 @@ def _table(
     }
     if is_spaced(found):
         needed |= {m: found[m].column for m in ("spacing", "v_follower", "v_leader")}
-    examined.findings += find.cells(table, needed)
+    examined.findings += cell_findings(table, needed)
     stand = seen.table.at(np.arange(len(table)))
-    examined.findings += find.order(stand, int(table.frame.duplicated().sum()))
+    examined.findings += order_findings(stand, int(table.frame.duplicated().sum()))
     doubts = [("units", text) for text in seen.doubts(rate).values()]
     doubts += [("columns", text) for text in rivals(found).values()]
     examined.findings += [Finding(kind, "warning", text) for kind, text in doubts]
@@ -192,7 +192,9 @@ def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
     try:
         made = _read(source)
         left_out = made.left_out if isinstance(made, Reading) else []
-        findings += [Finding("left_out", "warning", text) for text in without(made, [], left_out)]
+        findings += [
+            Finding("left_out", "warning", text) for text in left_out_texts(len(made), [], left_out)
+        ]
         findings += [
             Finding("resampled", "warning", text)
             for text in (made.notes if isinstance(made, Reading) else [])
@@ -206,18 +208,14 @@ def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
 def _judged(found: Examination, sequences: list[Sequence], rate: float | None) -> Examination:
     """With everything that rows and sequences show."""
     rows, domain = found.rows, found.scale.domain
-    found.findings += find.sampling(rows)
-    found.findings += find.time_scale(found.known, found.scale, rate)
-    found.findings += find.accelerations(rows)
-    found.findings += find.direction(rows, domain)
+    found.findings += time_findings(found.known, found.scale, rate)
     whole = found.raw.native not in _CUT and not are_pairs(found.meanings)
-    found.findings += find.coming_and_going(rows, domain, whole)
+    found.findings += row_findings(rows, domain, whole)
     found.sequences = sequences[:: max(1, -(-len(sequences) // MOST))]
     noise = measured_noise(found.sequences)
     known = 0.0 if found.source.options.published else noise.position
     found.faults = {s.name: own for s in found.sequences if (own := find_faults(s, domain, known))}
-    found.findings += find.measurement(noise, found.sequences, domain)
-    found.findings += find.faults(found.faults, len(found.sequences))
+    found.findings += sequence_findings(found.sequences, found.faults, noise, domain)
     found.findings += _made(found, len(sequences))
     found.findings.sort(key=lambda one: _LEVELS.index(one.level))
     return found

@@ -10,9 +10,9 @@ import pandas as pd
 
 from nnode.data.check.columns import Meaning, are_pairs, clock_of, is_spaced, numbers
 from nnode.data.check.raw import Raw
-from nnode.data.check.scale import FAIR, LAG, LIKELY, Medians, Scale, medians, scales
 from nnode.data.sequence import Domain
-from nnode.data.trajectories import Trajectories
+from nnode.data.trajectories import Trajectories, driven
+from nnode.data.units import FAIR, LAG, LIKELY, Medians, Scale, medians, scales, share
 from nnode.errors import DataError
 
 #: Columns whose names tell a unit.
@@ -46,7 +46,7 @@ class Scaled:
     @property
     def share(self) -> float:
         """Probability of the units, whatever the rate of frames."""
-        return sum(s.probability for s in self.scales if s.units == self.scale.units)
+        return share(self.scales)
 
     def rates(self, told: float | None) -> list[float]:
         """Frames per second that fit, where times are frames and nothing tells their rate."""
@@ -260,30 +260,26 @@ def _of_pairs(raw: Raw, meanings: dict[str, Meaning]) -> dict[str, Meaning]:
 def _integrated(raw: Raw, meanings: Mapping[str, Meaning]) -> list[np.ndarray]:
     """Positions of followers and leaders in the unit of the spacing, by the reader's rule.
 
-    What distance a unit of speed times time is follows from how spacings change with the speeds:
-    the ratio of root mean squares of both changes.
+    The distance that a unit of speed covers in a unit of time follows from how spacings change
+    with the speeds: the ratio of the root mean squares of both changes over LAG samples.
     """
     assert raw.table is not None
     columns = [
         meanings[m].column for m in (clock_of(meanings), "spacing", "v_follower", "v_leader")
     ]
     time, spacing, follower, leader = (numbers(raw.table.frame, c) for c in columns)
-    pair = pd.factorize(_pairs(raw, meanings))[0]
-    order = np.lexsort((time, pair))
-    same = np.diff(pair[order]) == 0
-
-    def gone(v: np.ndarray) -> np.ndarray:
-        step = np.diff(time[order]) * (v[order][1:] + v[order][:-1]) / 2
-        return np.concatenate([[0.0], np.nancumsum(np.where(same, step, 0.0))])
-
-    relative, lag = gone(leader - follower), LAG
-    whole = pair[order][lag:] == pair[order][:-lag]
-    change = (spacing[order][lag:] - spacing[order][:-lag])[whole]
-    said = (relative[lag:] - relative[:-lag])[whole]
-    finite = np.isfinite(change)
-    unit = float(np.sqrt((change[finite] ** 2).sum() / max((said[finite] ** 2).sum(), 1e-300)))
-    if not (finite.any() and 0 < unit < 1e6):
-        unit = 1.0
-    x = np.empty(len(time))
-    x[order] = unit * gone(leader)
+    x, measured, expected = np.full(len(time), np.nan), [], []
+    names = _pairs(raw, meanings)
+    for pair in pd.Series(names).groupby(names).indices.values():
+        rows = pair[np.isfinite(time[pair])]
+        rows = rows[np.argsort(time[rows], kind="stable")]
+        x[rows] = driven(time[rows], leader[rows])
+        relative = x[rows] - driven(time[rows], follower[rows])
+        measured.append(spacing[rows][LAG:] - spacing[rows][:-LAG])
+        expected.append(relative[LAG:] - relative[:-LAG])
+    change, of_speeds = np.concatenate(measured), np.concatenate(expected)
+    known = np.isfinite(change)
+    squares = max(float((of_speeds[known] ** 2).sum()), 1e-300)
+    unit = float(np.sqrt((change[known] ** 2).sum() / squares))
+    x *= unit if known.any() and 0 < unit < 1e6 else 1.0
     return [x - spacing, x]

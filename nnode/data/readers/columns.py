@@ -6,13 +6,16 @@ import difflib
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from nnode.data.options import one_of, positive
+from nnode.data.sequence import LENGTH_UNITS, SPEED_UNITS, TIME_UNITS
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 from nnode.files import csv_cell
 
@@ -28,6 +31,20 @@ _WHOLE = 2.0**63
 #: So many bytes and lines are looked at to tell how a text is laid out.
 LOOKED_AT, _LINES = 1 << 16, 20
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|nan|inf", re.IGNORECASE)
+
+
+@dataclass
+class ColumnOptions:
+    """Columns and units of any table.
+
+    ``columns`` names the table's columns by what they mean, as each reader lists them. A column
+    that bears the name of its meaning need not be listed; null leaves an optional one out.
+    """
+
+    columns: dict[str, str | None] = field(default_factory=dict)  # {meaning: column}
+    position_unit: str = "m"  # m | ft | cm | km, of positions, lengths and destinations
+    time_unit: str = "s"  # s | ms | us | ns | frame; dates and durations need none
+    frame_rate: float | None = None  # 1/s, with time_unit=frame
 
 
 @dataclass(frozen=True)
@@ -506,3 +523,65 @@ def _since_first(values: np.ndarray, unit: float) -> tuple[int, np.ndarray]:
 def opened(source: Path | str | Table) -> Table:
     """A table by its path; one that is open already is taken as it is."""
     return source if isinstance(source, Table) else Table(Path(source))
+
+
+def seconds_per_unit(options: ColumnOptions) -> float:
+    """Seconds in a unit of a table's times.
+
+    Raises:
+        ConfigError: an unknown unit, or frames without their rate.
+    """
+    scale = one_of("time_unit", options.time_unit, {**TIME_UNITS, "frame": np.nan})
+    if options.time_unit == "frame":
+        scale = 1.0 / positive("frame_rate", options.frame_rate)
+    return scale
+
+
+def table_rows(
+    table: Table,
+    names: Mapping[str, str],
+    options: ColumnOptions,
+    axes: tuple[str, ...] = ("x",),
+) -> Trajectories:
+    """The columns of any table, by what they mean.
+
+    Rows of different recordings, or of different sequences, never meet: both are the name of the
+    recording.
+
+    Args:
+        names: of the columns by their meaning.
+        axes: meanings of the positions' columns.
+
+    Raises:
+        ConfigError: an unknown unit.
+        DataError: cells that are missing or hold no number; names the row.
+    """
+    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
+
+    def words(key: str) -> np.ndarray | None:
+        return table.names(names[key], empty=True) if key in names else None
+
+    v = length = recording = None
+    if "speed" in names:
+        unit = one_of("speed_unit", getattr(options, "speed_unit", "m/s"), SPEED_UNITS)
+        v = np.abs(table.numbers(names["speed"]))[:, None] * unit
+    if "length" in names:
+        own_unit = getattr(options, "length_unit", None) or options.position_unit
+        length = table.positive(names["length"]) * one_of("length_unit", own_unit, LENGTH_UNITS)
+    parts = [table.names(names[key]) for key in ("recording", "sequence") if key in names]
+    if parts:
+        recording = np.array([" ".join(cells) for cells in zip(*parts, strict=True)], dtype=object)
+    return Trajectories(
+        path=table.path,
+        name=table.path.stem,
+        where=table.row,
+        agent=table.names(names["vehicle" if "vehicle" in names else "agent"]),
+        time=table.times(names["time"], seconds_per_unit(options))[1],
+        x=np.stack([table.measured(names[axis]) for axis in axes], -1) * metres,
+        v=v,
+        recording=recording,
+        lane=table.names(names["lane"]) if "lane" in names else None,
+        length=length,
+        kind=words("kind"),
+        group=words("group"),
+    )

@@ -6,12 +6,12 @@ that grow as it drives on, whichever way that is.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from nnode.data.cut import Reading, by_lane, check_cutting
-from nnode.data.options import HighDOptions
+from nnode.data.cut import LaneOptions, Reading, by_lane, check_cutting
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import table_path
 from nnode.data.trajectories import Trajectories
@@ -22,6 +22,13 @@ TRACKS, TRACKS_META, RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_record
 
 #: drivingDirection of tracks that drive towards smaller, and towards larger positions.
 LEFT, RIGHT = 1, 2
+
+
+@dataclass
+class HighDOptions(LaneOptions):
+    """highD's tracks, with the tables ``tracksMeta`` and ``recordingMeta`` beside them."""
+
+    name: str = "highd"
 
 
 def highd_files(options: HighDOptions) -> dict[str, Path]:

@@ -10,17 +10,19 @@ import logging
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from enum import Enum
 from fnmatch import fnmatch
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from nnode.data.cut import Member, Reading, by_presence, sequence_of, told_uneven
 from nnode.data.exits import Exit, destinations, exits_of, read_exits
-from nnode.data.options import JuelichOptions, Velocity, one_of, positive
+from nnode.data.options import DataOptions, one_of, positive
 from nnode.data.readers.recordings import natural, raw_files
 from nnode.data.sequence import Sequence
 from nnode.data.trajectories import Grid, Record, Trajectories, records
@@ -40,6 +42,41 @@ _NAME = re.compile(r"(.+)\.txt")
 
 #: Rows of people, and their sampling interval (s).
 People = tuple[Trajectories, float]
+
+
+class Velocity(str, Enum):
+    """Finite difference that velocities are computed with.
+
+    ``forward`` looks only at the positions of the sequence itself; ``central`` and ``backward``
+    use the neighbouring frames of the whole trajectory where there are such.
+    """
+
+    forward = "forward"
+    central = "central"
+    backward = "backward"
+
+
+@dataclass
+class JuelichOptions(DataOptions):
+    """Trajectory text files of the Jülich archive: id frame x y z."""
+
+    name: str = "juelich"
+    domain: str = "crowd"
+    fill: float = 0.0  # the published recordings as they are
+    t_seq: float = 1.0  # s, length of a sequence
+    frame_rate: float | None = None  # 1/s; null reads it from the file's header
+    unit: str | None = None  # cm | m; null reads it from the file's header
+    walking_axis: str = "x"  # x | y; walls run along it
+    walls: dict[str, list[float]] = field(default_factory=dict)  # recording: [low, high], m
+    view: list[float] | None = None  # [from, to] along the walking axis, m; null takes all
+    velocity: Velocity = Velocity.forward
+    min_agents: int = 1  # fewest people in a sequence
+    # {name: {line: [x1, y1, x2, y2], direction: +x}}, m: destinations on exit lines, by where
+    # people walk (+x | -x | +y | -y | [x, y]); null: their last position in the sequence
+    exits: Any = None
+    # s before a sequence in which preferred velocities are measured, for model.desired=direction;
+    # 0 measures none. Who is not tracked so long before has the velocity of his first sample
+    history: float = 1.0
 
 
 def juelich_files(options: JuelichOptions) -> dict[str, Path]:

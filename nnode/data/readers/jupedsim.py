@@ -10,19 +10,19 @@ import math
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import shapely
+from omegaconf import MISSING
 from shapely.geometry.polygon import orient
 
 from nnode.data.cut import Reading
-from nnode.data.options import WalkwayOptions
-from nnode.data.readers.columns import EXACT, Table, opened
-from nnode.data.readers.juelich import People, cut_people, load_people, people_of
+from nnode.data.readers.columns import EXACT, ColumnOptions, Table, opened, table_rows
+from nnode.data.readers.juelich import JuelichOptions, People, cut_people, load_people, people_of
 from nnode.data.readers.recordings import table_path
-from nnode.data.readers.vehicles import table_rows
 from nnode.data.sequence import check_interval
 from nnode.errors import ConfigError, DataError
 
@@ -42,6 +42,16 @@ TABLES = (".csv", ".parquet", ".pq")
 REQUIRED, OPTIONAL = ("agent", "time", "x", "y"), ("recording", "sequence")
 
 _COLUMNS = ("id", "frame", "pos_x", "pos_y")
+
+
+@dataclass
+class WalkwayOptions(ColumnOptions, JuelichOptions):
+    """One file of walking people: PedPy's text, JuPedSim's SQLite database, or a table."""
+
+    name: str = "pedpy"
+    fill: float = 0.5  # s of missing frames of a person that are interpolated; 0: none
+    path: str = MISSING  # the file; relative to data.source where that is given
+    geometry: str | None = None  # text file with the walkable area as WKT, m
 
 
 def walkway_files(options: WalkwayOptions, table: Table | None = None) -> dict[str, Path | Table]:

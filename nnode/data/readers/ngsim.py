@@ -11,15 +11,16 @@ and Supporting Data, doi 10.21949/1504477, with its dictionary of columns.
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nnode.data.cut import Reading, by_lane, check_cutting
-from nnode.data.options import NgsimOptions, VehicleTableOptions
+from nnode.data.cut import LaneOptions, Reading, by_lane, check_cutting
 from nnode.data.readers.columns import EXACT, Table
-from nnode.data.readers.vehicles import LENGTH_UNITS, read_vehicles
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
+from nnode.data.sequence import LENGTH_UNITS
 from nnode.data.trajectories import Trajectories
 from nnode.errors import DataError
 
@@ -69,6 +70,13 @@ APART = 7.5 * 60e3
 
 #: Hours by which the clocks of both freeways, in April and June, were behind UTC.
 BEHIND_UTC = 7
+
+
+@dataclass
+class NgsimOptions(LaneOptions):
+    """NGSIM's public trajectories of freeways, in feet and ms, as they are published."""
+
+    name: str = "ngsim"
 
 
 def read_ngsim(path: Path, options: NgsimOptions) -> Reading:

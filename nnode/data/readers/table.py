@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from omegaconf import MISSING
 
 from nnode.data.cut import Reading, by_sequence
 from nnode.data.exits import destinations, exits_of, read_exits
-from nnode.data.options import TableOptions, check_known, wanted
-from nnode.data.readers.columns import Table, opened
+from nnode.data.options import DataOptions, check_known, wanted
+from nnode.data.readers.columns import ColumnOptions, Table, opened, table_rows
 from nnode.data.readers.recordings import natural, table_path
-from nnode.data.readers.vehicles import LENGTH_UNITS, table_rows
+from nnode.data.sequence import LENGTH_UNITS
 from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
@@ -23,6 +25,24 @@ _WALL = ("x1", "y1", "x2", "y2")
 
 #: Keys of the files of a table.
 TABLE, WALLS = "table", "walls"
+
+
+@dataclass
+class TableOptions(ColumnOptions, DataOptions):
+    """A user's own tidy table (CSV or Parquet), one row per sequence, time and agent.
+
+    ``columns`` names the table's columns by what they mean: ``sequence``, ``time``, ``agent``,
+    ``x``, and where they exist ``y``, ``length``, ``kind``, ``group``, ``dest_x``, ``dest_y``,
+    ``recording``. A column that bears the name of its meaning need not be listed; null leaves an
+    optional one out.
+    """
+
+    name: str = "table"
+    path: str = MISSING  # the table; relative to data.source where that is given
+    walls: str | None = None  # CSV with x1, y1, x2, y2 (m), the walkable side on the left
+    # {name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}, m: destinations on exit lines,
+    # in place of the columns dest_x, dest_y
+    exits: Any = None
 
 
 def table_files(options: TableOptions, table: Table | None = None) -> dict[str, Path | Table]:
