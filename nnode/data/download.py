@@ -308,22 +308,27 @@ def _reason(error: OSError) -> str:
     return next(known, f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
+def held(source: Path, dataset: str) -> dict[str, Path]:
+    """Files of a folder and of its sub-folders of a data set, by name; the first one of a name."""
+    below = [sub for o in ORIGINS.values() if dataset in o.folders for sub in o.folders]
+    places = [source, *(source / sub for sub in dict.fromkeys((dataset, *below)))]
+    files: dict[str, Path] = {}
+    for path in (path for place in places if place.is_dir() for path in sorted(place.iterdir())):
+        files.setdefault(path.name, path)
+    return files
+
+
 def _find(dataset: str, name: str, source: Path) -> Path:
     if not source.is_dir():
         raise DataError(f"data.source: there is no folder {source}; expected one that holds {name}")
-    origin = _origin(dataset, name)
-    below = dict.fromkeys((dataset, *(origin.folders if origin else ())))
-    places = [source, *(source / sub for sub in below)]
-    for place in places:
-        path = place / name
-        if path.is_file():
-            _note_edits(path, origin)
-            return path
-    held = sorted({p.name for place in places if place.is_dir() for p in place.iterdir()})
-    listing = ", ".join(held[:20]) + (f", ... ({len(held)} in all)" if len(held) > 20 else "")
+    files = held(source, dataset)
+    if name in files and files[name].is_file():
+        _note_edits(files[name], _origin(dataset, name))
+        return files[name]
+    listing = ", ".join([*files][:20]) + (f", ... ({len(files)} in all)" if len(files) > 20 else "")
     raise DataError(
-        f"{name} is neither in {source} nor in its sub-folders {', '.join(below)}"
-        f"{_nearest(name, held)}; found there: {listing or 'nothing'}; name a file that is there "
+        f"{name} is neither in {source} nor in its sub-folders of {dataset}"
+        f"{_nearest(name, [*files])}; it holds: {listing or 'nothing'}; name one of these files "
         "or set data.source to another folder"
     )
 

@@ -475,16 +475,22 @@ def order_findings(rows: Trajectories, identical: int) -> Iterator[Finding]:
         )
 
 
-def row_findings(rows: Trajectories, domain: Domain, whole: bool) -> Iterator[Finding]:
+def row_findings(
+    rows: Trajectories, medians: Medians, scale: Scale, stated: float | None, whole: bool
+) -> Iterator[Finding]:
     """What rows in order and in SI units show before they are cut into sequences.
 
     Args:
+        medians: in the file's own units.
+        scale: those units.
+        stated: frames per second that the file or the user states.
         whole: whether records begin and end where agents enter and leave, not where they were cut.
     """
     yield from _sampling(rows)
+    yield from _clock(medians, scale, stated)
     yield from _accelerations(rows)
-    yield from _directions(rows, domain)
-    yield from _entering_and_leaving(rows, domain, whole)
+    yield from _directions(rows, scale.domain)
+    yield from _entering_and_leaving(rows, scale.domain, whole)
 
 
 def _sampling(rows: Trajectories) -> Iterator[Finding]:
@@ -514,13 +520,8 @@ def _sampling(rows: Trajectories) -> Iterator[Finding]:
         )
 
 
-def time_findings(medians: Medians, scale: Scale, stated: float | None) -> Iterator[Finding]:
-    """Whether the clock is right, by speeds in the file and by what is possible.
-
-    Args:
-        medians: in the file's own units.
-        stated: frames per second that the file or the user states.
-    """
+def _clock(medians: Medians, scale: Scale, stated: float | None) -> Iterator[Finding]:
+    """Whether the clock is right, by speeds in the file and by what is possible."""
     speed = medians.speed * scale.metres / scale.seconds
     ratio = medians.ratio * scale.metres / (scale.per_second * scale.seconds)
     usual = USUAL[scale.domain]["speed"]

@@ -31,7 +31,6 @@ from nnode.data.quality import (
     order_findings,
     row_findings,
     sequence_findings,
-    time_findings,
 )
 from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence
@@ -208,9 +207,8 @@ def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
 def _judged(found: Examination, sequences: list[Sequence], rate: float | None) -> Examination:
     """With everything that rows and sequences show."""
     rows, domain = found.rows, found.scale.domain
-    found.findings += time_findings(found.known, found.scale, rate)
     whole = found.raw.native not in _CUT and not are_pairs(found.meanings)
-    found.findings += row_findings(rows, domain, whole)
+    found.findings += row_findings(rows, found.known, found.scale, rate, whole)
     found.sequences = sequences[:: max(1, -(-len(sequences) // MOST))]
     noise = measured_noise(found.sequences)
     known = 0.0 if found.source.options.published else noise.position

@@ -80,7 +80,9 @@ def raw_files(
     """
     dataset = options.name if options.name in download.FILES else default
     public = _matches(pattern, download.FILES[dataset])
-    local = _matches(pattern, _held(options.source, dataset))
+    source = options.source or os.environ.get(download.FOLDER_VARIABLE) or ""
+    folder = None if "://" in source or not source else Path(source).expanduser()
+    local = _matches(pattern, [] if folder is None else sorted(download.held(folder, dataset)))
     asked = wanted(options.recording)
     if asked is None:
         asked = public if set(public) & set(local) or not local else local
@@ -174,12 +176,3 @@ def _published(name: str) -> str:
 def _matches(pattern: re.Pattern[str], names: Iterable[str]) -> list[str]:
     found = (pattern.fullmatch(name) for name in names)
     return [match.group(1) for match in found if match]
-
-
-def _held(source: str | None, dataset: str) -> list[str]:
-    """Names of the files in a local source folder and in its sub-folder of the data set."""
-    source = source or os.environ.get(download.FOLDER_VARIABLE)
-    if not source or "://" in source:
-        return []
-    places = [Path(source).expanduser(), Path(source).expanduser() / dataset]
-    return sorted({p.name for place in places if place.is_dir() for p in place.iterdir()})
