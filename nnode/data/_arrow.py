@@ -106,12 +106,12 @@ def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None
 
     def vectors(prefix: str) -> np.ndarray | None:
         columns = [numbers(prefix + a) for a in _AXES if prefix + a in table.column_names]
-        found = [column for column in columns if column is not None]
-        return np.stack(found, axis=-1) if found else None
+        known_columns = [column for column in columns if column is not None]
+        return np.stack(known_columns, axis=-1) if known_columns else None
 
     def names(name: str) -> tuple[str, ...] | None:
-        found = table[name].slice(0, n).to_pylist()
-        return None if None in found else tuple(found)
+        values = table[name].slice(0, n).to_pylist()
+        return None if None in values else tuple(values)
 
     time, x = numbers("time"), vectors("")
     if time is None or x is None:

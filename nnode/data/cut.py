@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -388,7 +388,7 @@ def _in_lane(of: list[Member], at: int) -> list[Member]:
 def by_presence(
     every: list[Record],
     steps: int,
-    least: int = 1,
+    min_agents: int = 1,
     axis: int = 0,
     view: tuple[float, float] | None = None,
 ) -> Iterator[_Platoon]:
@@ -398,21 +398,14 @@ def by_presence(
 
     Args:
         steps: of a window.
-        least: fewest agents.
+        min_agents: fewest agents.
         axis, view: m, whoever is there is within these ends of a coordinate at all times.
     """
     if not every:
         return
     begin = np.array([record.first for record in every])
     end = np.array([record.last for record in every])
-    low, number = int(begin.min()), end - begin
-    # windows that lie within a record: two records may lie years apart
-    starts = {
-        low + k * steps
-        for a, b in zip(begin[number >= steps], end[number >= steps], strict=True)
-        for k in range(-((low - int(a)) // steps), (int(b) - low) // steps)
-    }
-    for first in sorted(starts):
+    for first in _starts(every, steps):
         last = first + steps
         present = [every[i] for i in np.flatnonzero((begin <= first) & (end >= last))]
         if view is not None:
@@ -421,7 +414,7 @@ def by_presence(
                 (x[:, axis] >= view[0]).all() and (x[:, axis] <= view[1]).all() for x in paths
             ]
             present = [record for record, good in zip(present, inside, strict=True) if good]
-        if len(present) >= least:
+        if len(present) >= min_agents:
             yield present, first, last
 
 
@@ -487,12 +480,12 @@ def _platoons(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
     if not lane:
         return
     if options.pairs:
-        pieces, least = _pairs(lane, options), 2
+        pieces, min_vehicles = _pairs(lane, options), 2
     else:
         pieces = _intervals(lane) if options.window is None else _windows(lane, options)
-        least = options.min_vehicles
+        min_vehicles = options.min_vehicles
     for platoon, first, last in pieces:
-        if len(platoon) >= least and last - first + 1 >= options.min_samples:
+        if len(platoon) >= min_vehicles and last - first + 1 >= options.min_samples:
             yield _in_order(platoon, first), first, last
 
 
@@ -508,40 +501,41 @@ def _intervals(every: list[Record]) -> Iterator[_Platoon]:
 
 def _pairs(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
     """Followers with their leaders, as long as nobody comes between them, in order of time."""
-    stays: dict[tuple[int, int], list[tuple[Record, Record, int, int]]] = {}
+    stays: dict[tuple[int, int], list[tuple[list[Record], int, int]]] = {}
     for platoon, first, last in _intervals(lane):
-        for follower, leader in pairwise(_in_order(platoon, first)):
-            pair_stays = stays.setdefault((id(follower), id(leader)), [])
-            if pair_stays and pair_stays[-1][3] + 1 == first:
-                first_of_all = pair_stays.pop()[2]
-                pair_stays.append((follower, leader, first_of_all, last))
-            else:
-                pair_stays.append((follower, leader, first, last))
-    every = sorted(
-        (span for every_stay in stays.values() for span in every_stay), key=lambda span: span[2]
-    )
-    for follower, leader, first, last in every:
+        for pair in map(list, pairwise(_in_order(platoon, first))):
+            of_pair = stays.setdefault((id(pair[0]), id(pair[1])), [])
+            begin = of_pair.pop()[1] if of_pair and of_pair[-1][2] + 1 == first else first
+            of_pair.append((pair, begin, last))
+    for pair, first, last in sorted(chain(*stays.values()), key=lambda stay: stay[1]):
         steps = last - first if options.window is None else round(options.window / options.dt)
         for start, end in windows(first, last, max(steps, 1)):
-            yield [follower, leader], start, end
+            yield pair, start, end
+
+
+def _starts(every: list[Record], steps: int) -> list[int]:
+    """Starts of the consecutive windows that lie within a record.
+
+    They count from the first record's start. All windows would be too many, as two records may lie
+    years apart.
+    """
+    low = min(record.first for record in every)
+    return sorted(
+        {
+            low + k * steps
+            for record in every
+            for k in range(-((low - record.first) // steps), (record.last - low) // steps)
+        }
+    )
 
 
 def _windows(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
     assert options.window is not None
     steps = round(options.window / options.dt)
-    start, end = min(r.first for r in lane), max(r.last for r in lane)
-    # only windows in which somebody is in view: two records may lie years apart
-    busy = {
-        k
-        for r in lane
-        for k in range((r.first - start) // steps - 1, (r.last - start) // steps + 1)
-    }
-    for first in sorted(start + k * steps for k in busy if 0 <= k <= (end - start) // steps - 1):
+    for first in _starts(lane, steps):
         last = first + steps
         in_view = [r for r in lane if r.first <= last and r.last >= first]
         whole = _in_order([r for r in in_view if r.first <= first and r.last >= last], first)
-        if not whole:
-            continue
         x = np.stack([r.x[first - r.first : last - r.first + 1, 0] for r in whole], axis=1)
         broken: set[int] = set()
         for r in in_view:

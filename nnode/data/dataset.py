@@ -49,10 +49,10 @@ Source = Store | Sequences | SmoothSpeeds
 
 def noise_of(source: Source) -> Noise:
     """The noise of measurement of a source, as its manifest tells it or as it shows."""
-    told = source.manifest.get("noise")
-    if told is not None:
-        known = {key: float("nan") if value is None else value for key, value in told.items()}
-        return Noise(**known)
+    stored = source.manifest.get("noise")
+    if stored is not None:
+        values = {key: float("nan") if value is None else value for key, value in stored.items()}
+        return Noise(**values)
     every = max(1, -(-len(source) // _TOLD))
     return measured_noise(source[i] for i in range(0, len(source), every))
 
@@ -149,8 +149,8 @@ class EpochSampler(torch.utils.data.Sampler[list[int]]):
 
     def sequences(self, batch: int) -> int:
         """Sequences of mini-batch number ``batch``, those of all processes."""
-        least, more = divmod(self.n, self.n_batches)
-        return least + (batch < more)
+        smallest, larger_ones = divmod(self.n, self.n_batches)
+        return smallest + (batch < larger_ones)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch, counted from 0; it starts at its first mini-batch."""

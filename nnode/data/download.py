@@ -238,10 +238,10 @@ def _origin(dataset: str, name: str) -> Origin | None:
 
     Both corridor archives are read by one reader, which need not know who publishes a file.
     """
-    own = ORIGINS.get(dataset)
-    if own is not None and name in own.files:
-        return own
-    return next((o for o in ORIGINS.values() if name in o.files and dataset in o.folders), own)
+    origin = ORIGINS.get(dataset)
+    if origin is not None and name in origin.files:
+        return origin
+    return next((o for o in ORIGINS.values() if name in o.files and dataset in o.folders), origin)
 
 
 def _fetch_published(dataset: str, name: str, folder: Path) -> Path:
@@ -252,11 +252,11 @@ def _fetch_published(dataset: str, name: str, folder: Path) -> Path:
             f"data.source=FOLDER, or {FOLDER_VARIABLE}, to a folder that holds {name}"
         )
     if name not in origin.files:
-        known = [n for o in ORIGINS.values() if dataset in o.folders for n in o.files]
+        published = [n for o in ORIGINS.values() if dataset in o.folders for n in o.files]
         raise DataError(
             f"{name} is not among the published files of {dataset}"
-            f"{_nearest(name, known)}; published: {', '.join(known)}; for a file of your own set "
-            "data.source=FOLDER"
+            f"{_nearest(name, published)}; published: {', '.join(published)}; for a file of your own "
+            "set data.source=FOLDER"
         )
     return _fetch(dataset, name, origin.url(name), folder)
 
@@ -304,8 +304,8 @@ def _reason(error: OSError) -> str:
     if answer is not None:
         return f"the server answered {answer.status_code} {answer.reason}"
     kinds = {kind.__name__ for kind in type(error).__mro__}
-    known = (words for kind, words in _REASONS.items() if kind in kinds)
-    return next(known, f"{type(error).__name__}: {' '.join(str(error).split())}")
+    words_of_kind = (words for kind, words in _REASONS.items() if kind in kinds)
+    return next(words_of_kind, f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
 def held(source: Path, dataset: str) -> dict[str, Path]:

@@ -105,10 +105,10 @@ def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any]
     """Read files that do not depend on each other."""
 
     def every(files: _Files, options: Any) -> Reading:
-        found = Reading()
+        sequences = Reading()
         for path in files.values():
-            found.add(read(path, options))
-        return found
+            sequences.add(read(path, options))
+        return sequences
 
     return every
 
@@ -222,15 +222,15 @@ def judge(
     # faults are told with the source's own identifiers, and of faulty sequences they are looked
     # at as well: through them one of those agents may go on
     agents, notes = identify(sequences, domain, options.agents)
-    unique = {s.name: replace(s, agents=own) for s, own in zip(sequences, agents, strict=True)}
+    unique = {s.name: replace(s, agents=names) for s, names in zip(sequences, agents, strict=True)}
     kept = [unique[s.name] for s in kept]
     if options.start_speeds is Starts.smoothed:
         kept = [start_smoothed(s) for s in kept]
     if filled := interpolated(kept):
         log.info("%s", interpolated_text(filled))
     if notes:
-        more = f" (and {len(notes) - 1} more recordings)" if len(notes) > 1 else ""
-        log.info("%s%s; data.agents decides by hand", notes[0], more)
+        others = f" (and {len(notes) - 1} more recordings)" if len(notes) > 1 else ""
+        log.info("%s%s; data.agents decides by hand", notes[0], others)
     manifest = {
         "package": {"name": "nnode", "version": VERSION},
         "reader": type(options).__name__,
@@ -299,13 +299,13 @@ def made_by(store: Store) -> type[DataOptions]:
         ConfigError: a store of an earlier version, which did not note it.
     """
     name = store.manifest.get("reader")
-    found = next((kind for kind in FORMATS if kind.__name__ == name), None)
-    if found is None:
+    kind_of_options = next((kind for kind in FORMATS if kind.__name__ == name), None)
+    if kind_of_options is None:
         raise ConfigError(
             f"{store.folder} does not tell which of nnode's readers prepared it (found {name!r}); "
             "prepare the data again, or set data.prepared=null to prepare on the fly"
         )
-    return found
+    return kind_of_options
 
 
 def refuse_others(store: Store, asked: Mapping[str, Any]) -> None:
@@ -347,8 +347,8 @@ def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:
         except MissingMandatoryValue as error:
             raise ConfigError(f"{error.full_key} is not set; give it a value") from error
     if type(options) not in FORMATS:
-        known = ", ".join(kind.__name__ for kind in FORMATS)
-        raise ConfigError(f"no reader for {type(options).__name__}; expected one of {known}")
+        kinds = ", ".join(kind.__name__ for kind in FORMATS)
+        raise ConfigError(f"no reader for {type(options).__name__}; expected one of {kinds}")
     return options
 
 
@@ -404,18 +404,18 @@ def _drawn(folder: Path, judged: Judged, draw: Draw | None) -> Iterator[None]:
     partial = folder / f".{PLOTS}.{os.getpid()}.partial"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for rest in folder.glob(".*.partial"):  # what an interrupted preparation left
-            shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
+        for leftover in folder.glob(".*.partial"):  # what an interrupted preparation left
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         partial.mkdir()
     except OSError as error:
         raise DataError(f"{folder} cannot be written: {error}; choose another folder") from error
     try:
         if draw is not None:
             for recording in dict.fromkeys(s.recording for s in sequences):
-                own = [s for s in sequences if s.recording == recording]
-                if any(faults[s.name] for s in own):
+                of_recording = [s for s in sequences if s.recording == recording]
+                if any(faults[s.name] for s in of_recording):
                     name = f"{file_name(recording)}.png"
-                    draw(own, faults, judged.domain, partial / name)
+                    draw(of_recording, faults, judged.domain, partial / name)
         yield
         shutil.rmtree(folder / PLOTS, ignore_errors=True)
         if any(partial.iterdir()):

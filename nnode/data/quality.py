@@ -114,12 +114,12 @@ def find_faults(sequence: Sequence, domain: Domain, noise: float = 0.0) -> list[
     error = max(limits.noise, NOISY * np.sqrt(2) * np.nan_to_num(noise))
     limits = replace(limits, noise=float(error))
     view = _View(sequence, domain, limits)
-    found = [*_short(view), *_times(view), *_values(view), *_duplicates(view)]
+    faults = [*_short(view), *_times(view), *_values(view), *_duplicates(view)]
     if sequence.n_samples and sequence.n_agents:
-        found += [*_zero_rows(view), *_displacements(view)]
-        found += [*_order(view, found), *_bumpers(view)] if domain == "traffic" else []
-        found += _overlaps(view)
-    return sorted(found, key=lambda f: -np.inf if f.time is None else f.time)
+        faults += [*_zero_rows(view), *_displacements(view)]
+        faults += [*_order(view, faults), *_bumpers(view)] if domain == "traffic" else []
+        faults += _overlaps(view)
+    return sorted(faults, key=lambda f: -np.inf if f.time is None else f.time)
 
 
 def usable(sequence: Sequence, faults: list[Fault]) -> bool:
@@ -133,11 +133,11 @@ def by_kind(faults: Iterable[Iterable[Fault]]) -> dict[str, int]:
     Args:
         faults: of every sequence.
     """
-    return _counted({fault.kind for fault in own} for own in faults)
+    return _counted({fault.kind for fault in of_sequence} for of_sequence in faults)
 
 
 def _counted(kinds: Iterable[Iterable[str]]) -> dict[str, int]:
-    counts = Counter(kind for own in kinds for kind in own)
+    counts = Counter(kind for of_sequence in kinds for kind in of_sequence)
     return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
 
@@ -155,12 +155,14 @@ class _View:
         self.time = sequence.time
         # A vehicle that merely starts at the origin has a single zero there.
         zero = (x == 0).all(axis=2)
-        again = np.zeros_like(zero)
+        repeated = np.zeros_like(zero)
         if len(x) > 1:
-            again[1:] |= zero[1:] & zero[:-1]
-            again[:-1] |= zero[1:] & zero[:-1]
-        self.zero = again
-        self.x = np.where(again[:, :, None] | ~np.isfinite(x).all(axis=2, keepdims=True), np.nan, x)
+            repeated[1:] |= zero[1:] & zero[:-1]
+            repeated[:-1] |= zero[1:] & zero[:-1]
+        self.zero = repeated
+        self.x = np.where(
+            repeated[:, :, None] | ~np.isfinite(x).all(axis=2, keepdims=True), np.nan, x
+        )
         steps = np.diff(sequence.time)
         self.dt = float(np.median(steps)) if steps.size else float("nan")
 
@@ -286,21 +288,21 @@ def _expected(sound: np.ndarray, k: int) -> np.ndarray:
     everyone = everyone[np.isfinite(everyone).all(axis=1)]
     usual = np.median(everyone, axis=0) if len(everyone) else np.zeros(sound.shape[2])
     before = sound[max(k - RECENT, 0) : k]
-    known = np.isfinite(before).any(axis=0)
-    own = np.nanmedian(np.where(known, before, 0.0), axis=0) if len(before) else usual
-    return np.where(known, own, usual)
+    measured = np.isfinite(before).any(axis=0)
+    of_agent = np.nanmedian(np.where(measured, before, 0.0), axis=0) if len(before) else usual
+    return np.where(measured, of_agent, usual)
 
 
 def _continuations(expected: np.ndarray, then: np.ndarray, reach: float) -> dict[int, int]:
     """Which agent's next position continues which agent's path, where it is not its own."""
-    found: dict[int, int] = {}
+    continues: dict[int, int] = {}
     for rows, columns in _groups(expected, then, reach):
         cost = np.minimum(cdist(expected[rows], then[columns]), reach)
         for a, b in zip(*linear_sum_assignment(cost), strict=True):
             i, j = int(rows[a]), int(columns[b])
             if i != j and cost[a, b] < reach:
-                found[i] = j
-    return dict(sorted(found.items()))
+                continues[i] = j
+    return dict(sorted(continues.items()))
 
 
 def _groups(a: np.ndarray, b: np.ndarray, reach: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -309,8 +311,11 @@ def _groups(a: np.ndarray, b: np.ndarray, reach: float) -> Iterator[tuple[np.nda
     Points of different groups are farther apart, so that each group is a problem of its own. Groups
     of more than :data:`CROWDED` points are left out: paths cannot be told apart there.
     """
-    known = [np.flatnonzero(_placed(x)) for x in (a, b)]
-    i, j = (own[k] for own, k in zip(known, _near(a[known[0]], b[known[1]], reach), strict=True))
+    placed = [np.flatnonzero(_placed(x)) for x in (a, b)]
+    i, j = (
+        numbers[k]
+        for numbers, k in zip(placed, _near(a[placed[0]], b[placed[1]], reach), strict=True)
+    )
     n = len(a)
     graph = coo_array((np.ones(len(i)), (i, n + j)), shape=(2 * n, 2 * n))
     label = connected_components(graph, directed=False)[1]
@@ -333,22 +338,22 @@ def _near(a: np.ndarray, b: np.ndarray, reach: float) -> tuple[np.ndarray, np.nd
     """
     if not len(a) or not len(b):
         return np.empty(0, int), np.empty(0, int)
-    one, other = cKDTree(a), cKDTree(b)
+    tree, other = cKDTree(a), cKDTree(b)
     # a little farther, because trees compare squares; the caller decides at the limit
     reach *= 1 + 1e-9
-    if one.count_neighbors(other, reach) <= PAIRS:
-        found = one.sparse_distance_matrix(other, reach, output_type="ndarray")
-        return found["i"], found["j"]
+    if tree.count_neighbors(other, reach) <= PAIRS:
+        pairs = tree.sparse_distance_matrix(other, reach, output_type="ndarray")
+        return pairs["i"], pairs["j"]
     _, j = other.query(a, k=2, distance_upper_bound=reach)
     i = np.repeat(np.arange(len(a)), 2)
-    there = j.ravel() < len(b)
-    return i[there], j.ravel()[there]
+    within = j.ravel() < len(b)
+    return i[within], j.ravel()[within]
 
 
-def _order(view: _View, found: list[Fault]) -> Iterator[Fault]:
+def _order(view: _View, faults: list[Fault]) -> Iterator[Fault]:
     """Neighbours in the lane that are not in the order of their positions."""
     gap = np.diff(view.x[:, :, 0], axis=1)
-    swapped = [set(f.agents) for f in found if f.kind == "identity_swap"]
+    swapped = [set(f.agents) for f in faults if f.kind == "identity_swap"]
     for i, k in _samples(gap < 0):
         # After a swap the wrong order is its consequence, not another fault.
         if any({i, i + 1} <= agents for agents in swapped):
@@ -727,7 +732,7 @@ def sequence_findings(
     for kind, number in by_kind(faults.values()).items():
         if kind == "too_short":
             continue
-        first = next(f for own in faults.values() for f in own if f.kind == kind)
+        first = next(f for of_sequence in faults.values() for f in of_sequence if f.kind == kind)
         yield Finding(
             kind,
             "error" if number > MANY * len(sequences) else "warning",

@@ -83,21 +83,21 @@ def measured_noise(sequences: Iterable[Sequence]) -> Noise:
     for s in sequences:
         if s.n_samples < LEAST or not s.n_agents:
             continue
-        found = _noise(s.x)
-        places.append(found)
+        noise = _noise(s.x)
+        places.append(noise)
         # a forward difference holds the errors of two positions
-        speeds.append(np.sqrt(2) * found / s.dt if s.v is None else _noise(s.v))
-    position, start = (_usual(found) for found in (places, speeds))
+        speeds.append(np.sqrt(2) * noise / s.dt if s.v is None else _noise(s.v))
+    position, start = (_usual(noise) for noise in (places, speeds))
     return Noise(position, start)
 
 
 def _noise(x: np.ndarray) -> np.ndarray:
     """``(N,)`` standard deviations of the noise of ``(K, N, D)``, NaN where nothing is known."""
     size = np.abs(np.diff(x, 4, axis=0)).transpose(1, 0, 2).reshape(x.shape[1], -1)
-    known = np.isfinite(size).any(axis=1)
-    found = np.full(x.shape[1], np.nan)
-    found[known] = np.nanmedian(size[known], axis=1) / (_MEDIAN * np.sqrt(_FOURTH))
-    return found
+    measured = np.isfinite(size).any(axis=1)
+    deviations = np.full(x.shape[1], np.nan)
+    deviations[measured] = np.nanmedian(size[measured], axis=1) / (_MEDIAN * np.sqrt(_FOURTH))
+    return deviations
 
 
 def _usual(parts: list[np.ndarray]) -> float:
@@ -159,8 +159,8 @@ def across(time: np.ndarray, x: np.ndarray, i: int, at: np.ndarray) -> np.ndarra
     middle = (time[i] + time[i + 1]) / 2
     degree = DEGREE if high - low > DEGREE else 1
     powers = np.vander(time[rows] - middle, degree + 1)
-    found = np.linalg.lstsq(powers, x[rows] - x[i], rcond=None)[0]
-    return np.asarray(np.vander(at - middle, degree + 1) @ found + x[i])
+    coefficients = np.linalg.lstsq(powers, x[rows] - x[i], rcond=None)[0]
+    return np.asarray(np.vander(at - middle, degree + 1) @ coefficients + x[i])
 
 
 def smooth(time: np.ndarray, x: np.ndarray, window: float) -> tuple[np.ndarray, np.ndarray]:
@@ -194,9 +194,9 @@ def smooth(time: np.ndarray, x: np.ndarray, window: float) -> tuple[np.ndarray, 
         return x, np.gradient(x, time)
     even = np.interp(grid, time, x)
     samples = min(samples, len(grid) - 1 + len(grid) % 2)
-    found = savgol_filter(even, samples, DEGREE)
+    smoothed = savgol_filter(even, samples, DEGREE)
     speed = savgol_filter(even, samples, DEGREE, deriv=1, delta=step)
-    return np.interp(time, grid, found), np.interp(time, grid, speed)
+    return np.interp(time, grid, smoothed), np.interp(time, grid, speed)
 
 
 def start_smoothed(sequence: Sequence) -> Sequence:

@@ -109,12 +109,12 @@ def recognised(
     raw, memory = _raw(source), isinstance(source, pd.DataFrame)
     if raw.table is None:
         return _native(raw)
-    found = _of_table(in_seconds(raw), memory, domain, dict(given or {}))
+    source_of_table = _of_table(in_seconds(raw), memory, domain, dict(given or {}))
     if not memory:
-        return found
+        return source_of_table
     return replace(
-        found,
-        options=replace(found.options, path=""),  # type: ignore[call-arg]
+        source_of_table,
+        options=replace(source_of_table.options, path=""),  # type: ignore[call-arg]
         table=raw.table,
     )
 
@@ -132,28 +132,28 @@ def _of_table(
     exact = _exact(raw, given)
     if exact == "table":
         return _tidy(raw, domain, given)
-    found = _with_given(raw, meanings(raw), given)
-    if exact is None and not memory and (native := native_source(raw, found)) is not None:
+    columns = _with_given(raw, meanings(raw), given)
+    if exact is None and not memory and (native := native_source(raw, columns)) is not None:
         return _native(replace(raw, native=native))
-    unclear = rivals(found) if exact is None else {}
+    unclear = rivals(columns) if exact is None else {}
     for meaning in ("agent", "time", "frame", "x", "y", "sequence", "lane"):
         if meaning in unclear:
             raise ConfigError(f"{raw.path}: {unclear[meaning]}")
     rate = given.get("frame_rate")
-    told = {what: str(given[key]) for what, key in UNIT.items() if key in given}
+    stated = {what: str(given[key]) for what, key in UNIT.items() if key in given}
     try:
-        seen = scaled(raw, found, domain, rate, told)
+        measured = scaled(raw, columns, domain, rate, stated)
     except DataError:
         if exact is None:
             raise
         return _by_name(raw, exact, given)
     if exact is None:
-        _check_units(raw, seen, rate or raw.rate, told)
-    elif told or _si(seen.scale) or seen.share < SURE:
+        _check_units(raw, measured, rate or raw.rate, stated)
+    elif stated or _si(measured.scale) or measured.share < SURE:
         return _by_name(raw, exact, given)
-    found = seen.meanings
-    read = source_of(raw, seen)
-    return replace(read, line=_line(raw, found, seen, read.group))
+    columns = measured.meanings
+    read = source_of(raw, measured)
+    return replace(read, line=_line(raw, columns, measured, read.group))
 
 
 def _native(raw: Raw) -> Recognised:
@@ -207,11 +207,11 @@ def _tidy(raw: Raw, domain: Domain | None, given: Mapping[str, Any]) -> Recognis
     read, line = _by_name(raw, "table", given), ""
     if not any(key in given for key in UNIT.values()):
         try:
-            seen = scaled(raw, _with_given(raw, meanings(raw), given), chosen, None)
+            measured = scaled(raw, _with_given(raw, meanings(raw), given), chosen, None)
         except (DataError, ConfigError):
             return replace(read, options=replace(read.options, domain=chosen))
-        best = seen.scale
-        if not _si(best) and seen.share >= SURE:
+        best = measured.scale
+        if not _si(best) and measured.share >= SURE:
             line = (
                 f"{raw.path}: a tidy table is read in m and s, and its numbers look like "
                 f"{best}; {best.options} reads it so"
@@ -220,17 +220,21 @@ def _tidy(raw: Raw, domain: Domain | None, given: Mapping[str, Any]) -> Recognis
 
 
 def _with_given(
-    raw: Raw, found: dict[str, Meaning], given: Mapping[str, Any]
+    raw: Raw, recognised_columns: dict[str, Meaning], given: Mapping[str, Any]
 ) -> dict[str, Meaning]:
     """Meanings as the user says, and the others as they were recognised."""
     assert raw.table is not None
     names = list(map(str, raw.table.frame.columns))
     columns: Mapping[str, str | None] = given.get("columns") or {}
-    own: dict[str, Meaning] = {}
+    given_columns: dict[str, Meaning] = {}
     for key, column in columns.items():
         meaning = CALLED.get(str(key), str(key))
         if column is None:
-            found = {m: one for m, one in found.items() if m != meaning}
+            recognised_columns = {
+                m: column_meaning
+                for m, column_meaning in recognised_columns.items()
+                if m != meaning
+            }
             continue
         if column not in names:
             raise ConfigError(
@@ -239,23 +243,31 @@ def _with_given(
             )
         if meaning == "time" and given.get("time_unit") == "frame":
             meaning = "frame"
-        own[meaning] = Meaning(column, plain(column)[1], "given")
-    taken = {one.column for one in own.values()}
-    if {"time", "frame"} & own.keys():
-        found = {m: one for m, one in found.items() if m not in ("time", "frame")}
-    return {m: one for m, one in found.items() if one.column not in taken} | own
+        given_columns[meaning] = Meaning(column, plain(column)[1], "given")
+    taken = {column_meaning.column for column_meaning in given_columns.values()}
+    if {"time", "frame"} & given_columns.keys():
+        recognised_columns = {
+            m: column_meaning
+            for m, column_meaning in recognised_columns.items()
+            if m not in ("time", "frame")
+        }
+    return {
+        m: column_meaning
+        for m, column_meaning in recognised_columns.items()
+        if column_meaning.column not in taken
+    } | given_columns
 
 
-def _check_units(raw: Raw, seen: Scaled, rate: float | None, told: Mapping[str, str]) -> None:
+def _check_units(raw: Raw, measured: Scaled, rate: float | None, stated: Mapping[str, str]) -> None:
     """Refuse units, or rates of frames, that may be two things.
 
     Raises:
         ConfigError: names both.
     """
-    doubts = seen.doubts(rate)
-    if "units" in doubts and not told:
+    doubts = measured.doubts(rate)
+    if "units" in doubts and not stated:
         raise ConfigError(f"{raw.path}: {doubts['units']}")
-    if len(seen.rates(rate)) > 1:
+    if len(measured.rates(rate)) > 1:
         raise ConfigError(f"{raw.path}: {doubts['rate']}")
 
 
@@ -263,9 +275,9 @@ def _si(scale: Scale) -> bool:
     return (scale.position, scale.time, scale.rate, scale.speed) == ("m", "s", None, "m/s")
 
 
-def _line(raw: Raw, found: Mapping[str, Meaning], seen: Scaled, group: str) -> str:
-    named = ", ".join(f"{meaning} = {one.column}" for meaning, one in found.items())
-    words, scale = f"{seen.scale} ({certainty(seen.share)})", seen.scale
+def _line(raw: Raw, columns: Mapping[str, Meaning], measured: Scaled, group: str) -> str:
+    named = ", ".join(f"{meaning} = {column.column}" for meaning, column in columns.items())
+    words, scale = f"{measured.scale} ({certainty(measured.share)})", measured.scale
     if scale.rate is not None and raw.rate not in (None, scale.rate):
         words = f"{replace(scale, rate=raw.rate)} as it tells; {scale.rate:g} frames/s fit"
     return f"{raw.path}: recognised {named}; {words}; read as data={group}"
@@ -289,11 +301,11 @@ def source_of_native(raw: Raw) -> Recognised:
     path = str(raw.path.absolute())
     if raw.native == "esimas":
         name = raw.path.stem.removeprefix("sequence_data")
-        least = 2 if name.startswith("_") else 3
+        min_vehicles = 2 if name.startswith("_") else 3
         folder = str(raw.path.absolute().parent)
         return Recognised(
             "esimas",
-            EsimasOptions(source=folder, recording=name.lstrip("_"), min_vehicles=least),
+            EsimasOptions(source=folder, recording=name.lstrip("_"), min_vehicles=min_vehicles),
         )
     natives: dict[str, DataOptions] = {
         "ngsim": NgsimOptions(path=path),

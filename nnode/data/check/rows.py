@@ -48,18 +48,18 @@ class Scaled:
         """Probability of the units, whatever the rate of frames."""
         return share(self.scales)
 
-    def rates(self, told: float | None) -> list[float]:
+    def rates(self, stated: float | None) -> list[float]:
         """Frames per second that fit, where times are frames and nothing tells their rate."""
-        if told is not None or self.scale.rate is None:
+        if stated is not None or self.scale.rate is None:
             return []
         same = (s for s in self.scales if s.units == self.scale.units and s.probability > FAIR)
         return sorted({s.rate for s in same if s.rate})
 
-    def doubts(self, told: float | None) -> dict[str, str]:
+    def doubts(self, stated: float | None) -> dict[str, str]:
         """What may be two things, ``units`` and ``rate``, in words.
 
         Args:
-            told: frames per second as the file or the user tells.
+            stated: frames per second as the file or the user tells.
         """
         sentences, best = {}, self.scale
         if self.share < LIKELY:
@@ -68,7 +68,7 @@ class Scaled:
                 f"its numbers may be {best} or {other}; say which, with {best.options} or "
                 f"{other.options}"
             )
-        if rates := self.rates(told):
+        if rates := self.rates(stated):
             fit = " or ".join(f"{rate:g}" for rate in rates)
             sentences["rate"] = (
                 f"times are frames of a rate that the file does not tell; {fit} frames/s fit: say "
@@ -160,24 +160,36 @@ def _domains(
     return ["traffic"] if "lane" in meanings else ["crowd", "traffic"]
 
 
-def _rows(raw: Raw, found: Mapping[str, Meaning]) -> Trajectories:
+def _rows(raw: Raw, meanings_of_columns: Mapping[str, Meaning]) -> Trajectories:
     """The rows as they stand: what tells recordings and sequences apart is part of the name."""
-    table, pairs = raw.table, are_pairs(found)
+    table, pairs = raw.table, are_pairs(meanings_of_columns)
     assert table is not None
-    _check_needed(raw, found, pairs)
+    _check_needed(raw, meanings_of_columns, pairs)
 
     def cells(*meanings: str) -> list[np.ndarray]:
-        return [numbers(table.frame, found[m].column) for m in meanings if m in found]
+        return [
+            numbers(table.frame, meanings_of_columns[m].column)
+            for m in meanings
+            if m in meanings_of_columns
+        ]
 
     def names(*meanings: str) -> list[np.ndarray]:
-        return [table.names(found[m].column, empty=True) for m in meanings if m in found]
+        return [
+            table.names(meanings_of_columns[m].column, empty=True)
+            for m in meanings
+            if m in meanings_of_columns
+        ]
 
     parts = names("recording", "sequence")
-    (time,) = cells(clock_of(found))
+    (time,) = cells(clock_of(meanings_of_columns))
     if pairs:
-        pair = _pairs(raw, found)
+        pair = _pairs(raw, meanings_of_columns)
         leads = ["follower", "leader"]
-        x = _integrated(raw, found) if is_spaced(found) else cells("x_follower", "x_leader")
+        x = (
+            _integrated(raw, meanings_of_columns)
+            if is_spaced(meanings_of_columns)
+            else cells("x_follower", "x_leader")
+        )
         v = cells("v_follower", "v_leader")
         return Trajectories(
             path=raw.path,
@@ -193,7 +205,7 @@ def _rows(raw: Raw, found: Mapping[str, Meaning]) -> Trajectories:
     agents = _joined([*parts, agent])
     agents[agent == ""] = None
     # along the lane where there are lanes
-    x = cells("x") if "lane" in found else cells("x", "y")
+    x = cells("x") if "lane" in meanings_of_columns else cells("x", "y")
     v = cells("vx", "vy")[: len(x)]
     speed = [np.sqrt(sum(part**2 for part in v))] if len(v) == len(x) else cells("speed")
     part = _joined(parts) if parts else None

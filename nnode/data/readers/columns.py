@@ -198,8 +198,8 @@ class Table:
         except OSError as error:
             raise DataError(f"{path} cannot be read: {error.strerror}") from error
         text = start.decode("utf-8-sig", errors="replace")
-        found = layout(text, whole=len(start) < LOOKED_AT)
-        return (None, csv) if found is None else (found.names, {**found.options, **csv})
+        form = layout(text, whole=len(start) < LOOKED_AT)
+        return (None, csv) if form is None else (form.names, {**form.options, **csv})
 
     def _take(self, frame: pd.DataFrame) -> None:
         self.frame = frame
@@ -251,7 +251,7 @@ class Table:
                 raise ConfigError(
                     f"data.columns.{key} is unknown; expected {', '.join(required + optional)}"
                 )
-        found = {}
+        chosen = {}
         for key in required + optional:
             if key in names and names[key] is None:
                 if key in required:
@@ -259,10 +259,10 @@ class Table:
                 continue
             column = names.get(key) or key
             if column in self.frame.columns:
-                found[key] = column
+                chosen[key] = column
             elif key in required or key in names:
                 raise DataError(self._missing(key, column, mapped=mapped))
-        return found
+        return chosen
 
     def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
         """The column as ``(rows,)`` float64.
@@ -325,21 +325,21 @@ class Table:
                 return None
             cells = cells.astype("string")
         try:
-            found = self._instants(cells).dt.as_unit("ns")
+            instants = self._instants(cells).dt.as_unit("ns")
         except (ValueError, OverflowError) as error:  # beyond the years that nanoseconds count
             raise DataError(
                 f"{self.path}: column {column!r} holds no dates of our time: {error}"
             ) from error
-        known = found.notna().to_numpy()
-        if not known.all():
-            i = int(np.flatnonzero(~known)[0])
+        valid = instants.notna().to_numpy()
+        if not valid.all():
+            i = int(np.flatnonzero(~valid)[0])
             shown = "nothing" if cells.isna().iloc[i] else repr(str(cells.iloc[i])[:40])
             raise DataError(
                 f"{self.path}, {self.row(i)}: column {column!r} holds {shown}; expected seconds, "
                 "or dates (2020-01-31 08:00:00.2), clock times (08:00:00.2) or durations in all "
                 "rows"
             )
-        return np.asarray(found.astype("int64"))
+        return np.asarray(instants.astype("int64"))
 
     @staticmethod
     def _instants(cells: pd.Series) -> pd.Series:
@@ -367,10 +367,10 @@ class Table:
         Raises:
             DataError: a cell without such; names the row.
         """
-        found = self.instants(column)
-        if found is not None:
-            first = int(found.min())
-            return first, (found - first) / 1e9
+        instants = self.instants(column)
+        if instants is not None:
+            first = int(instants.min())
+            return first, (instants - first) / 1e9
         values = self.numbers(column)
         whole = pd.api.types.is_integer_dtype(self.frame[column])
         if whole and np.abs(values).max() < _WHOLE:
@@ -414,8 +414,8 @@ class Table:
             # NumPy takes text with zero characters behind it for the same text without them
             text = text.str.rstrip("\0").str.strip()
         except (TypeError, ValueError):  # bytes that are no text, or lists in cells
-            known = map(int, np.flatnonzero(~absent))
-            i = next((i for i in known if not _is_text(cells, i)), 0)
+            filled = map(int, np.flatnonzero(~absent))
+            i = next((i for i in filled if not _is_text(cells, i)), 0)
             raise DataError(
                 f"{self.path}, {self.row(i)}: column {column!r} holds {_quoted(cells, i)}; "
                 "expected a name or number"
@@ -464,10 +464,10 @@ class Table:
 def floats(cells: pd.Series) -> np.ndarray:
     """A column's cells ``(rows,)`` as float64, NaN where they hold no real number."""
     try:
-        found = pd.to_numeric(cells, errors="coerce")
-        if found.dtype.kind == "c":  # which would lose its imaginary part
+        numbers = pd.to_numeric(cells, errors="coerce")
+        if numbers.dtype.kind == "c":  # which would lose its imaginary part
             return np.full(len(cells), np.nan)
-        return np.array(found, dtype=np.float64)
+        return np.array(numbers, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):  # such as whole numbers beyond float64
         return np.array([_float(cell) for cell in cells])
 

@@ -128,10 +128,10 @@ def _load(path: Path) -> list[Any]:
         raise DataError(
             f"{path}: expected a cell array 'sequences', found {', '.join(content) or 'nothing'}"
         )
-    found = content["sequences"]
-    if isinstance(found, np.ndarray):
-        return list(found.ravel())
-    return found if isinstance(found, list) else [found]
+    sequences = content["sequences"]
+    if isinstance(sequences, np.ndarray):
+        return list(sequences.ravel())
+    return sequences if isinstance(sequences, list) else [sequences]
 
 
 def _field(cell: Any, name: str, where: str) -> np.ndarray:

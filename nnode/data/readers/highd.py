@@ -92,11 +92,11 @@ def read_highd(files: dict[str, Path], options: HighDOptions) -> Reading:
 
 def _rate(path: Path) -> float:
     table = Table(path)
-    (rate, *more) = table.numbers(table.choose(("frameRate",))["frameRate"])
-    if more or not rate > 0:
+    (rate, *further) = table.numbers(table.choose(("frameRate",))["frameRate"])
+    if further or not rate > 0:
         raise DataError(
             f"{path}: expected one row with a positive frameRate (1/s), found "
-            f"{1 + len(more)} rows, the first with {rate:g}"
+            f"{1 + len(further)} rows, the first with {rate:g}"
         )
     return float(rate)
 

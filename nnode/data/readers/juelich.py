@@ -135,43 +135,43 @@ def cut_people(people: People, options: JuelichOptions, walls: np.ndarray | None
         )
     if walls is None:
         walls = _walls(path.stem, options.walls, axis, rows.x, view)
-    found: list[Sequence] = []
+    sequences: list[Sequence] = []
     notes: list[str] = []
-    for (name,), own in rows.parts("recording"):
+    for (name,), of_recording in rows.parts("recording"):
         recording = name or rows.name
-        grid = Grid(dt, float(own.time.min()))
-        every = records(own, grid, fill=options.fill, smoothing=options.smooth)
+        grid = Grid(dt, float(of_recording.time.min()))
+        every = records(of_recording, grid, fill=options.fill, smoothing=options.smooth)
         every = [_with_velocity(record, dt, options) for record in every]
         notes += told_uneven(every, dt)
-        goals = _goals(own, read_exits(options.exits))
+        goals = _goals(of_recording, read_exits(options.exits))
         before = round(options.history / dt)
-        for number, (there, first, last) in enumerate(
+        for number, (present, first, last) in enumerate(
             by_presence(every, steps, max(options.min_agents, 1), axis, view)
         ):
-            there.sort(key=lambda record: natural(record.agent))
-            of = [Member(record.agent, record.row, [record]) for record in there]
-            found.append(
+            present.sort(key=lambda record: natural(record.agent))
+            of = [Member(record.agent, record.row, [record]) for record in present]
+            sequences.append(
                 sequence_of(
                     f"{recording}/{number:03d}",
-                    own,
+                    of_recording,
                     of,
                     first,
                     last,
                     grid,
                     recording=recording,
-                    destination=_destinations(goals, there, first, last),
-                    preferred=_before(every, there, first, before, dt),
+                    destination=_destinations(goals, present, first, last),
+                    preferred=_before(every, present, first, before, dt),
                     walls=walls,
                 )
             )
-    if not found:
+    if not sequences:
         span = float(rows.time.max() - rows.time.min()) + dt
         raise DataError(
             f"{path}: no sequence; nowhere are {max(options.min_agents, 1)} people present for "
             f"{options.t_seq:g} s ({len(set(rows.agent))} people, {span:g} s in all); lower "
             "data.t_seq or data.min_agents, widen data.view, or leave it out of data.recording"
         )
-    return Reading(found, notes=notes)
+    return Reading(sequences, notes=notes)
 
 
 def _with_velocity(record: Record, dt: float, options: JuelichOptions) -> Record:
@@ -196,18 +196,18 @@ def _goals(rows: Trajectories, exits: list[Exit]) -> _Goals:
     names, first = np.unique(agent, return_index=True)
     last = len(agent) - 1 - np.unique(agent[::-1], return_index=True)[1]
     try:
-        own = exits_of(exits, rows.x[order[first]], rows.x[order[last]], names.tolist())
+        goals = exits_of(exits, rows.x[order[first]], rows.x[order[last]], names.tolist())
     except DataError as error:
         raise DataError(f"{rows.path}: {error}") from error
-    return dict(zip(names.tolist(), own, strict=True))
+    return dict(zip(names.tolist(), goals, strict=True))
 
 
-def _destinations(goals: _Goals, there: list[Record], first: int, last: int) -> np.ndarray:
+def _destinations(goals: _Goals, present: list[Record], first: int, last: int) -> np.ndarray:
     """``(N, 2)`` m: nearest points of exits, or the last positions of the sequence."""
     if not goals:
-        return np.stack([record.x[last - record.first] for record in there])
-    x = np.stack([record.x[first - record.first] for record in there])
-    return destinations([goals[record.agent] for record in there], x)
+        return np.stack([record.x[last - record.first] for record in present])
+    x = np.stack([record.x[first - record.first] for record in present])
+    return destinations([goals[record.agent] for record in present], x)
 
 
 def _interval(option: str, value: list[float] | None) -> tuple[float, float] | None:
@@ -323,7 +323,7 @@ def _check_lines(path: Path) -> None:
 
 
 def _before(
-    every: list[Record], there: list[Record], first: int, steps: int, dt: float
+    every: list[Record], present: list[Record], first: int, steps: int, dt: float
 ) -> np.ndarray | None:
     """Mean velocities (m/s) of people so many steps before a time, NaN of who was not tracked."""
     at = first - steps
@@ -331,10 +331,10 @@ def _before(
         return None
     then = {r.agent: r.x[at - r.first] for r in every if r.first <= at <= r.last}
     nowhere = np.full(2, np.nan)
-    found: np.ndarray = np.stack(
-        [(r.x[first - r.first] - then.get(r.agent, nowhere)) / (steps * dt) for r in there]
+    velocity: np.ndarray = np.stack(
+        [(r.x[first - r.first] - then.get(r.agent, nowhere)) / (steps * dt) for r in present]
     )
-    return found if np.isfinite(found).any() else None
+    return velocity if np.isfinite(velocity).any() else None
 
 
 def _walls(

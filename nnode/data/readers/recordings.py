@@ -153,9 +153,9 @@ def tables_below(options: DataOptions, path: str, patterns: Iterable[str]) -> di
     if place.is_file():
         return {place.name: place}
     for pattern in patterns:
-        found = sorted(path for path in place.glob(pattern) if path.is_file())
-        if found:
-            return {path.relative_to(place).as_posix(): path for path in found}
+        files = sorted(path for path in place.glob(pattern) if path.is_file())
+        if files:
+            return {path.relative_to(place).as_posix(): path for path in files}
     raise DataError(
         f"data.path: the folder {place} holds no file like {' or '.join(patterns)} (data.files)"
         f"{_published(options.name)}"
@@ -174,5 +174,5 @@ def _published(name: str) -> str:
 
 
 def _matches(pattern: re.Pattern[str], names: Iterable[str]) -> list[str]:
-    found = (pattern.fullmatch(name) for name in names)
-    return [match.group(1) for match in found if match]
+    matches = (pattern.fullmatch(name) for name in names)
+    return [match.group(1) for match in matches if match]

@@ -185,8 +185,8 @@ class _Content:
             self.time.append(self.now)
             self.x.append(self._number(name, attributes, "pos"))
             for key, column in (("speed", self.speed), ("length", self.length)):
-                known = key in attributes
-                column.append(self._number(name, attributes, key) if known else math.nan)
+                given = key in attributes
+                column.append(self._number(name, attributes, key) if given else math.nan)
             self.line.append(self.parser.CurrentLineNumber)
 
     def _end(self, name: str) -> None:

@@ -85,9 +85,9 @@ def read_table(source: Path | Table, options: TableOptions, walls: Path | None =
         check_known(asked, rows.recording)
         rows = rows.at(np.flatnonzero(np.isin(rows.recording, asked)))
     segments = None if walls is None else _segments(walls)
-    found = by_sequence(rows, options, natural)
-    found[:] = [replace(s, walls=segments) for s in found]
-    return found
+    sequences = by_sequence(rows, options, natural)
+    sequences[:] = [replace(s, walls=segments) for s in sequences]
+    return sequences
 
 
 def _rows(table: Table, options: TableOptions) -> Trajectories:
@@ -138,14 +138,14 @@ def _goals(rows: Trajectories, options: TableOptions) -> np.ndarray:
     """``(R, 2)`` m, the destinations of people by their exits."""
     exits, goal = read_exits(options.exits), np.full_like(rows.x, np.nan)
     code = pd.DataFrame({"r": rows.recording, "s": rows.sequence, "a": rows.agent})
-    known = np.isfinite(rows.x).all(axis=1)
+    measured = np.isfinite(rows.x).all(axis=1)
     for numbers in code.groupby(["r", "s", "a"], sort=False).indices.values():
-        own = np.asarray(numbers)[np.argsort(rows.time[numbers], kind="stable")]
-        there = own[known[own]] if known[own].any() else own
-        start, end = rows.x[there[:1]], rows.x[there[-1:]]
-        group = None if rows.group is None else [str(rows.group[own[0]])]
-        chosen = exits_of(exits, start, end, [str(rows.agent[own[0]])], group)
-        goal[own] = destinations(chosen, start)
+        of_person = np.asarray(numbers)[np.argsort(rows.time[numbers], kind="stable")]
+        located = of_person[measured[of_person]] if measured[of_person].any() else of_person
+        start, end = rows.x[located[:1]], rows.x[located[-1:]]
+        group = None if rows.group is None else [str(rows.group[of_person[0]])]
+        chosen = exits_of(exits, start, end, [str(rows.agent[of_person[0]])], group)
+        goal[of_person] = destinations(chosen, start)
     return goal
 
 
