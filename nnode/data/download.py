@@ -255,8 +255,8 @@ def _fetch_published(dataset: str, name: str, folder: Path) -> Path:
         published = [n for o in ORIGINS.values() if dataset in o.folders for n in o.files]
         raise DataError(
             f"{name} is not among the published files of {dataset}"
-            f"{_nearest(name, published)}; published: {', '.join(published)}; for a file of your own "
-            "set data.source=FOLDER"
+            f"{_nearest(name, published)}; published: {', '.join(published)}; for a file of your "
+            "own set data.source=FOLDER"
         )
     return _fetch(dataset, name, origin.url(name), folder)
 
