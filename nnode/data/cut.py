@@ -38,7 +38,7 @@ LISTED = 3
 
 
 class Reading(list[Sequence]):
-    """Sequences of a reader that tells what it left out and what it changed.
+    """Sequences of a reader, with what it left out and what it changed.
 
     Attributes:
         left_out: ``name`` and ``why`` of each record of which there is no sequence.
@@ -85,7 +85,7 @@ _Platoon = tuple[list[Record], int, int]
 
 @dataclass
 class Member:
-    """An agent of a sequence: its name, a row of the table that tells what it is, its records."""
+    """An agent of a sequence: its name, a row of the table with its properties, its records."""
 
     agent: str
     row: int
@@ -147,8 +147,8 @@ def sequence_of(
     return Sequence(name=name, x=x, **(fields | further))
 
 
-def told_uneven(agent_records: Iterable[Record], dt: float) -> list[str]:
-    """A sentence about records whose times are uneven, if there are such."""
+def uneven_text(agent_records: Iterable[Record], dt: float) -> list[str]:
+    """A sentence about records with uneven times, if any."""
     every = list(agent_records)
     number = sum(int(r.uneven.sum()) for r in every)
     total = sum(len(r.x) for r in every)
@@ -206,7 +206,7 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
         stem = recording or table.name
         reused = stem if options.agents is Agents.auto else ""
         every = records(rows, grid, fill=options.fill, smoothing=options.smooth, reused=reused)
-        notes += [f"{stem}: {text}" for text in told_uneven(every, grid.dt)]
+        notes += [f"{stem}: {text}" for text in uneven_text(every, grid.dt)]
         present = {""} if rows.lane is None else set(rows.lane)
         for lane in (name for name in chosen if name in present):
             lane_records = [r for r in every if rows.lane is None or rows.lane[r.row] == lane]
@@ -293,7 +293,7 @@ def by_sequence(
         lane = not ordered and table.x.shape[1] == 1
         orders = [_in_lane(of, first) if lane else of for first, _ in parts]
         reading += numbered_parts(name, rows, orders, parts, grid, **fields)
-    reading.notes = told_uneven(every, table.dt) + notes[:LISTED]
+    reading.notes = uneven_text(every, table.dt) + notes[:LISTED]
     if len(notes) > LISTED:
         reading.notes.append(f"and {len(notes) - LISTED} more such sequences")
     return reading

@@ -17,8 +17,8 @@ from nnode.data.smooth import Noise, measured_noise, smooth_speeds, suggested_wi
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError
 
-#: Sequences by which noise is told, where no manifest tells it.
-_TOLD = 400
+#: Sequences by which noise is estimated where no manifest has it.
+_ESTIMATED = 400
 
 
 class SmoothSpeeds:
@@ -48,12 +48,12 @@ Source = Store | Sequences | SmoothSpeeds
 
 
 def noise_of(source: Source) -> Noise:
-    """The noise of measurement of a source, as its manifest tells it or as it shows."""
+    """The noise of measurement of a source, from its manifest or else estimated."""
     stored = source.manifest.get("noise")
     if stored is not None:
         values = {key: float("nan") if value is None else value for key, value in stored.items()}
         return Noise(**values)
-    every = max(1, -(-len(source) // _TOLD))
+    every = max(1, -(-len(source) // _ESTIMATED))
     return measured_noise(source[i] for i in range(0, len(source), every))
 
 

@@ -54,7 +54,7 @@ class Exit:
 
 
 def read_exits(exits: Any) -> list[Exit]:
-    """Exits as ``data.exits`` tells them.
+    """Exits of ``data.exits``.
 
     Args:
         exits: ``{name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}`` (m), with

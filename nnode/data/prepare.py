@@ -147,7 +147,7 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
             :func:`nnode.plots.quality.plot_faults`; None draws nothing.
 
     Returns:
-        The store. Its manifest tells the source files and their SHA-256, all options, the
+        The store. Its manifest has the source files and their SHA-256, all options, the
         package's version, the sampling interval (s), how many sequences were read, kept and
         dropped (in all and by recording), every fault that was found, every sequence and agent
         that was dropped and why, every record of which there is no sequence, what was interpolated

@@ -273,7 +273,7 @@ def _once(table: Trajectories, order: np.ndarray, code: np.ndarray) -> None:
         raise DataError(
             f"{table.path}, {table.where(j)}: agent {table.agent[j]}{whose} stands there a second "
             f"time at {table.time[j]:g} s (first in {table.where(i)}); expected one row per agent "
-            "and time: name the column that tells agents of one name apart (data.columns)"
+            "and time: name the column that distinguishes agents of one name (data.columns)"
         )
 
 

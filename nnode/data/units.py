@@ -30,7 +30,7 @@ SURE, LIKELY = 0.95, 0.7
 #: A rate that is no less probable than this fits.
 FAIR = 0.05
 
-#: What units are expected at all, without a name that tells: most data are in SI units.
+#: Prior weights of units where no column's name has one: most data are in SI units.
 _BEFORE = {
     "m": 1.0,
     "cm": 0.1,
@@ -173,7 +173,7 @@ class Scale:
 
 
 def medians(rows: Trajectories, domain: Domain) -> Medians:
-    """What the scale is told by, of rows in order."""
+    """The medians of rows in order by which the scale is recognised."""
     moves = displacements(rows)
     speed = ratio = float("nan")
     if moves.size.size:
@@ -281,9 +281,9 @@ def scales(
 
     Args:
         measured: medians by the domains that come into question.
-        stated: units by ``position``, ``time``, ``speed`` as the file tells them.
-        frames: whether times may be frames; then they are where ``told`` says so.
-        rate: frames per second as the file or the user tells.
+        stated: units by ``position``, ``time``, ``speed`` as the file states them.
+        frames: whether times may be frames; then they are where ``stated`` says so.
+        rate: frames per second that the file or the user states.
         speeds: whether the file has speeds.
     """
     scored = []

@@ -87,7 +87,7 @@ def examine(path: Path, domain: Domain | None = None, rate: float | None = None)
 
     Args:
         domain: of the data; None looks for itself.
-        rate: frames per second that the file is said to have; None: what the file tells.
+        rate: frames per second that the file is said to have; None: what the file states.
 
     Raises:
         ConfigError: there is no such file.

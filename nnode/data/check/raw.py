@@ -33,8 +33,8 @@ class Raw:
         table: the cells, None for a native format.
         named: whether the file names its columns.
         separator: ``,``, ``;``, tab, or a space for any white space; empty for Parquet.
-        rate: frames per second that a comment tells.
-        unit: of positions that a comment tells, ``cm`` or ``m``.
+        rate: frames per second that a comment states.
+        unit: of positions that a comment states, ``cm`` or ``m``.
         dated: columns of dates, clock times or durations; in ``table`` these are seconds.
     """
 

@@ -377,7 +377,7 @@ def _people(raw: Raw, scaled_table: Scaled) -> Recognised:
     scale, rows = scaled_table.scale, scaled_table.rows
     columns = {meaning: recognised.column for meaning, recognised in scaled_table.meanings.items()}
     dt = rows.dt
-    if scale.rate is not None and raw.rate is not None:  # what the file tells is taken
+    if scale.rate is not None and raw.rate is not None:  # what the file states is taken
         dt *= scale.rate / raw.rate
         scale = replace(scale, rate=raw.rate)
     steps = max(2, round(1 / dt))

@@ -49,7 +49,7 @@ class Scaled:
         return share(self.scales)
 
     def rates(self, stated: float | None) -> list[float]:
-        """Frames per second that fit, where times are frames and nothing tells their rate."""
+        """Frames per second that fit, where times are frames and nothing states their rate."""
         if stated is not None or self.scale.rate is None:
             return []
         same = (s for s in self.scales if s.units == self.scale.units and s.probability > FAIR)
@@ -59,7 +59,7 @@ class Scaled:
         """What may be two things, ``units`` and ``rate``, in words.
 
         Args:
-            stated: frames per second as the file or the user tells.
+            stated: frames per second that the file or the user states.
         """
         sentences, best = {}, self.scale
         if self.share < LIKELY:
@@ -89,7 +89,7 @@ def scaled(
     Args:
         meanings: column by meaning.
         domain, rate: see :func:`examine`.
-        told_units: units by ``position``, ``time``, ``speed``, as the user tells them.
+        told_units: units by ``position``, ``time``, ``speed``, as the user states them.
 
     Raises:
         DataError: a column that is needed was not recognised, or nothing moves.
@@ -161,7 +161,7 @@ def _domains(
 
 
 def _rows(raw: Raw, meanings_of_columns: Mapping[str, Meaning]) -> Trajectories:
-    """The rows as they stand: what tells recordings and sequences apart is part of the name."""
+    """The rows as they stand; names of recordings and sequences are part of the agents' names."""
     table, pairs = raw.table, are_pairs(meanings_of_columns)
     assert table is not None
     _check_needed(raw, meanings_of_columns, pairs)

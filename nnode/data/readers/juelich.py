@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nnode.data.cut import Member, Reading, by_presence, sequence_of, told_uneven
+from nnode.data.cut import Member, Reading, by_presence, sequence_of, uneven_text
 from nnode.data.exits import Exit, destinations, exits_of, read_exits
 from nnode.data.options import DataOptions, one_of, positive
 from nnode.data.readers.recordings import natural, raw_files
@@ -142,7 +142,7 @@ def cut_people(people: People, options: JuelichOptions, walls: np.ndarray | None
         grid = Grid(dt, float(of_recording.time.min()))
         every = records(of_recording, grid, fill=options.fill, smoothing=options.smooth)
         every = [_with_velocity(record, dt, options) for record in every]
-        notes += told_uneven(every, dt)
+        notes += uneven_text(every, dt)
         goals = _goals(of_recording, read_exits(options.exits))
         before = round(options.history / dt)
         for number, (present, first, last) in enumerate(
@@ -246,7 +246,7 @@ def load_people(path: Path, options: JuelichOptions) -> People:
         raise ConfigError(
             f"{path}: the header and data.frame_rate={rate}, data.unit={options.unit} do not "
             f"settle the frame rate and the unit: {error} Set data.frame_rate (1/s) and "
-            "data.unit (cm, m) where the header lacks them, and to null where it tells them"
+            "data.unit (cm, m) where the header lacks them, and to null where it has them"
         ) from error
     table = trajectory.data[["id", "frame", "x", "y"]].reset_index(drop=True)
     if not np.isfinite(table[["x", "y"]].to_numpy()).all():

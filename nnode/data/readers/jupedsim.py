@@ -72,12 +72,12 @@ def read_walkway(
         path: SQLite database as JuPedSim's writer makes it; text ``id frame x y z``; or a table
             (CSV, Parquet, in memory, or any text whose ``columns`` are given).
         options: those of the Jülich reader. ``frame_rate`` and ``unit`` are for texts without a
-            header; a database tells its own, and a table has units.
+            header; a database states its own, and a table has units.
         geometry: text file with the walkable area as WKT (m); it takes the place of the area
             that a database holds.
 
     Returns:
-        Sequences named ``recording/number`` after the file. Where neither file tells an area,
+        Sequences named ``recording/number`` after the file. Where neither file has an area,
         walls are those of ``options.walls``.
 
     Raises:

@@ -38,7 +38,7 @@ HEAD = ("Date", "Vehicle_order", "Number_of_vehicles", "ACC", "Distance_setting"
 #: Places in a platoon; its vehicles are tens.
 MOST_VEHICLES = 1000
 
-#: What may be told of a vehicle.
+#: Properties of a vehicle that models may be given.
 KNOWN = ("make", "setting", "acc", "order")
 
 #: Times of a run, with those that no row stands for.
@@ -61,7 +61,7 @@ AWAY = 50.0
 class OpenAccOptions(DataOptions):
     """Platoons on test tracks of OpenACC: speeds, and gaps from bumper to bumper.
 
-    Of each vehicle is known: ``make``, ``setting`` (the distance setting of the adaptive cruise
+    Each vehicle has a ``make``, ``setting`` (the distance setting of the adaptive cruise
     control, ``none`` for people), ``acc`` (``ACC`` or ``people``), ``order`` (1 leads).
     """
 
@@ -71,8 +71,8 @@ class OpenAccOptions(DataOptions):
     path: str | None = None
     # patterns of the files of a folder, of which the first that fits any is taken
     files: list[str] = field(default_factory=lambda: ["**/*.csv", "**/*.parquet"])
-    kind: str | None = "make"  # make | setting | acc | order; null: it is not told
-    group: str | None = "setting"  # make | setting | acc | order; null: it is not told
+    kind: str | None = "make"  # make | setting | acc | order; null: not given to the models
+    group: str | None = "setting"  # make | setting | acc | order; null: not given to the models
     # m, that every vehicle is taken to have, as it is not published: positions are gaps and
     # lengths; null: positions are gaps alone
     length: float | None = 5.0
@@ -112,7 +112,7 @@ def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> list[Seq
 
     Args:
         files: see :func:`openacc_files`.
-        options: what is told of vehicles, time grid and the way of cutting.
+        options: what is known of vehicles, time grid and the way of cutting.
 
     Returns:
         Sequences named ``run/number``, with measured speeds. Vehicles are called ``make``, with

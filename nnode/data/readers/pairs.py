@@ -26,11 +26,11 @@ from nnode.data.cut import (
     chosen_lanes,
     numbered_parts,
     spans,
-    told_uneven,
+    uneven_text,
     whole_steps,
     windows,
 )
-from nnode.data.limits import UNEVEN
+from nnode.data.limits import LIMITS, UNEVEN
 from nnode.data.options import DataOptions, check_known, one_of, positive, wanted
 from nnode.data.readers.columns import ColumnOptions, Table, opened, seconds_per_unit
 from nnode.data.readers.recordings import natural, place_below, tables_below
@@ -52,10 +52,6 @@ OPTIONAL = (*_LENGTHS, "spacing", *_SPEEDS, *_WORDS)
 
 #: Key of the table that lists the files.
 INDEX = "index"
-
-#: m by which a length that follows from spacings may vary within a pair: the error that a single
-#: position may have without being a fault (:mod:`nnode.data.quality`).
-UNSTEADY = 0.5
 
 
 class Gaps(str, Enum):
@@ -146,7 +142,7 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
         Speeds are the measured ones where the source has those of both. A pair without a column
         of it is a file; without a run, all are of one recording, which is called like the data. A
         vehicle without an identifier is called after the pair and is in no other one.
-        ``left_out`` tells of pairs that are too short.
+        ``left_out`` lists pairs that are too short.
 
     Raises:
         ConfigError: an option out of its range, an unknown recording or lane.
@@ -208,7 +204,7 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             anonymous,
             len(pairs),
         )
-    reading.notes = told_uneven(every, dt)
+    reading.notes = uneven_text(every, dt)
     return reading
 
 
@@ -245,7 +241,7 @@ def _unit(option: str, value: Any, path: Path, units: dict[str, float]) -> float
 
 
 def _listed(path: Path | Table | None) -> dict[str, dict[str, str]]:
-    """What an index tells of every file, by the file's path."""
+    """Properties of every file that an index lists, by the file's path."""
     if path is None:
         return {}
     table = opened(path)
@@ -387,7 +383,7 @@ def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:
         return float("nan")
     usual = float(np.nanmedian(length))
     off = np.abs(length - usual)
-    if np.nanmax(off) > UNSTEADY:
+    if np.nanmax(off) > LIMITS["traffic"].noise:
         i = int(rows[np.nanargmax(off)])
         raise DataError(
             f"{table.path}, {table.row(i)}: x_leader - x_follower - spacing is "

@@ -64,7 +64,7 @@ def read_table(source: Path | Table, options: TableOptions, walls: Path | None =
 
     Returns:
         Sequences named ``recording/sequence``, in the order of their names, whatever that of the
-        rows. Samples that no row or an empty cell tells are filled where no more than ``fill`` s
+        rows. Samples without a row, or with an empty cell, are filled where no more than ``fill`` s
         are missing, and uneven times are interpolated, see
         :func:`nnode.data.trajectories.records`. A platoon is cut into the parts in which all its
         vehicles are there, with a number behind the name where there are several; where these are
