@@ -24,7 +24,7 @@ from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, WalkwayOptions
 from nnode.data.readers.ngsim import NgsimOptions
 from nnode.data.readers.openacc import OpenAccOptions
 from nnode.data.readers.sumo import SumoOptions
-from nnode.data.sequence import Domain
+from nnode.data.sequence import Domain, Sequence
 from nnode.data.sequences import Sequences
 
 ROOM = "POLYGON ((0 0, 20 0, 20 4, 0 4, 0 0), (4 1, 5 1, 5 2, 4 2, 4 1))"
@@ -77,7 +77,7 @@ _KINDS = (
 
 def read_all(options: DataOptions, files: dict[str, Any]) -> None:
     """Read files and look for faults, without the last resort for foreign errors."""
-    sequences = FORMATS[type(options)].read(files, options)
+    sequences: list[Sequence] = FORMATS[type(options)].read(files, options)
     domain: Domain = "crowd" if options.domain == "crowd" else "traffic"
     if domain == "crowd":
         sequences, _ = drop_absent(sequences)

@@ -55,12 +55,11 @@ class Reading(list[Sequence]):
         self.left_out = list(left_out)
         self.notes = list(notes)
 
-    def add(self, other: list[Sequence]) -> None:
+    def add(self, other: Reading) -> None:
         """Append what another file gave."""
         self += other
-        if isinstance(other, Reading):
-            self.left_out += other.left_out
-            self.notes += other.notes
+        self.left_out += other.left_out
+        self.notes += other.notes
 
 
 @dataclass

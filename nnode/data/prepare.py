@@ -83,10 +83,10 @@ class Format:
     """A raw format: which files it needs, and how they become sequences."""
 
     files: Callable[..., _Files]
-    read: Callable[[_Files, Any], list[Sequence]]
+    read: Callable[[_Files, Any], Reading]
     tables: bool = False  # whether ``files`` takes a table in memory as well
 
-    def sequences(self, files: _Files, options: Any) -> list[Sequence]:
+    def sequences(self, files: _Files, options: Any) -> Reading:
         """Read the files.
 
         Raises:
@@ -101,7 +101,7 @@ class Format:
             return self.read(files, options)
 
 
-def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any], list[Sequence]]:
+def _each(read: Callable[[Path, Any], Reading]) -> Callable[[_Files, Any], Reading]:
     """Read files that do not depend on each other."""
 
     def every(files: _Files, options: Any) -> Reading:
@@ -195,7 +195,7 @@ class Judged:
 
 
 def judge(
-    options: DataOptions, files: _Files, read: list[Sequence], stages: Stages | None = None
+    options: DataOptions, files: _Files, read: Reading, stages: Stages | None = None
 ) -> Judged:
     """Look for faults and sort out what the options do not keep.
 
@@ -207,7 +207,6 @@ def judge(
         NNodeError: see :func:`prepare`.
     """
     domain = _domain(options, read)
-    read = read if isinstance(read, Reading) else Reading(read)
     _plausible(options, read)
     noise = measured_noise(read)
     sequences, absent = drop_absent(read) if domain == "crowd" else (read, [])

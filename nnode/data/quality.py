@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -894,3 +894,13 @@ def described(fault: Fault, sequence: Sequence) -> dict[str, Any]:
     """A fault for a manifest, with the agents' identifiers where the source has them."""
     names = [sequence.agents[i] for i in fault.agents] if sequence.agents else []
     return {**asdict(fault), "names": names}
+
+
+def recorded(manifest: Mapping[str, Any]) -> dict[str, list[Fault]]:
+    """The faults of a manifest by the sequence's name, see :func:`described`."""
+    faults: dict[str, list[Fault]] = {}
+    for entry in manifest.get("faults", []):
+        values = {field.name: entry[field.name] for field in fields(Fault)}
+        fault = Fault(**{**values, "agents": tuple(entry["agents"])})
+        faults.setdefault(fault.sequence, []).append(fault)
+    return faults

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
 from nnode.data.dataset import Source, noise_of
 from nnode.data.options import DataOptions, Faults
 from nnode.data.prepare import open_data
-from nnode.data.quality import Fault, interpolated_text, kinds_text
+from nnode.data.quality import Fault, interpolated_text, kinds_text, recorded
 from nnode.data.readers.recordings import natural
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.result import DataFault
@@ -75,15 +75,17 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
     Raises:
         DataError: fewer than three sequences are left, or no vehicle follows another.
     """
-    names = {one.name for one in fields(Fault)}
-    faults: dict[str, list[Fault]] = {}
-    reported = []
-    for entry in store.manifest.get("faults", []):
-        plain = {key: value for key, value in entry.items() if key in names}
-        fault = Fault(**{**plain, "agents": tuple(entry["agents"])})
-        faults.setdefault(fault.sequence, []).append(fault)
-        who = entry.get("names") or [str(i) for i in fault.agents]
-        reported.append(DataFault(fault.kind, fault.sequence, who, fault.time, fault.detail))
+    faults = recorded(store.manifest)
+    reported = [
+        DataFault(
+            entry["kind"],
+            entry["sequence"],
+            entry.get("names") or [str(i) for i in entry["agents"]],
+            entry["time"],
+            entry["detail"],
+        )
+        for entry in store.manifest.get("faults", [])
+    ]
     # in one order, whatever that of a list: divisions into folds go by it
     everything = sorted(store, key=lambda s: natural(s.name))
     sound = [s for s in everything if s.name not in faults]

@@ -183,7 +183,7 @@ def _table(
     return _judged(examined, sequences, rate)
 
 
-def _read(source: Recognised) -> list[Sequence]:
+def _read(source: Recognised) -> Reading:
     kind = FORMATS[type(source.options)]
     return kind.sequences(kind.files(source.options), source.options)
 
@@ -192,13 +192,9 @@ def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
     """The sequences that the reader makes of the file; what it refuses is a finding."""
     try:
         made = _read(source)
-        left_out = made.left_out if isinstance(made, Reading) else []
+        texts = {"left_out": left_out_texts(len(made), [], made.left_out), "resampled": made.notes}
         findings += [
-            Finding("left_out", "warning", text) for text in left_out_texts(len(made), [], left_out)
-        ]
-        findings += [
-            Finding("resampled", "warning", text)
-            for text in (made.notes if isinstance(made, Reading) else [])
+            Finding(kind, "warning", text) for kind, of_kind in texts.items() for text in of_kind
         ]
         return made
     except NNodeError as error:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nnode.data.cut import Member, sequence_of, whole_steps, windows
+from nnode.data.cut import Member, Reading, sequence_of, whole_steps, windows
 from nnode.data.options import DataOptions, check_known, one_of, positive, wanted
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import raw_files, tables_below
@@ -103,7 +103,7 @@ def openacc_files(options: OpenAccOptions) -> dict[str, Path]:
     )
 
 
-def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> list[Sequence]:
+def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> Reading:
     """Read runs and cut them into sequences.
 
     Where a vehicle's record has a hole longer than ``fill``, or a vehicle has no columns, the
@@ -129,7 +129,7 @@ def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> list[Seq
     if asked is not None and options.path is not None:
         check_known(asked, [run.name for run in runs])
         runs = [run for run in runs if run.name in asked]
-    sequences: list[Sequence] = []
+    sequences = Reading()
     for run in runs:
         check_laps(run)
         sequences += by_spacing(run, options)
