@@ -25,18 +25,16 @@ from nnode.calibrate.options import (
     TorchdiffeqOptions,
     TrainerOptions,
 )
-from nnode.data.options import (
-    EsimasOptions,
-    HighDOptions,
-    JuelichOptions,
-    NgsimOptions,
-    OpenAccOptions,
-    PairOptions,
-    SumoOptions,
-    TableOptions,
-    VehicleTableOptions,
-    WalkwayOptions,
-)
+from nnode.data.readers.esimas import EsimasOptions
+from nnode.data.readers.highd import HighDOptions
+from nnode.data.readers.juelich import JuelichOptions
+from nnode.data.readers.jupedsim import WalkwayOptions
+from nnode.data.readers.ngsim import NgsimOptions
+from nnode.data.readers.openacc import OpenAccOptions
+from nnode.data.readers.pairs import PairOptions
+from nnode.data.readers.sumo import SumoOptions
+from nnode.data.readers.table import TableOptions
+from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.discover.options import DiscoverOptions
 from nnode.model.laws import LAW_MODELS
 from nnode.model.options import (

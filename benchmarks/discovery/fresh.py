@@ -12,7 +12,8 @@ import torch
 
 from benchmarks.truths.measure import closure
 from nnode.app.python.report import Report
-from nnode.data.options import Faults, TableOptions
+from nnode.data.options import Faults
+from nnode.data.readers.table import TableOptions
 from nnode.discover.inputs import read_inputs
 from nnode.discover.judge.model_comparison import ModelComparison, windows_of
 from nnode.model.effects import CATALOGUE

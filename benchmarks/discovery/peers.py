@@ -15,7 +15,8 @@ from omegaconf import OmegaConf
 from benchmarks.truths.regression import PEERS, Library
 from nnode.calibrate.parameters import ParameterVector
 from nnode.config import SCHEMAS
-from nnode.data.options import Faults, TableOptions
+from nnode.data.options import Faults
+from nnode.data.readers.table import TableOptions
 from nnode.data.sequence import Domain
 from nnode.discover.division import divide
 from nnode.discover.inputs import read_inputs

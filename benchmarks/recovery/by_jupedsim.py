@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nnode.data.options import WalkwayOptions
-from nnode.data.readers.jupedsim import read_walkway
+from nnode.data.readers.jupedsim import WalkwayOptions, read_walkway
 from nnode.data.sequence import Sequence
 
 #: JuPedSim's step, and that of what it writes, s; how long people are watched, s.

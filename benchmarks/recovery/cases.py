@@ -12,8 +12,7 @@ import numpy as np
 
 from benchmarks.recovery import by_jupedsim, by_sumo, laws
 from benchmarks.recovery.recover import Recovered, recover
-from nnode.data.options import SumoOptions
-from nnode.data.readers.sumo import read_sumo
+from nnode.data.readers.sumo import SumoOptions, read_sumo
 from nnode.data.sequence import Sequence
 from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS
 

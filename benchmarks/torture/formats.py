@@ -16,20 +16,15 @@ import pandas as pd
 
 from nnode.app.check import check_file
 from nnode.data.identity import identify
-from nnode.data.options import (
-    DataOptions,
-    HighDOptions,
-    NgsimOptions,
-    OpenAccOptions,
-    SumoOptions,
-    WalkwayOptions,
-)
-from nnode.data.policy import drop_absent
+from nnode.data.options import DataOptions
 from nnode.data.prepare import FORMATS
-from nnode.data.quality import find_faults
-from nnode.data.readers.highd import RECORDING_META, TRACKS, TRACKS_META
-from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE
-from nnode.data.sequence import Domain
+from nnode.data.quality import drop_absent, find_faults
+from nnode.data.readers.highd import RECORDING_META, TRACKS, TRACKS_META, HighDOptions
+from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, WalkwayOptions
+from nnode.data.readers.ngsim import NgsimOptions
+from nnode.data.readers.openacc import OpenAccOptions
+from nnode.data.readers.sumo import SumoOptions
+from nnode.data.sequence import Domain, Sequence
 from nnode.data.sequences import Sequences
 
 ROOM = "POLYGON ((0 0, 20 0, 20 4, 0 4, 0 0), (4 1, 5 1, 5 2, 4 2, 4 1))"
@@ -82,7 +77,7 @@ _KINDS = (
 
 def read_all(options: DataOptions, files: dict[str, Any]) -> None:
     """Read files and look for faults, without the last resort for foreign errors."""
-    sequences = FORMATS[type(options)].read(files, options)
+    sequences: list[Sequence] = FORMATS[type(options)].read(files, options)
     domain: Domain = "crowd" if options.domain == "crowd" else "traffic"
     if domain == "crowd":
         sequences, _ = drop_absent(sequences)

@@ -14,8 +14,8 @@ import pandas as pd
 from benchmarks.torture.child import Child, script
 from nnode.app.python.report import Report
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.data.options import EsimasOptions
 from nnode.data.prepare import prepare
+from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.store import MANIFEST, Store
 from nnode.data.synthetic import traffic_recording
 from nnode.pages.page import Block, TableBlock

@@ -22,16 +22,13 @@ from benchmarks.torture.gadgets import evil_checkpoint, strange_checkpoint
 from benchmarks.torture.inputs import damaged_bytes, damaged_formula, damaged_text
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.optimizers import AdadeltaOptions, build_optimizer
-from nnode.data.options import (
-    EsimasOptions,
-    JuelichOptions,
-    PairOptions,
-    TableOptions,
-    VehicleTableOptions,
-)
+from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.readers.highd import TRACKS
+from nnode.data.readers.juelich import JuelichOptions
+from nnode.data.readers.pairs import PairOptions
 from nnode.data.readers.table import TABLE as TIDY
-from nnode.data.readers.table import WALLS
+from nnode.data.readers.table import WALLS, TableOptions
+from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.data.sequence import Sequence
 from nnode.data.store import MANIFEST, TABLE, Store, write_store
 from nnode.model import Traffic, build_model

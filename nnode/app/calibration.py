@@ -26,9 +26,10 @@ from nnode.calibrate.options import Pooling, StartSpeeds
 from nnode.calibrate.trainer import Trainer
 from nnode.data.clusters import clusters
 from nnode.data.dataset import SequenceDataset, SmoothSpeeds, Source, noise_of
+from nnode.data.limits import BEARABLE
 from nnode.data.sequence import Sequence
 from nnode.data.sequences import Sequences
-from nnode.data.smooth import BEARABLE, Noise
+from nnode.data.smooth import Noise
 from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.exchange.trajectories import simulated
 from nnode.files import xarray

@@ -12,14 +12,15 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from nnode.app.cli.typed import changes, group_defaults, plain_options
-from nnode.data.check.examine import Examination, examine, sure
-from nnode.data.check.findings import Finding
-from nnode.data.check.scale import AGREE, INTERVAL, USUAL, Range
+from nnode.data.check.examine import Examination, examine
 from nnode.data.clusters import index_of
 from nnode.data.identity import identify
+from nnode.data.limits import AGREE, INTERVAL, USUAL, Range
+from nnode.data.quality import Finding
 from nnode.data.readers.columns import floats, quoted
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.split import split
+from nnode.data.units import certainty, share
 from nnode.discover.inputs import LEAST
 from nnode.errors import ConfigError, NNodeError, printable
 from nnode.machine import how_made
@@ -49,7 +50,7 @@ class Check:
     @property
     def probability(self) -> float:
         """Of the units, whatever the rate of frames."""
-        return _probability(self.examination)
+        return share(self.examination.scales)
 
     def __repr__(self) -> str:
         return summary(self.examination, self.options)
@@ -131,7 +132,7 @@ def summary(found: Examination, lines: list[str]) -> str:
     if found.meanings:
         known = ", ".join(f"{m} = {one.column}" for m, one in found.meanings.items())
         text.append(f"columns: {known}")
-        text.append(f"units: {_units(found)} ({sure(_probability(found))})")
+        text.append(f"units: {_units(found)} ({certainty(share(found.scales))})")
     else:
         text.append(f"format: {found.raw.native}, whose reader knows its units")
     text += [f"{_SIGNS[one.level]:>5}  {one.kind}: {one.text}" for one in found.findings]
@@ -198,17 +199,6 @@ def _units(found: Examination) -> str:
     clock = f"frames of 1/{scale.rate:g} s" if scale.rate else scale.time
     speeds = f", speeds in {scale.speed}" if found.rows.v is not None else ""
     return f"{scale.domain}, positions in {scale.position}, times in {clock}{speeds}"
-
-
-def _probability(found: Examination) -> float:
-    """Of the units, whatever the rate of frames."""
-    best = found.scale
-    return sum(
-        one.probability
-        for one in found.scales
-        if (one.domain, one.position, one.time, one.speed)
-        == (best.domain, best.position, best.time, best.speed)
-    )
 
 
 def blocks(found: Examination, lines: list[str]) -> list[Block]:
@@ -300,7 +290,7 @@ def _units_blocks(found: Examination) -> list[Block]:
             }
     blocks: list[Block] = [
         Heading("Units and time scale"),
-        Text(f"Taken: {_units(found)}: {sure(_probability(found))}."),
+        Text(f"Taken: {_units(found)}: {certainty(share(found.scales))}."),
         TableBlock("medians", pd.DataFrame(rows).T, "Medians in SI units, and what is usual."),
     ]
     if len(found.scales) > 1:

@@ -10,8 +10,8 @@ from nnode.app.cli.recognised import with_recognised
 from nnode.data.clusters import clusters, relation
 from nnode.data.dataset import noise_of
 from nnode.data.options import DataOptions
-from nnode.data.policy import told_filled
 from nnode.data.prepare import prepare
+from nnode.data.quality import interpolated_text, kinds_text, recorded
 from nnode.plots.quality import plot_faults
 
 
@@ -24,15 +24,10 @@ def prepare_data(config: DictConfig, folder: Path) -> None:
     config = with_recognised(config)
     options: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
     store = prepare(options, folder, draw=plot_faults)
-    reasons: dict[str, int] = {}
-    for recording in store.manifest["recordings"].values():
-        for kind, number in recording["faulty"].items():
-            reasons[kind] = reasons.get(kind, 0) + number
-    if reasons:
-        listed = ", ".join(f"{kind} in {number}" for kind, number in sorted(reasons.items()))
-        print(f"faults: {listed} sequences; pictures in {folder / 'faults'}")
+    if kinds := kinds_text(recorded(store.manifest).values()):
+        print(f"faults: {kinds} sequences; pictures in {folder / 'faults'}")
     if store.manifest["filled"]:
-        print(told_filled(store.manifest["filled"]))
+        print(interpolated_text(store.manifest["filled"]))
     print(noise_of(store))
     gap = options.split.gap
     number = int(clusters(store.index, gap).max()) + 1

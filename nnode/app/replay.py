@@ -11,9 +11,8 @@ import torch
 
 from nnode.app.python.inputs import Table
 from nnode.calibrate.evaluate import Simulate
-from nnode.data.options import TableOptions
 from nnode.data.readers.columns import Table as DataTable
-from nnode.data.readers.table import read_table
+from nnode.data.readers.table import TableOptions, read_table
 from nnode.data.sequence import Sequence
 from nnode.data.store import Store
 from nnode.discover.report.replay import zone_of

@@ -13,24 +13,29 @@ from nnode.data.sequence import Sequence
 
 _AXES = ("x", "y")
 _TEXT = ("sequence", "recording", "agent", "kind", "group")
+#: Columns of vectors, without the axis that follows: the sequence's field, and its unit.
+_VECTORS = {
+    "": ("x", "m"),
+    "v": ("v", "m/s"),
+    "dest_": ("destination", "m"),
+    "preferred_": ("preferred", "m/s"),
+}
 
 
 def schema(dims: int) -> pa.Schema:
     """Columns of the table for ``dims`` space dimensions; units stand in the metadata."""
-    axes = _AXES[:dims]
-    units = {"time": "s"} | dict.fromkeys(axes, "m") | {f"v{a}": "m/s" for a in axes}
-    units |= {"length": "m"} | {f"dest_{a}": "m" for a in axes}
-    units |= {f"preferred_{a}": "m/s" for a in axes}
-    order = ["sequence", "recording", "time", "agent", *axes, *(f"v{a}" for a in axes)]
-    order += ["length", "kind", "group", *(f"dest_{a}" for a in axes)]
-    order += [f"preferred_{a}" for a in axes if dims > 1]
+    vectors = {
+        prefix: {prefix + axis: unit for axis in _AXES[:dims]}
+        for prefix, (_, unit) in _VECTORS.items()
+    }
+    units = {"sequence": "", "recording": "", "time": "s", "agent": "", **vectors[""]}
+    units |= {**vectors["v"], "length": "m", "kind": "", "group": "", **vectors["dest_"]}
+    units |= vectors["preferred_"] if dims > 1 else {}
     return pa.schema(
-        [
-            pa.field(name, pa.float64(), metadata={"unit": units[name]})
-            if name in units
-            else pa.field(name, pa.string())
-            for name in order
-        ]
+        pa.field(name, pa.float64(), metadata={"unit": unit})
+        if unit
+        else pa.field(name, pa.string())
+        for name, unit in units.items()
     )
 
 
@@ -59,11 +64,13 @@ def to_table(item: Sequence) -> pa.Table:
         "kind": list(item.kind) * k if item.kind else None,
         "group": list(item.group) * k if item.group else None,
     }
-    for d, axis in enumerate(_AXES[:dims]):
-        columns[axis] = item.x[:, :, d].ravel()
-        columns[f"v{axis}"] = None if item.v is None else item.v[:, :, d].ravel()
-        for name, own in (("dest", item.destination), ("preferred", item.preferred)):
-            columns[f"{name}_{axis}"] = None if own is None else np.tile(own[:, d], k)
+    for prefix, (field, _) in _VECTORS.items():
+        values = getattr(item, field)
+        for d, axis in enumerate(_AXES[:dims]):
+            # destinations and preferred velocities are those of all times
+            columns[prefix + axis] = (
+                None if values is None else np.broadcast_to(values[..., d], (k, n)).ravel()
+            )
     fields = schema(dims)
     arrays = [
         pa.nulls(rows, field.type)
@@ -99,12 +106,12 @@ def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None
 
     def vectors(prefix: str) -> np.ndarray | None:
         columns = [numbers(prefix + a) for a in _AXES if prefix + a in table.column_names]
-        found = [column for column in columns if column is not None]
-        return np.stack(found, axis=-1) if found else None
+        known_columns = [column for column in columns if column is not None]
+        return np.stack(known_columns, axis=-1) if known_columns else None
 
     def names(name: str) -> tuple[str, ...] | None:
-        found = table[name].slice(0, n).to_pylist()
-        return None if None in found else tuple(found)
+        values = table[name].slice(0, n).to_pylist()
+        return None if None in values else tuple(values)
 
     time, x = numbers("time"), vectors("")
     if time is None or x is None:

@@ -62,12 +62,12 @@ def clusters(index: Index, gap: float = GAP, *, together: bool = False) -> np.nd
     """
     edges: list[tuple[int, int]] = []
     for members in _groups(index, "site").values():
-        known = identified(index, members)
-        if known:
+        named = identified(index, members)
+        if named:
             first: dict[str, int] = {}
             edges += [(first.setdefault(a, i), i) for i in members for a in index[i]["agents"]]
-        if together or not known:
-            edges += _near(index, members, 0.0 if known else gap, together)
+        if together or not named:
+            edges += _near(index, members, 0.0 if named else gap, together)
     row, column = np.array(edges, dtype=int).reshape(-1, 2).T
     graph = coo_array((np.ones(len(row)), (row, column)), shape=(len(index), len(index)))
     return np.asarray(connected_components(graph, directed=False)[1])
@@ -118,11 +118,11 @@ def identified(index: Index, members: Iterable[int]) -> bool:
 
 def relation(index: Index, gap: float = GAP) -> str:
     """What makes sequences one cluster, in words: "sequences that ..."."""
-    known = [bool(entry["agents"]) for entry in index]
-    if all(known):
+    named = [bool(entry["agents"]) for entry in index]
+    if all(named):
         return "share an agent"
     near = f"are closer than {gap:g} s in time"
-    return f"share an agent or {near}" if any(known) else near
+    return f"share an agent or {near}" if any(named) else near
 
 
 def level(sequences: ListLike[Sequence], label: np.ndarray, covariate: str | None) -> np.ndarray:
@@ -137,19 +137,19 @@ def level(sequences: ListLike[Sequence], label: np.ndarray, covariate: str | Non
     if covariate is None or _varies(sequences, covariate):
         return label
     names = [s.recording for s in sequences]
-    found: np.ndarray = np.unique(names, return_inverse=True)[1]
-    return found
+    recordings: np.ndarray = np.unique(names, return_inverse=True)[1]
+    return recordings
 
 
 def _varies(sequences: ListLike[Sequence], covariate: str) -> bool:
     """Whether a covariate takes several values within any recording."""
-    seen: dict[str, set[Any]] = {}
+    by_recording_values: dict[str, set[Any]] = {}
     for s in sequences:
         values = getattr(s, covariate)
         if values is not None and len(values):
-            known = (v for v in np.asarray(values).tolist() if v != "" and v == v)  # not NaN
-            seen.setdefault(s.recording, set()).update(known)
-    return any(len(values) > 1 for values in seen.values())
+            finite = (v for v in np.asarray(values).tolist() if v != "" and v == v)  # not NaN
+            by_recording_values.setdefault(s.recording, set()).update(finite)
+    return any(len(values) > 1 for values in by_recording_values.values())
 
 
 def signs(number: int, flips: int, rng: np.random.Generator) -> np.ndarray:

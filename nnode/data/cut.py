@@ -9,31 +9,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import dataclass, field
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
-import pandas as pd
+from omegaconf import MISSING
 
-from nnode.data.options import (
-    Agents,
-    DataOptions,
-    Gaps,
-    LaneOptions,
-    OpenAccOptions,
-    PairOptions,
-    check_known,
-    positive,
-    wanted,
-)
-from nnode.data.sequence import UNEVEN, Sequence
-from nnode.data.smooth import smooth
+from nnode.data.options import Agents, DataOptions, check_known, positive, wanted
+from nnode.data.sequence import Sequence
 from nnode.data.trajectories import (
     Grid,
     Record,
     Trajectories,
-    driven,
     measured_times,
     records,
 )
@@ -47,14 +35,10 @@ MOST_CELLS = 10**8
 LEAST = 3
 #: Sequences that notes list.
 LISTED = 3
-#: Times of a run, with those that no row stands for.
-MOST_TIMES = 10**6
-#: Times and places of a run may be so many, or so many times the rows that stand there.
-_CELLS, _SPARSE = 10**7, 10
 
 
 class Reading(list[Sequence]):
-    """Sequences of a reader that tells what it left out and what it changed.
+    """Sequences of a reader, with what it left out and what it changed.
 
     Attributes:
         left_out: ``name`` and ``why`` of each record of which there is no sequence.
@@ -71,12 +55,27 @@ class Reading(list[Sequence]):
         self.left_out = list(left_out)
         self.notes = list(notes)
 
-    def add(self, other: list[Sequence]) -> None:
+    def add(self, other: Reading) -> None:
         """Append what another file gave."""
         self += other
-        if isinstance(other, Reading):
-            self.left_out += other.left_out
-            self.notes += other.notes
+        self.left_out += other.left_out
+        self.notes += other.notes
+
+
+@dataclass
+class LaneOptions(DataOptions):
+    """How vehicles' rows become platoons, whatever file they come from."""
+
+    domain: str = "traffic"
+    path: str = MISSING  # the file; relative to data.source where that is given
+    kinds: Any = field(default_factory=dict)  # {class code: name}; codes may be numbers
+    lane: Any = None  # a lane or a list of lanes; null takes every lane, each by itself
+    dt: float = 0.2  # reference time grid, s
+    min_vehicles: int = 3  # fewest vehicles of a platoon
+    min_samples: int = 3  # fewest points of the time grid
+    window: float | None = None  # s; null: maximal intervals with the same vehicles in view
+    # whether every follower and its leader are a sequence of their own, min_vehicles aside
+    pairs: bool = False
 
 
 #: Agents' records, and the first and the last time of their sequence.
@@ -85,7 +84,7 @@ _Platoon = tuple[list[Record], int, int]
 
 @dataclass
 class Member:
-    """An agent of a sequence: its name, a row of the table that tells what it is, its records."""
+    """An agent of a sequence: its name, a row of the table with its properties, its records."""
 
     agent: str
     row: int
@@ -147,8 +146,8 @@ def sequence_of(
     return Sequence(name=name, x=x, **(fields | further))
 
 
-def told_uneven(agent_records: Iterable[Record], dt: float) -> list[str]:
-    """A sentence about records whose times are uneven, if there are such."""
+def uneven_text(agent_records: Iterable[Record], dt: float) -> list[str]:
+    """A sentence about records with uneven times, if any."""
     every = list(agent_records)
     number = sum(int(r.uneven.sum()) for r in every)
     total = sum(len(r.x) for r in every)
@@ -206,7 +205,7 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
         stem = recording or table.name
         reused = stem if options.agents is Agents.auto else ""
         every = records(rows, grid, fill=options.fill, smoothing=options.smooth, reused=reused)
-        notes += [f"{stem}: {text}" for text in told_uneven(every, grid.dt)]
+        notes += [f"{stem}: {text}" for text in uneven_text(every, grid.dt)]
         present = {""} if rows.lane is None else set(rows.lane)
         for lane in (name for name in chosen if name in present):
             lane_records = [r for r in every if rows.lane is None or rows.lane[r.row] == lane]
@@ -292,68 +291,14 @@ def by_sequence(
         fields = {"recording": run} | ({} if named else {"agents": ()})
         lane = not ordered and table.x.shape[1] == 1
         orders = [_in_lane(of, first) if lane else of for first, _ in parts]
-        reading += _numbered(name, rows, orders, parts, grid, **fields)
-    reading.notes = told_uneven(every, table.dt) + notes[:LISTED]
+        reading += numbered_parts(name, rows, orders, parts, grid, **fields)
+    reading.notes = uneven_text(every, table.dt) + notes[:LISTED]
     if len(notes) > LISTED:
         reading.notes.append(f"and {len(notes) - LISTED} more such sequences")
     return reading
 
 
-def by_pair(rows: Trajectories, dt: float, options: PairOptions) -> tuple[Reading, list[Record]]:
-    """Cut a pair where either is not there, or into windows without such a gap.
-
-    Args:
-        rows: of one pair, the follower's and then as many of the leader's.
-        dt: s, of the time grid; it begins at 0 where ``options.dt`` says it, otherwise with the
-            pair.
-
-    Returns:
-        Sequences named ``recording/sequence``, with a number behind where there are several, and
-        both records.
-
-    Raises:
-        ConfigError: a ``dt`` finer than the rows, or a ``window`` that is no whole number of steps.
-        DataError: a gap, where ``gaps=error``; or one agent twice at one time.
-    """
-    ((run, number), _), *_ = rows.parts("recording", "sequence")
-    name = f"{run}/{number}"
-    if options.dt is not None and dt < rows.dt * (1 - UNEVEN):
-        raise ConfigError(
-            f"data.dt={dt:g} s is finer than the {rows.dt:g} s of {rows.path}: pair {number}; "
-            "expected no more times than were measured"
-        )
-    grid = Grid(dt, 0.0 if options.dt is not None else float(rows.time.min()))
-    pair_records = records(rows, grid, fill=options.fill, smoothing=options.smooth)
-    vehicles = [Member(str(rows.agent[i]), i) for i in (0, len(rows) // 2)]
-    for record in pair_records:
-        vehicles[record.row >= len(rows) // 2].records.append(record)
-    parts = spans(vehicles)
-    if len(parts) > 1 and options.gaps is Gaps.error:
-        end, start = (grid.origin + dt * k for k in (parts[0][1], parts[1][0]))
-        row = int(np.argmin(np.where(rows.time >= start - dt / 2, rows.time, np.inf)))
-        raise DataError(
-            f"{rows.path}: pair {number} steps from {end:g} s to {start:g} s "
-            f"({rows.where(row)}), expected steps of {dt:g} s ({len(parts) - 1} such gaps); "
-            "data.gaps=cut cuts the pair there"
-        )
-    if options.window is not None:
-        steps = whole_steps("window", options.window, dt)
-        parts = [piece for part in parts for piece in windows(*part, steps)]
-    parts = [(a, b) for a, b in parts if b - a + 1 >= options.min_samples]
-    made = Reading(_numbered(name, rows, [vehicles] * len(parts), parts, grid, recording=run))
-    if not made:
-        times = f"data.min_samples={options.min_samples} times"
-        if len(rows) // 2 < options.min_samples:
-            why = f"fewer than {times}"
-        elif options.window is not None:
-            why = f"no data.window={options.window:g} s without a gap"
-        else:
-            why = f"no {times} without a gap"
-        made.left_out.append({"name": name, "why": why})
-    return made, pair_records
-
-
-def _numbered(
+def numbered_parts(
     name: str,
     rows: Trajectories,
     of: list[list[Member]],
@@ -442,7 +387,7 @@ def _in_lane(of: list[Member], at: int) -> list[Member]:
 def by_presence(
     every: list[Record],
     steps: int,
-    least: int = 1,
+    min_agents: int = 1,
     axis: int = 0,
     view: tuple[float, float] | None = None,
 ) -> Iterator[_Platoon]:
@@ -452,21 +397,14 @@ def by_presence(
 
     Args:
         steps: of a window.
-        least: fewest agents.
+        min_agents: fewest agents.
         axis, view: m, whoever is there is within these ends of a coordinate at all times.
     """
     if not every:
         return
     begin = np.array([record.first for record in every])
     end = np.array([record.last for record in every])
-    low, number = int(begin.min()), end - begin
-    # windows that lie within a record: two records may lie years apart
-    starts = {
-        low + k * steps
-        for a, b in zip(begin[number >= steps], end[number >= steps], strict=True)
-        for k in range(-((low - int(a)) // steps), (int(b) - low) // steps)
-    }
-    for first in sorted(starts):
+    for first in _starts(every, steps):
         last = first + steps
         present = [every[i] for i in np.flatnonzero((begin <= first) & (end >= last))]
         if view is not None:
@@ -475,170 +413,8 @@ def by_presence(
                 (x[:, axis] >= view[0]).all() and (x[:, axis] <= view[1]).all() for x in paths
             ]
             present = [record for record, good in zip(present, inside, strict=True) if good]
-        if len(present) >= least:
+        if len(present) >= min_agents:
             yield present, first, last
-
-
-def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
-    """Cut a platoon whose vehicles are known by their speeds and spacings.
-
-    The foremost vehicle of a sequence is where its integrated speed brings it, those behind it are
-    the spacings and lengths further back. Where the speed or the spacing of a vehicle has a hole
-    longer than ``fill``, the platoon is cut in two at its place.
-
-    Args:
-        rows: of one run, the first vehicle in front; ``x`` is not looked at.
-        options: ``dt``, ``fill``, ``max_error`` and the way of cutting.
-
-    Returns:
-        Sequences named ``run/number``, in order of time, the leader last.
-
-    Raises:
-        ConfigError: a ``dt`` or ``window`` that is no whole number of steps.
-        DataError: times that are not equally spaced, or a vehicle twice at one time.
-    """
-    start, step, (speed, spacing) = _equally_spaced(rows, rows.v, rows.spacing)
-    most = int(options.fill / step + 1e-6)  # samples that may be missing
-    v = _filled(speed, most)
-    sound = _sound(rows, spacing, np.diff(v, axis=1), step, options.max_error)
-    gap = _filled(sound, most)
-    added = (np.isfinite(v) & np.isnan(speed)) | (np.isfinite(gap) & np.isnan(sound))
-    way = np.stack([driven(step * np.arange(len(v)), column) for column in v.T], 1)
-    every = 1 if options.dt is None else whole_steps("dt", options.dt, step)
-    v, gap, way, added = v[::every], gap[::every], way[::every], added[::every]
-    grid = Grid(step * every, start)
-    # with the vehicle in front; the first has nobody there
-    linked = np.isfinite(v) & np.isfinite(gap)
-    linked[:, 1:] &= np.isfinite(v[:, :-1])
-    linked[:, 0] = False
-    first_row = pd.Series(np.arange(len(rows))).groupby(rows.agent, sort=False).first()
-    table = replace(rows, x=rows.x[:, :1])
-    sequences: list[Sequence] = []
-    for first, last in _linked_intervals(linked, grid.dt, options):
-        part = slice(first, last + 1)
-        heads = np.flatnonzero(~linked[part].all(axis=0))
-        for i, end in pairwise([*heads.tolist(), linked.shape[1]]):
-            if end - i < options.min_vehicles or not np.isfinite(v[part, i]).all():
-                continue
-            front, platoon = way[part, i], []
-            for n in range(i, end):
-                front = front - (gap[part, n] + (options.length or 0.0) if n > i else 0.0)
-                x, speeds = front, v[part, n]
-                if options.smooth is not None:
-                    x, speeds = smooth(grid.dt * np.arange(len(x)), x, options.smooth)
-                    speeds = np.maximum(speeds, 0.0)
-                record = Record(
-                    str(first_row.index[n]),
-                    int(first_row.iloc[n]),
-                    first,
-                    x[:, None],
-                    speeds[:, None],
-                    added[part, n],
-                    np.zeros(len(x), dtype=bool),
-                )
-                platoon.append(Member(record.agent, record.row, [record]))
-            name = f"{rows.name}/{len(sequences):03d}"
-            sequences.append(sequence_of(name, table, platoon[::-1], first, last, grid))
-    return sequences
-
-
-def _equally_spaced(
-    rows: Trajectories, *columns: np.ndarray | None
-) -> tuple[float, float, list[np.ndarray]]:
-    """Time of the first sample, step (s), and columns ``(K, N)``, NaN where there is no row."""
-    time, at = np.unique(np.round(rows.time, 6), return_inverse=True)
-    agent, names = pd.factorize(rows.agent)
-    if len(time) < 2:
-        raise DataError(f"{rows.path}: all rows of {rows.name} stand at one time")
-    step = round(float(np.median(np.diff(time))), 9)
-    number = (time - time[0]) / step
-    if not number[-1] < MOST_TIMES:
-        raise DataError(
-            f"{rows.path}: times go from {time[0]:g} to {time[-1]:g} s in steps of {step:g} s; "
-            f"expected at most {MOST_TIMES:.0e} steps: look for a time that is wrong"
-        )
-    k = np.round(number).astype(int)
-    odd = np.flatnonzero(np.abs(number - k) > 0.1)
-    if odd.size:
-        raise DataError(
-            f"{rows.path}: the time {time[odd[0]]:g} s is no whole number of steps of {step:g} s "
-            f"from the first, {time[0]:g} s"
-        )
-    shape = (int(k[-1]) + 1, len(names))
-    if shape[0] * shape[1] > max(_CELLS, _SPARSE * len(rows)):
-        raise DataError(
-            f"{rows.path}: {len(rows)} rows stand at {shape[0]} equally spaced times of {shape[1]} "
-            "vehicles; look for a time or a position that is wrong, or cut the file"
-        )
-    cell = k[at] * shape[1] + agent
-    if len(np.unique(cell)) < len(cell):
-        raise DataError(
-            f"{rows.path}: run {rows.name} has two rows of one position at one time; expected one "
-            "row per vehicle and time"
-        )
-    wide_columns = []
-    for column in columns:
-        wide = np.full(shape, np.nan)
-        if column is not None:
-            wide.ravel()[cell] = column.ravel()
-        wide_columns.append(wide)
-    return float(time[0]), step, wide_columns
-
-
-def _filled(values: np.ndarray, most: int) -> np.ndarray:
-    """``(K, N)`` values with holes of at most ``most`` samples interpolated."""
-    full = values.copy()
-    for column in full.T:
-        missing, measured = (np.flatnonzero(np.isnan(column) == where) for where in (True, False))
-        after = np.searchsorted(measured, missing)
-        inside = (after > 0) & (after < len(measured))
-        missing, after = missing[inside], after[inside]
-        short = missing[measured[after] - measured[after - 1] <= most + 1]
-        column[short] = np.interp(short, measured, column[measured]) if short.size else 0.0
-    return full
-
-
-def _sound(
-    rows: Trajectories, spacing: np.ndarray, faster: np.ndarray, dt: float, most: float | None
-) -> np.ndarray:
-    """``(K, N)`` spacings without those that are none: not above 0, or between samples of which
-    one contradicts the speeds by more than ``most`` m.
-
-    Args:
-        faster: ``(K, N - 1)`` m/s, how much faster each follower is than the vehicle in front.
-    """
-    sound = np.where(spacing > 0, spacing, np.nan)
-    if most is not None:
-        expected = -(faster[1:] + faster[:-1]) / 2 * dt
-        off = np.abs(np.diff(sound[:, 1:], axis=0) - expected) > most
-        sound[1:, 1:][off] = np.nan
-        sound[:-1, 1:][off] = np.nan
-    names = list(dict.fromkeys(rows.agent))
-    bad = np.isfinite(spacing) & np.isnan(sound)
-    for i in np.flatnonzero(bad.any(axis=0)):
-        log.info(
-            "%s: %d of %d gaps of %s to %s are not above 0, or change otherwise than their speeds "
-            "tell (data.max_error); they count as unknown",
-            rows.name,
-            bad[:, i].sum(),
-            np.isfinite(spacing[:, i]).sum(),
-            names[i],
-            names[i - 1],
-        )
-    return sound
-
-
-def _linked_intervals(
-    linked: np.ndarray, dt: float, options: OpenAccOptions
-) -> Iterator[tuple[int, int]]:
-    """First and last sample of windows, or of maximal intervals with the same links."""
-    if options.window is not None:
-        yield from windows(0, len(linked) - 1, whole_steps("window", options.window, dt))
-        return
-    changes = np.flatnonzero((linked[1:] != linked[:-1]).any(axis=1)) + 1
-    for first, after in pairwise([0, *changes.tolist(), len(linked)]):
-        if (after - 1 - first) * dt >= options.min_duration - 1e-6:
-            yield first, after - 1
 
 
 def whole_steps(option: str, seconds: float, dt: float) -> int:
@@ -703,12 +479,12 @@ def _platoons(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
     if not lane:
         return
     if options.pairs:
-        pieces, least = _pairs(lane, options), 2
+        pieces, min_vehicles = _pairs(lane, options), 2
     else:
         pieces = _intervals(lane) if options.window is None else _windows(lane, options)
-        least = options.min_vehicles
+        min_vehicles = options.min_vehicles
     for platoon, first, last in pieces:
-        if len(platoon) >= least and last - first + 1 >= options.min_samples:
+        if len(platoon) >= min_vehicles and last - first + 1 >= options.min_samples:
             yield _in_order(platoon, first), first, last
 
 
@@ -724,40 +500,41 @@ def _intervals(every: list[Record]) -> Iterator[_Platoon]:
 
 def _pairs(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
     """Followers with their leaders, as long as nobody comes between them, in order of time."""
-    stays: dict[tuple[int, int], list[tuple[Record, Record, int, int]]] = {}
+    stays: dict[tuple[int, int], list[tuple[list[Record], int, int]]] = {}
     for platoon, first, last in _intervals(lane):
-        for follower, leader in pairwise(_in_order(platoon, first)):
-            pair_stays = stays.setdefault((id(follower), id(leader)), [])
-            if pair_stays and pair_stays[-1][3] + 1 == first:
-                first_of_all = pair_stays.pop()[2]
-                pair_stays.append((follower, leader, first_of_all, last))
-            else:
-                pair_stays.append((follower, leader, first, last))
-    every = sorted(
-        (span for every_stay in stays.values() for span in every_stay), key=lambda span: span[2]
-    )
-    for follower, leader, first, last in every:
+        for pair in map(list, pairwise(_in_order(platoon, first))):
+            of_pair = stays.setdefault((id(pair[0]), id(pair[1])), [])
+            begin = of_pair.pop()[1] if of_pair and of_pair[-1][2] + 1 == first else first
+            of_pair.append((pair, begin, last))
+    for pair, first, last in sorted(chain(*stays.values()), key=lambda stay: stay[1]):
         steps = last - first if options.window is None else round(options.window / options.dt)
         for start, end in windows(first, last, max(steps, 1)):
-            yield [follower, leader], start, end
+            yield pair, start, end
+
+
+def _starts(every: list[Record], steps: int) -> list[int]:
+    """Starts of the consecutive windows that lie within a record.
+
+    They count from the first record's start. All windows would be too many, as two records may lie
+    years apart.
+    """
+    low = min(record.first for record in every)
+    return sorted(
+        {
+            low + k * steps
+            for record in every
+            for k in range(-((low - record.first) // steps), (record.last - low) // steps)
+        }
+    )
 
 
 def _windows(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
     assert options.window is not None
     steps = round(options.window / options.dt)
-    start, end = min(r.first for r in lane), max(r.last for r in lane)
-    # only windows in which somebody is in view: two records may lie years apart
-    busy = {
-        k
-        for r in lane
-        for k in range((r.first - start) // steps - 1, (r.last - start) // steps + 1)
-    }
-    for first in sorted(start + k * steps for k in busy if 0 <= k <= (end - start) // steps - 1):
+    for first in _starts(lane, steps):
         last = first + steps
         in_view = [r for r in lane if r.first <= last and r.last >= first]
         whole = _in_order([r for r in in_view if r.first <= first and r.last >= last], first)
-        if not whole:
-            continue
         x = np.stack([r.x[first - r.first : last - r.first + 1, 0] for r in whole], axis=1)
         broken: set[int] = set()
         for r in in_view:

@@ -17,8 +17,8 @@ from nnode.data.smooth import Noise, measured_noise, smooth_speeds, suggested_wi
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError
 
-#: Sequences by which noise is told, where no manifest tells it.
-_TOLD = 400
+#: Sequences by which noise is estimated where no manifest has it.
+_ESTIMATED = 400
 
 
 class SmoothSpeeds:
@@ -48,12 +48,12 @@ Source = Store | Sequences | SmoothSpeeds
 
 
 def noise_of(source: Source) -> Noise:
-    """The noise of measurement of a source, as its manifest tells it or as it shows."""
-    told = source.manifest.get("noise")
-    if told is not None:
-        known = {key: float("nan") if value is None else value for key, value in told.items()}
-        return Noise(**known)
-    every = max(1, -(-len(source) // _TOLD))
+    """The noise of measurement of a source, from its manifest or else estimated."""
+    stored = source.manifest.get("noise")
+    if stored is not None:
+        values = {key: float("nan") if value is None else value for key, value in stored.items()}
+        return Noise(**values)
+    every = max(1, -(-len(source) // _ESTIMATED))
     return measured_noise(source[i] for i in range(0, len(source), every))
 
 
@@ -149,8 +149,8 @@ class EpochSampler(torch.utils.data.Sampler[list[int]]):
 
     def sequences(self, batch: int) -> int:
         """Sequences of mini-batch number ``batch``, those of all processes."""
-        least, more = divmod(self.n, self.n_batches)
-        return least + (batch < more)
+        smallest, larger_ones = divmod(self.n, self.n_batches)
+        return smallest + (batch < larger_ones)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch, counted from 0; it starts at its first mini-batch."""

@@ -238,10 +238,10 @@ def _origin(dataset: str, name: str) -> Origin | None:
 
     Both corridor archives are read by one reader, which need not know who publishes a file.
     """
-    own = ORIGINS.get(dataset)
-    if own is not None and name in own.files:
-        return own
-    return next((o for o in ORIGINS.values() if name in o.files and dataset in o.folders), own)
+    origin = ORIGINS.get(dataset)
+    if origin is not None and name in origin.files:
+        return origin
+    return next((o for o in ORIGINS.values() if name in o.files and dataset in o.folders), origin)
 
 
 def _fetch_published(dataset: str, name: str, folder: Path) -> Path:
@@ -252,11 +252,11 @@ def _fetch_published(dataset: str, name: str, folder: Path) -> Path:
             f"data.source=FOLDER, or {FOLDER_VARIABLE}, to a folder that holds {name}"
         )
     if name not in origin.files:
-        known = [n for o in ORIGINS.values() if dataset in o.folders for n in o.files]
+        published = [n for o in ORIGINS.values() if dataset in o.folders for n in o.files]
         raise DataError(
             f"{name} is not among the published files of {dataset}"
-            f"{_nearest(name, known)}; published: {', '.join(known)}; for a file of your own set "
-            "data.source=FOLDER"
+            f"{_nearest(name, published)}; published: {', '.join(published)}; for a file of your "
+            "own set data.source=FOLDER"
         )
     return _fetch(dataset, name, origin.url(name), folder)
 
@@ -304,26 +304,31 @@ def _reason(error: OSError) -> str:
     if answer is not None:
         return f"the server answered {answer.status_code} {answer.reason}"
     kinds = {kind.__name__ for kind in type(error).__mro__}
-    known = (words for kind, words in _REASONS.items() if kind in kinds)
-    return next(known, f"{type(error).__name__}: {' '.join(str(error).split())}")
+    words_of_kind = (words for kind, words in _REASONS.items() if kind in kinds)
+    return next(words_of_kind, f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def held(source: Path, dataset: str) -> dict[str, Path]:
+    """Files of a folder and of its sub-folders of a data set, by name; the first one of a name."""
+    below = [sub for o in ORIGINS.values() if dataset in o.folders for sub in o.folders]
+    places = [source, *(source / sub for sub in dict.fromkeys((dataset, *below)))]
+    files: dict[str, Path] = {}
+    for path in (path for place in places if place.is_dir() for path in sorted(place.iterdir())):
+        files.setdefault(path.name, path)
+    return files
 
 
 def _find(dataset: str, name: str, source: Path) -> Path:
     if not source.is_dir():
         raise DataError(f"data.source: there is no folder {source}; expected one that holds {name}")
-    origin = _origin(dataset, name)
-    below = dict.fromkeys((dataset, *(origin.folders if origin else ())))
-    places = [source, *(source / sub for sub in below)]
-    for place in places:
-        path = place / name
-        if path.is_file():
-            _note_edits(path, origin)
-            return path
-    held = sorted({p.name for place in places if place.is_dir() for p in place.iterdir()})
-    listing = ", ".join(held[:20]) + (f", ... ({len(held)} in all)" if len(held) > 20 else "")
+    files = held(source, dataset)
+    if name in files and files[name].is_file():
+        _note_edits(files[name], _origin(dataset, name))
+        return files[name]
+    listing = ", ".join([*files][:20]) + (f", ... ({len(files)} in all)" if len(files) > 20 else "")
     raise DataError(
-        f"{name} is neither in {source} nor in its sub-folders {', '.join(below)}"
-        f"{_nearest(name, held)}; found there: {listing or 'nothing'}; name a file that is there "
+        f"{name} is neither in {source} nor in its sub-folders of {dataset}"
+        f"{_nearest(name, [*files])}; it holds: {listing or 'nothing'}; name one of these files "
         "or set data.source to another folder"
     )
 

@@ -53,41 +53,41 @@ class Exit:
         return np.asarray(start + share * along)
 
 
-def read_exits(told: Any) -> list[Exit]:
-    """Exits as ``data.exits`` tells them.
+def read_exits(exits: Any) -> list[Exit]:
+    """Exits of ``data.exits``.
 
     Args:
-        told: ``{name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}`` (m), with ``heading``
-            ([x, y] or a word as for ``direction``) in place of ``line``; or None.
+        exits: ``{name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}`` (m), with
+            ``heading`` ([x, y] or a word as for ``direction``) in place of ``line``; or None.
 
     Raises:
         ConfigError: names the exit and what is wrong with it.
     """
-    found = []
-    for name, own in dict(told or {}).items():
-        if not isinstance(own, Mapping) or not set(own) <= set(_KEYS):
+    read = []
+    for name, entry in dict(exits or {}).items():
+        if not isinstance(entry, Mapping) or not set(entry) <= set(_KEYS):
             raise ConfigError(
-                f"data.exits.{name}={own}: expected some of {', '.join(_KEYS)}, such as "
+                f"data.exits.{name}={entry}: expected some of {', '.join(_KEYS)}, such as "
                 "{line: [5, 0, 5, 4], direction: +x}"
             )
-        if (own.get("line") is None) == (own.get("heading") is None):
-            raise ConfigError(f"data.exits.{name}={dict(own)}: expected a line or a heading")
+        if (entry.get("line") is None) == (entry.get("heading") is None):
+            raise ConfigError(f"data.exits.{name}={dict(entry)}: expected a line or a heading")
         line = None
-        if own.get("line") is not None:
-            line = _numbers(f"{name}.line", own["line"], 4).reshape(2, 2)
+        if entry.get("line") is not None:
+            line = _numbers(f"{name}.line", entry["line"], 4).reshape(2, 2)
             if (line[0] == line[1]).all():
                 raise ConfigError(f"data.exits.{name}.line: ends where it begins")
-        group = own.get("group")
-        found.append(
+        group = entry.get("group")
+        read.append(
             Exit(
                 name=str(name),
                 line=line,
-                heading=_unit(f"{name}.heading", own.get("heading")),
-                direction=_unit(f"{name}.direction", own.get("direction")),
+                heading=_unit(f"{name}.heading", entry.get("heading")),
+                direction=_unit(f"{name}.direction", entry.get("direction")),
                 group=None if group is None else str(group),
             )
         )
-    return found
+    return read
 
 
 def _numbers(what: str, value: Any, number: int) -> np.ndarray:
@@ -133,14 +133,14 @@ def exits_of(
     Raises:
         DataError: somebody whom no exit is for.
     """
-    found = []
+    chosen = []
     for i, name in enumerate(names):
         way = last[i] - first[i]
         fits = [
-            one
-            for one in exits
-            if (one.group is None or (groups is not None and groups[i] == one.group))
-            and (one.direction is None or way @ one.direction > 0)
+            exit_
+            for exit_ in exits
+            if (exit_.group is None or (groups is not None and groups[i] == exit_.group))
+            and (exit_.direction is None or way @ exit_.direction > 0)
         ]
         if not fits:
             of = f" of group {groups[i]!r}" if groups is not None and groups[i] else ""
@@ -150,18 +150,18 @@ def exits_of(
                 f"{last[i][1]:.1f}) m; add one without direction and group"
             )
         # what is for a group goes before what is for all
-        own = [one for one in fits if one.group is not None] or fits
-        found.append(min(own, key=lambda one: _distance(one, last[i], way)))
-    return found
+        candidates = [exit_ for exit_ in fits if exit_.group is not None] or fits
+        chosen.append(min(candidates, key=lambda exit_: _distance(exit_, last[i], way)))
+    return chosen
 
 
-def _distance(one: Exit, last: np.ndarray, way: np.ndarray) -> float:
+def _distance(exit_: Exit, last: np.ndarray, way: np.ndarray) -> float:
     """m from where somebody was last seen; of a heading, the part of the way aside or back."""
-    if one.heading is None:
-        return float(np.linalg.norm(one.point(last) - last))
-    return float(np.linalg.norm(way - max(way @ one.heading, 0.0) * one.heading))
+    if exit_.heading is None:
+        return float(np.linalg.norm(exit_.point(last) - last))
+    return float(np.linalg.norm(way - max(way @ exit_.heading, 0.0) * exit_.heading))
 
 
-def destinations(own: ListLike[Exit], x: np.ndarray) -> np.ndarray:
+def destinations(exits: ListLike[Exit], x: np.ndarray) -> np.ndarray:
     """``(N, 2)`` m, the destinations of people with their exits who are at ``x`` (N, 2)."""
-    return np.stack([one.point(place) for one, place in zip(own, x, strict=True)])
+    return np.stack([exit_.point(place) for exit_, place in zip(exits, x, strict=True)])

@@ -11,7 +11,7 @@ told apart by where the agents are:
 - Otherwise there is one clock, and an identifier that turns up again where its agent cannot have
   got to since is another agent's.
 
-Places are the same within the error that :mod:`nnode.data.quality` grants a single position;
+Places are the same within the error that :mod:`nnode.data.limits` grants a single position;
 windows of one recording repeat the same rows and do not need it. Most agents, not all, because a
 single one at another place is what a fault of the measurement looks like.
 """
@@ -26,8 +26,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from nnode.data.limits import LIMITS
 from nnode.data.options import Agents
-from nnode.data.quality import LIMITS
 from nnode.data.sequence import Domain, Sequence
 
 #: Sampling times are counted up to this number: it is exact, and adding to it as well.
@@ -66,17 +66,20 @@ def identify(
         if s.agents:
             recordings[s.recording].append(i)
     for recording, places in recordings.items():
-        own = [sequences[i] for i in places]
-        found: _Numbers | None
+        members = [sequences[i] for i in places]
+        numbering: _Numbers | None
         if mode is Agents.sequence:
-            found = _counted(own, range(len(own))), "identifiers belong to their sequence"
+            numbering = (
+                _counted(members, range(len(members))),
+                "identifiers belong to their sequence",
+            )
         else:
-            found = _judged(own, domain)
-        if found is None:
+            numbering = _judged(members, domain)
+        if numbering is None:
             continue
-        notes.append(f"{recording}: {found[1]}")
-        taken = {name for s in own for name in s.agents}
-        for i, s, numbers in zip(places, own, found[0], strict=True):
+        notes.append(f"{recording}: {numbering[1]}")
+        taken = {name for s in members for name in s.agents}
+        for i, s, numbers in zip(places, members, numbering[0], strict=True):
             named[i] = tuple(
                 numbered(name, n, taken) for name, n in zip(s.agents, numbers, strict=True)
             )
@@ -89,9 +92,9 @@ _Numbers = tuple[list[list[int]], str]
 
 def _counted(sequences: list[Sequence], worlds: Iterable[int]) -> list[list[int]]:
     """Number the agents of one name by the worlds that they are in, as these appear."""
-    seen: dict[str, dict[int, int]] = defaultdict(dict)
+    worlds_of: dict[str, dict[int, int]] = defaultdict(dict)
     return [
-        [seen[name].setdefault(int(world), len(seen[name]) + 1) for name in s.agents]
+        [worlds_of[name].setdefault(int(world), len(worlds_of[name]) + 1) for name in s.agents]
         for s, world in zip(sequences, worlds, strict=True)
     ]
 
@@ -189,14 +192,14 @@ def _neighbours(tracks: list[_Track | None], error: float) -> tuple[_Pairs, _Pai
     table = np.concatenate(parts)
     table = table[np.isfinite(table).all(axis=1)]
     table = table[np.lexsort((table[:, 2], *table.T[:3:-1], table[:, 1], table[:, 0]))]
-    one, two = table[:-1], table[1:]
-    ghosts = one[:, 3] + two[:, 3]
-    met = (one[:, :2] == two[:, :2]).all(axis=1) & (one[:, 2] != two[:, 2]) & (ghosts < 2)
-    close = np.linalg.norm(one[:, 4:] - two[:, 4:], axis=1) <= error
+    row, next_row = table[:-1], table[1:]
+    ghosts = row[:, 3] + next_row[:, 3]
+    met = (row[:, :2] == next_row[:, :2]).all(axis=1) & (row[:, 2] != next_row[:, 2]) & (ghosts < 2)
+    close = np.linalg.norm(row[:, 4:] - next_row[:, 4:], axis=1) <= error
 
     def pairs(mask: np.ndarray) -> _Pairs:
-        both = np.sort(np.stack([one[mask, 2], two[mask, 2]], axis=1), axis=1)
-        return [(int(i), int(j)) for i, j in np.unique(both, axis=0)]
+        indices = np.sort(np.stack([row[mask, 2], next_row[mask, 2]], axis=1), axis=1)
+        return [(int(i), int(j)) for i, j in np.unique(indices, axis=0)]
 
     return pairs(met & close), pairs(met & ~close & (ghosts == 0))
 
@@ -211,15 +214,15 @@ def _met(tracks: list[_Track | None], pair: tuple[int, int], error: float) -> di
         return {}
     # the row ahead of the end counts only where the sequences have no other time in common
     rows = max(min(a.first + len(a.x), b.first + len(b.x)) - 1 - b.first, 1)
-    own = a.x[b.first - a.first :][:rows]
-    other = b.x[: len(own)]
-    found = {}
+    path = a.x[b.first - a.first :][:rows]
+    other = b.x[: len(path)]
+    met = {}
     for name in a.place.keys() & b.place.keys():
-        apart = np.linalg.norm(own[:, a.place[name], None] - other, axis=2)
-        known = np.isfinite(apart)
-        if known[:, b.place[name]].any():
-            found[name] = bool((known.any(0) & ((apart <= error) | ~known).all(0)).any())
-    return found
+        apart = np.linalg.norm(path[:, a.place[name], None] - other, axis=2)
+        measured = np.isfinite(apart)
+        if measured[:, b.place[name]].any():
+            met[name] = bool((measured.any(0) & ((apart <= error) | ~measured).all(0)).any())
+    return met
 
 
 def _used_again(sequences: list[Sequence], domain: Domain) -> _Numbers | None:
@@ -264,8 +267,8 @@ def _used_again(sequences: list[Sequence], domain: Domain) -> _Numbers | None:
 def _end(s: Sequence, n: int, which: int) -> np.ndarray:
     """The first (0) or last (-1) known position of an agent, NaN where there is none."""
     x = s.x[:, n]
-    known = x[np.isfinite(x).all(axis=1)]
-    return known[which] if len(known) else np.full(x.shape[1], np.nan)
+    measured = x[np.isfinite(x).all(axis=1)]
+    return measured[which] if len(measured) else np.full(x.shape[1], np.nan)
 
 
 def given_anew(time: np.ndarray, x: np.ndarray, other: np.ndarray, hole: np.ndarray) -> np.ndarray:
@@ -293,7 +296,7 @@ def reachable(
     """Whether an agent at ``start`` can be at ``end`` (..., D; m) ``gap`` seconds later.
 
     No faster than the greatest possible speed, and a vehicle no further back than a path's reach
-    (see :class:`~nnode.data.quality.Limits`); what is not known is possible.
+    (see :class:`~nnode.data.limits.Limits`); what is not known is possible.
     """
     limits = LIMITS[domain]
     step = np.asarray(end - start)

@@ -27,26 +27,26 @@ def smooth(x: np.ndarray) -> np.ndarray:
     if len(x) < 6:
         return x.copy()
     columns, values, penalty = x.reshape(len(x), -1), _sizes(len(x)), _penalty(len(x))
-    one = np.eye(ORDER + 1, 1)
-    found, least = columns, np.inf
+    identity = np.eye(ORDER + 1, 1)
+    best, best_score = columns, np.inf
     for weight in WEIGHTS:
-        smoothed = solveh_banded(one + weight * penalty, columns, lower=True)
+        smoothed = solveh_banded(identity + weight * penalty, columns, lower=True)
         kept = (1 / (1 + weight * values)).sum()
         score = ((columns - smoothed) ** 2).sum() / (len(x) - kept) ** 2
-        if score < least:
-            found, least = smoothed, score
-    return found.reshape(x.shape)
+        if score < best_score:
+            best, best_score = smoothed, score
+    return best.reshape(x.shape)
 
 
 @cache
 def _penalty(samples: int) -> np.ndarray:
     """That on differences, as lower diagonals ``(ORDER + 1, K)``."""
     step = np.diff(np.eye(ORDER + 1), ORDER, axis=0)[0]
-    found = np.zeros((ORDER + 1, samples))
+    bands = np.zeros((ORDER + 1, samples))
     for i in range(ORDER + 1):
         for j in range(i + 1):
-            found[i - j, j : samples - ORDER + j] += step[i] * step[j]
-    return found
+            bands[i - j, j : samples - ORDER + j] += step[i] * step[j]
+    return bands
 
 
 @cache
@@ -55,8 +55,8 @@ def _sizes(samples: int) -> np.ndarray:
     at the ends alone."""
     if samples > LONG:
         waves = np.pi * np.arange(samples) / samples
-        found: np.ndarray = (2 - 2 * np.cos(waves)) ** ORDER
-        return found
+        eigenvalues: np.ndarray = (2 - 2 * np.cos(waves)) ** ORDER
+        return eigenvalues
     difference = np.diff(np.eye(samples), ORDER, axis=0)
     return np.maximum(np.linalg.eigvalsh(difference.T @ difference), 0.0)
 

@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,36 +21,37 @@ from omegaconf.errors import MissingMandatoryValue
 from nnode.data.cut import Reading
 from nnode.data.download import sha256
 from nnode.data.identity import identify
-from nnode.data.options import (
-    DataOptions,
-    EsimasOptions,
-    HighDOptions,
-    JuelichOptions,
-    NgsimOptions,
-    OpenAccOptions,
-    PairOptions,
-    Starts,
-    SumoOptions,
-    TableOptions,
-    VehicleTableOptions,
-    WalkwayOptions,
-    with_present_names,
+from nnode.data.options import DataOptions, Starts, with_present_names
+from nnode.data.quality import (
+    Fault,
+    apply_policy,
+    by_recording,
+    described,
+    drop_absent,
+    find_faults,
+    interpolated,
+    interpolated_text,
+    left_out_texts,
 )
-from nnode.data.policy import apply_policy, by_recording, drop_absent, told_filled, without
-from nnode.data.quality import Fault, find_faults
 from nnode.data.readers.columns import Table, quoted
-from nnode.data.readers.esimas import esimas_files, read_esimas
-from nnode.data.readers.highd import highd_files, read_highd
-from nnode.data.readers.juelich import juelich_files, read_juelich
-from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files
-from nnode.data.readers.ngsim import read_ngsim
-from nnode.data.readers.openacc import openacc_files, read_openacc
-from nnode.data.readers.pairs import pair_files, read_pairs
+from nnode.data.readers.esimas import EsimasOptions, esimas_files, read_esimas
+from nnode.data.readers.highd import HighDOptions, highd_files, read_highd
+from nnode.data.readers.juelich import JuelichOptions, juelich_files, read_juelich
+from nnode.data.readers.jupedsim import (
+    GEOMETRY,
+    PEOPLE,
+    WalkwayOptions,
+    read_walkway,
+    walkway_files,
+)
+from nnode.data.readers.ngsim import NgsimOptions, read_ngsim
+from nnode.data.readers.openacc import OpenAccOptions, openacc_files, read_openacc
+from nnode.data.readers.pairs import PairOptions, pair_files, read_pairs
 from nnode.data.readers.recordings import reading
-from nnode.data.readers.sumo import read_sumo, sumo_files
+from nnode.data.readers.sumo import SumoOptions, read_sumo, sumo_files
 from nnode.data.readers.table import TABLE as TIDY
-from nnode.data.readers.table import WALLS, read_table, table_files
-from nnode.data.readers.vehicles import read_vehicles, vehicle_files
+from nnode.data.readers.table import WALLS, TableOptions, read_table, table_files
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles, vehicle_files
 from nnode.data.sequence import Domain, Sequence, check_interval
 from nnode.data.smooth import measured_noise, start_smoothed
 from nnode.data.store import Store, write_store
@@ -82,10 +83,10 @@ class Format:
     """A raw format: which files it needs, and how they become sequences."""
 
     files: Callable[..., _Files]
-    read: Callable[[_Files, Any], list[Sequence]]
+    read: Callable[[_Files, Any], Reading]
     tables: bool = False  # whether ``files`` takes a table in memory as well
 
-    def sequences(self, files: _Files, options: Any) -> list[Sequence]:
+    def sequences(self, files: _Files, options: Any) -> Reading:
         """Read the files.
 
         Raises:
@@ -100,14 +101,14 @@ class Format:
             return self.read(files, options)
 
 
-def _each(read: Callable[[Path, Any], list[Sequence]]) -> Callable[[_Files, Any], list[Sequence]]:
+def _each(read: Callable[[Path, Any], Reading]) -> Callable[[_Files, Any], Reading]:
     """Read files that do not depend on each other."""
 
     def every(files: _Files, options: Any) -> Reading:
-        found = Reading()
+        sequences = Reading()
         for path in files.values():
-            found.add(read(path, options))
-        return found
+            sequences.add(read(path, options))
+        return sequences
 
     return every
 
@@ -146,7 +147,7 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
             :func:`nnode.plots.quality.plot_faults`; None draws nothing.
 
     Returns:
-        The store. Its manifest tells the source files and their SHA-256, all options, the
+        The store. Its manifest has the source files and their SHA-256, all options, the
         package's version, the sampling interval (s), how many sequences were read, kept and
         dropped (in all and by recording), every fault that was found, every sequence and agent
         that was dropped and why, every record of which there is no sequence, what was interpolated
@@ -194,7 +195,7 @@ class Judged:
 
 
 def judge(
-    options: DataOptions, files: _Files, read: list[Sequence], stages: Stages | None = None
+    options: DataOptions, files: _Files, read: Reading, stages: Stages | None = None
 ) -> Judged:
     """Look for faults and sort out what the options do not keep.
 
@@ -206,7 +207,6 @@ def judge(
         NNodeError: see :func:`prepare`.
     """
     domain = _domain(options, read)
-    read = read if isinstance(read, Reading) else Reading(read)
     _plausible(options, read)
     noise = measured_noise(read)
     sequences, absent = drop_absent(read) if domain == "crowd" else (read, [])
@@ -216,21 +216,20 @@ def judge(
         if stages is not None:
             stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
-    for text in [*read.notes, *without(read, dropped, read.left_out)]:
+    for text in [*read.notes, *left_out_texts(len(read), dropped, read.left_out)]:
         log.warning("%s", text)
     # faults are told with the source's own identifiers, and of faulty sequences they are looked
     # at as well: through them one of those agents may go on
     agents, notes = identify(sequences, domain, options.agents)
-    unique = {s.name: replace(s, agents=own) for s, own in zip(sequences, agents, strict=True)}
+    unique = {s.name: replace(s, agents=names) for s, names in zip(sequences, agents, strict=True)}
     kept = [unique[s.name] for s in kept]
     if options.start_speeds is Starts.smoothed:
         kept = [start_smoothed(s) for s in kept]
-    filled = [{"sequence": s.name, "samples": s.filled} for s in kept if s.filled]
-    if filled:
-        log.info("%s", told_filled(filled))
+    if filled := interpolated(kept):
+        log.info("%s", interpolated_text(filled))
     if notes:
-        more = f" (and {len(notes) - 1} more recordings)" if len(notes) > 1 else ""
-        log.info("%s%s; data.agents decides by hand", notes[0], more)
+        others = f" (and {len(notes) - 1} more recordings)" if len(notes) > 1 else ""
+        log.info("%s%s; data.agents decides by hand", notes[0], others)
     manifest = {
         "package": {"name": "nnode", "version": VERSION},
         "reader": type(options).__name__,
@@ -247,7 +246,7 @@ def judge(
         "notes": read.notes,
         "filled": filled,
         "noise": noise.plain(),
-        "faults": [_account(fault, s) for s in sequences for fault in faults[s.name]],
+        "faults": [described(fault, s) for s in sequences for fault in faults[s.name]],
     }
     return Judged(domain, sequences, faults, kept, manifest)
 
@@ -299,13 +298,13 @@ def made_by(store: Store) -> type[DataOptions]:
         ConfigError: a store of an earlier version, which did not note it.
     """
     name = store.manifest.get("reader")
-    found = next((kind for kind in FORMATS if kind.__name__ == name), None)
-    if found is None:
+    kind_of_options = next((kind for kind in FORMATS if kind.__name__ == name), None)
+    if kind_of_options is None:
         raise ConfigError(
             f"{store.folder} does not tell which of nnode's readers prepared it (found {name!r}); "
             "prepare the data again, or set data.prepared=null to prepare on the fly"
         )
-    return found
+    return kind_of_options
 
 
 def refuse_others(store: Store, asked: Mapping[str, Any]) -> None:
@@ -340,12 +339,6 @@ def plain(options: DataOptions) -> dict[str, Any]:
     return cast(dict[str, Any], json.loads(json.dumps(container)))
 
 
-def _account(fault: Fault, sequence: Sequence) -> dict[str, Any]:
-    """A fault as the manifest remembers it: with the agents' identifiers, where there are such."""
-    names = [sequence.agents[i] for i in fault.agents] if sequence.agents else []
-    return {**asdict(fault), "names": names}
-
-
 def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:
     if isinstance(options, DictConfig):
         try:
@@ -353,8 +346,8 @@ def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:
         except MissingMandatoryValue as error:
             raise ConfigError(f"{error.full_key} is not set; give it a value") from error
     if type(options) not in FORMATS:
-        known = ", ".join(kind.__name__ for kind in FORMATS)
-        raise ConfigError(f"no reader for {type(options).__name__}; expected one of {known}")
+        kinds = ", ".join(kind.__name__ for kind in FORMATS)
+        raise ConfigError(f"no reader for {type(options).__name__}; expected one of {kinds}")
     return options
 
 
@@ -410,18 +403,18 @@ def _drawn(folder: Path, judged: Judged, draw: Draw | None) -> Iterator[None]:
     partial = folder / f".{PLOTS}.{os.getpid()}.partial"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for rest in folder.glob(".*.partial"):  # what an interrupted preparation left
-            shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
+        for leftover in folder.glob(".*.partial"):  # what an interrupted preparation left
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         partial.mkdir()
     except OSError as error:
         raise DataError(f"{folder} cannot be written: {error}; choose another folder") from error
     try:
         if draw is not None:
             for recording in dict.fromkeys(s.recording for s in sequences):
-                own = [s for s in sequences if s.recording == recording]
-                if any(faults[s.name] for s in own):
+                of_recording = [s for s in sequences if s.recording == recording]
+                if any(faults[s.name] for s in of_recording):
                     name = f"{file_name(recording)}.png"
-                    draw(own, faults, judged.domain, partial / name)
+                    draw(of_recording, faults, judged.domain, partial / name)
         yield
         shutil.rmtree(folder / PLOTS, ignore_errors=True)
         if any(partial.iterdir()):

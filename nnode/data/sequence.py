@@ -16,6 +16,10 @@ Domain = Literal["traffic", "crowd"]
 
 #: Seconds by unit of time.
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+#: Metres by unit of length.
+LENGTH_UNITS = {"m": 1.0, "ft": 0.3048, "cm": 0.01, "km": 1000.0}
+#: m/s by unit of speed.
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.44704}
 #: s; a sampling interval is at least the first and below the second. Cameras, radar and satellite
 #: navigation take up to some hundred samples in a second. In ten seconds a car at 20 m/s drives
 #: 200 m and a person walks 13 m, past everything that either reacts to. Times in milliseconds of
@@ -23,13 +27,13 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: microseconds, nanoseconds, and, below it, days.
 SHORTEST, LONGEST = 1e-3, 10.0
 
-#: Share of the sampling interval by which a time may miss equal steps.
-UNEVEN = 0.01
 #: Distance (m) between the padding vehicles that stand in front of a shorter platoon.
 PADDING_GAP = 1e5
 #: Fields of a batch that are positions. They stay in float64: numbers of float32 are 0.5 m apart
 #: at 7,000 km, where the coordinates of maps lie.
 _POSITIONS = ("x", "destination", "walls")
+#: Fields of a sequence with a name, and with a number or a vector, of every agent.
+_NAMES, _PER_AGENT = ("agents", "kind", "group"), ("length", "destination", "preferred")
 
 
 def check_interval(dt: float, whose: str, remedy: str = "") -> None:
@@ -113,26 +117,21 @@ class Sequence:
                 f"sequence {self.name}: time must be ({x.shape[0]},), got shape {time.shape}"
             )
         n, d = x.shape[1:]
-        for field, shape in (
-            ("v", x.shape),
-            ("length", (n,)),
-            ("destination", (n, d)),
-            ("preferred", (n, d)),
-        ):
+        shapes = {"v": x.shape, "length": (n,), "destination": (n, d), "preferred": (n, d)}
+        for field, shape in shapes.items():
             value = getattr(self, field)
-            if value is not None:
-                value = np.asarray(value, dtype=np.float64)
-                if value.shape != shape:
-                    raise DataError(
-                        f"sequence {self.name}: {field} must be {shape}, got {value.shape}"
-                    )
-                if field == "length" and (value <= 0).any():
-                    raise DataError(
-                        f"sequence {self.name}: a length is {value[value <= 0][0]:g} m, expected "
-                        "a positive number, or NaN where it is not known"
-                    )
-                object.__setattr__(self, field, value)
-        for field in ("agents", "kind", "group"):
+            if value is None:
+                continue
+            value = np.asarray(value, dtype=np.float64)
+            if value.shape != shape:
+                raise DataError(f"sequence {self.name}: {field} must be {shape}, got {value.shape}")
+            if field == "length" and (value <= 0).any():
+                raise DataError(
+                    f"sequence {self.name}: a length is {value[value <= 0][0]:g} m, expected "
+                    "a positive number, or NaN where it is not known"
+                )
+            object.__setattr__(self, field, value)
+        for field in _NAMES:
             value = getattr(self, field)
             if value and len(value) != n:
                 raise DataError(
@@ -184,21 +183,16 @@ class Sequence:
     def select(self, keep: np.ndarray) -> Sequence:
         """The same sequence with only the agents where ``keep`` (N booleans) holds."""
         index = np.flatnonzero(keep)
-
-        def names(value: tuple[str, ...] | None) -> tuple[str, ...] | None:
-            return tuple(value[i] for i in index) if value else value
-
-        return replace(
-            self,
-            x=self.x[:, index],
-            v=None if self.v is None else self.v[:, index],
-            agents=names(self.agents) or (),
-            length=None if self.length is None else self.length[index],
-            kind=names(self.kind),
-            group=names(self.group),
-            destination=None if self.destination is None else self.destination[index],
-            preferred=None if self.preferred is None else self.preferred[index],
-        )
+        chosen: dict[str, Any] = {"x": self.x[:, index]}
+        if self.v is not None:
+            chosen["v"] = self.v[:, index]
+        for field in _NAMES:
+            if names := getattr(self, field):
+                chosen[field] = tuple(names[i] for i in index)
+        for field in _PER_AGENT:
+            if (values := getattr(self, field)) is not None:
+                chosen[field] = values[index]
+        return replace(self, **chosen)
 
 
 @dataclass(kw_only=True)
@@ -334,44 +328,35 @@ def collate(sequences: Iterable[Sequence]) -> Batch:
     n = max(item.n_agents for item in items)
     b, d = len(items), first.x.shape[2]
     w = max(0 if item.walls is None else len(item.walls) for item in items)
-    x = np.empty((k, b, n, d))
-    v = np.zeros((k, b, n, d))
+    x, v = np.empty((k, b, n, d)), np.zeros((k, b, n, d))
     valid = np.zeros((k, b, n), dtype=bool)
-    length = np.full((b, n), np.nan)
+    per_agent = {
+        "length": np.full((b, n), np.nan),
+        "destination": np.empty((b, n, d)),
+        "preferred": np.full((b, n, d), np.nan),
+    }
     walls = np.full((b, w, 4), np.nan)
-    destination = np.empty((b, n, d))
-    preferred = np.full((b, n, d), np.nan)
     for i, item in enumerate(items):
         ki, ni = item.n_samples, item.n_agents
         x[:ki, i, :ni] = item.x
         x[ki:, i, :ni] = item.x[-1]
-        ahead = item.x.max() + PADDING_GAP * np.arange(1, n - ni + 1)
-        x[:, i, ni:] = ahead[None, :, None]
+        x[:, i, ni:] = item.x.max() + PADDING_GAP * np.arange(1, n - ni + 1)[:, None]
         v[:ki, i, :ni] = item.velocity()
         valid[:ki, i, :ni] = True
-        destination[i] = x[-1, i]
-        if item.destination is not None:
-            destination[i, :ni] = item.destination
-        if item.preferred is not None:
-            preferred[i, :ni] = item.preferred
-        if item.length is not None:
-            length[i, :ni] = item.length
+        per_agent["destination"][i] = x[-1, i]
+        for field, padded in per_agent.items():
+            if (values := getattr(item, field)) is not None:
+                padded[i, :ni] = values
         if item.walls is not None:
             walls[i, : len(item.walls)] = item.walls
+    arrays = {"x": x, "v": v, "valid": valid, "agent": valid.any(axis=0), "walls": walls}
+    arrays |= {"start": np.array([item.time[0] for item in items]), **per_agent}
+    if all(item.preferred is None for item in items):
+        del arrays["preferred"]
     return Batch(
         dt=first.dt,
-        x=torch.from_numpy(x),
-        v=torch.from_numpy(v),
-        valid=torch.from_numpy(valid),
-        agent=torch.from_numpy(valid.any(axis=0)),
-        start=torch.tensor([item.time[0] for item in items], dtype=torch.float64),
-        destination=torch.from_numpy(destination),
-        length=torch.from_numpy(length),
-        walls=torch.from_numpy(walls),
         names=tuple(item.name for item in items),
         kind=tuple(item.kind for item in items),
         group=tuple(item.group for item in items),
-        preferred=None
-        if all(item.preferred is None for item in items)
-        else torch.from_numpy(preferred),
+        **{name: torch.from_numpy(array) for name, array in arrays.items()},
     )

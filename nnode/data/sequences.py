@@ -16,10 +16,10 @@ import pandas as pd
 from platformdirs import user_cache_path
 
 from nnode.data._arrow import to_table
-from nnode.data.check.recognise import recognised
-from nnode.data.check.source import Recognised
+from nnode.data.check.recognise import Recognised, recognised
 from nnode.data.clusters import clusters, index_of
-from nnode.data.options import DataOptions, LaneOptions
+from nnode.data.cut import LaneOptions
+from nnode.data.options import DataOptions
 from nnode.data.prepare import FORMATS, judge
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import reading
@@ -107,9 +107,9 @@ class Sequences:
             if isinstance(source, Table):
                 source = source.frame
             with reading("the table" if isinstance(source, pd.DataFrame) else source):
-                found = recognised(source)
-            say_recognised(found)
-            source, options = found.table, found.options
+                recognised_source = recognised(source)
+            say_recognised(recognised_source)
+            source, options = recognised_source.table, recognised_source.options
         if source is not None and not isinstance(source, pd.DataFrame | Table):
             if not hasattr(options, "path"):
                 raise ConfigError(f"data={options.name} is no table: leave the path out")
@@ -161,10 +161,10 @@ class Sequences:
         Raises:
             DataError: they are others.
         """
-        own = {item.name: item for item in self._items}
+        simulated = {item.name: item for item in self._items}
         total, number = 0.0, 0
         for other in Sequences.of(measured):
-            mine = own.get(other.name)
+            mine = simulated.get(other.name)
             if mine is None or mine.x.shape != other.x.shape:
                 raise DataError(
                     f"sequence {other.name} is not among the simulated ones, or has other agents "
@@ -182,15 +182,15 @@ class Sequences:
         known. ``sequence``, ``time`` and ``agent`` are the keys of the table that was read.
         """
         tables = [to_table(item).to_pandas().dropna(axis=1, how="all") for item in self._items]
-        found = pd.concat(tables, ignore_index=True)
-        run = found["recording"] + "/"
-        pairs = zip(found["sequence"], run, strict=True)
-        found["sequence"] = [name.removeprefix(prefix) for name, prefix in pairs]
+        table = pd.concat(tables, ignore_index=True)
+        run = table["recording"] + "/"
+        pairs = zip(table["sequence"], run, strict=True)
+        table["sequence"] = [name.removeprefix(prefix) for name, prefix in pairs]
         for key in ("sequence", "agent"):
-            if all(re.fullmatch(r"0|[1-9]\d{0,17}", name) for name in found[key].unique()):
-                found[key] = found[key].astype("int64")
-        goals = [key for key in found if str(key).startswith("dest_")]
-        return found.drop(columns=goals) if self.domain == "traffic" else found
+            if all(re.fullmatch(r"0|[1-9]\d{0,17}", name) for name in table[key].unique()):
+                table[key] = table[key].astype("int64")
+        goals = [key for key in table if str(key).startswith("dest_")]
+        return table.drop(columns=goals) if self.domain == "traffic" else table
 
     def to_xarray(self) -> Dataset:
         """Positions, and speeds where they are known, with sequence, sample and agent as axes.
@@ -211,10 +211,10 @@ class Sequences:
                     values[f"v{axis}"][part] = s.v[..., d]
             time[number, : s.n_samples] = s.time
             agent[number, : s.n_agents] = s.agents or [str(i) for i in range(s.n_agents)]
-        known = {key: value for key, value in values.items() if np.isfinite(value).any()}
+        finite = {key: value for key, value in values.items() if np.isfinite(value).any()}
         dims = ("sequence", "sample", "place")
         return xarray().Dataset(
-            {key: (dims, value, {"units": UNITS[key]}) for key, value in known.items()},
+            {key: (dims, value, {"units": UNITS[key]}) for key, value in finite.items()},
             coords={
                 "sequence": [s.name for s in self._items],
                 "time": (dims[:2], time, {"units": "s"}),
@@ -244,10 +244,10 @@ class Sequences:
         return f"<p>{escape(self._about())}</p>{table}{more}"
 
 
-def say_recognised(found: Recognised) -> None:
+def say_recognised(source: Recognised) -> None:
     """Tell how a table is read, where its names or units are not those of its format."""
-    if found.line:
-        log.warning("%s", found.line)
+    if source.line:
+        log.warning("%s", source.line)
 
 
 def _files(options: DataOptions, frame: pd.DataFrame | Table | None) -> dict[str, Any]:

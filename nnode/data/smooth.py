@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from scipy.signal import savgol_coeffs, savgol_filter
 
+from nnode.data.limits import BEARABLE
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 
@@ -32,13 +33,6 @@ LEAST = 9
 #: s, windows of ``data.smooth`` that are suggested.
 WINDOWS = (1.0, 1.5, 2.0, 3.0, 4.0)
 
-#: m/s; first speeds that are wrong by more are not taken from single samples. A follower forgets
-#: its first speed within about 2.5 s (idm with T = 1.4 s, a = 1.2 m/s²), so that 0.2 m/s move its
-#: path by 0.5 m, the error that a single position may have (nnode.data.quality). In simulations
-#: of idm, 40 followers for 40 s, errors of 0.07 m/s leave all parameters within 1 %, those of
-#: 0.28 m/s lead to errors of 1 % of v0 and 5 % of s0, those of 0.7 m/s of 2 % and 13 % (table in
-#: docs/data.md).
-BEARABLE = 0.2
 #: Median of the size of a standard normal variable, and the sum of squares of 1, 4, 6, 4, 1.
 _MEDIAN, _FOURTH = 0.6745, 70.0
 
@@ -89,21 +83,21 @@ def measured_noise(sequences: Iterable[Sequence]) -> Noise:
     for s in sequences:
         if s.n_samples < LEAST or not s.n_agents:
             continue
-        found = _noise(s.x)
-        places.append(found)
+        noise = _noise(s.x)
+        places.append(noise)
         # a forward difference holds the errors of two positions
-        speeds.append(np.sqrt(2) * found / s.dt if s.v is None else _noise(s.v))
-    position, start = (_usual(found) for found in (places, speeds))
+        speeds.append(np.sqrt(2) * noise / s.dt if s.v is None else _noise(s.v))
+    position, start = (_usual(noise) for noise in (places, speeds))
     return Noise(position, start)
 
 
 def _noise(x: np.ndarray) -> np.ndarray:
     """``(N,)`` standard deviations of the noise of ``(K, N, D)``, NaN where nothing is known."""
     size = np.abs(np.diff(x, 4, axis=0)).transpose(1, 0, 2).reshape(x.shape[1], -1)
-    known = np.isfinite(size).any(axis=1)
-    found = np.full(x.shape[1], np.nan)
-    found[known] = np.nanmedian(size[known], axis=1) / (_MEDIAN * np.sqrt(_FOURTH))
-    return found
+    measured = np.isfinite(size).any(axis=1)
+    deviations = np.full(x.shape[1], np.nan)
+    deviations[measured] = np.nanmedian(size[measured], axis=1) / (_MEDIAN * np.sqrt(_FOURTH))
+    return deviations
 
 
 def _usual(parts: list[np.ndarray]) -> float:
@@ -165,8 +159,8 @@ def across(time: np.ndarray, x: np.ndarray, i: int, at: np.ndarray) -> np.ndarra
     middle = (time[i] + time[i + 1]) / 2
     degree = DEGREE if high - low > DEGREE else 1
     powers = np.vander(time[rows] - middle, degree + 1)
-    found = np.linalg.lstsq(powers, x[rows] - x[i], rcond=None)[0]
-    return np.asarray(np.vander(at - middle, degree + 1) @ found + x[i])
+    coefficients = np.linalg.lstsq(powers, x[rows] - x[i], rcond=None)[0]
+    return np.asarray(np.vander(at - middle, degree + 1) @ coefficients + x[i])
 
 
 def smooth(time: np.ndarray, x: np.ndarray, window: float) -> tuple[np.ndarray, np.ndarray]:
@@ -200,9 +194,9 @@ def smooth(time: np.ndarray, x: np.ndarray, window: float) -> tuple[np.ndarray, 
         return x, np.gradient(x, time)
     even = np.interp(grid, time, x)
     samples = min(samples, len(grid) - 1 + len(grid) % 2)
-    found = savgol_filter(even, samples, DEGREE)
+    smoothed = savgol_filter(even, samples, DEGREE)
     speed = savgol_filter(even, samples, DEGREE, deriv=1, delta=step)
-    return np.interp(time, grid, found), np.interp(time, grid, speed)
+    return np.interp(time, grid, smoothed), np.interp(time, grid, speed)
 
 
 def start_smoothed(sequence: Sequence) -> Sequence:

@@ -126,14 +126,14 @@ def _published(index: Index, gap: float) -> Split:
             "data.split.mode=auto, or give the data a column split"
         )
     label = clusters(index, gap)
-    both = [i for i in train if label[i] in set(label[held])]
-    rest = sorted(set(range(len(index))) - {*train, *held})
+    on_both_sides = [i for i in train if label[i] in set(label[held])]
+    unused = sorted(set(range(len(index))) - {*train, *held})
     note = f"{len(held)} of {len(index)} sequences held out, as the source publishes it"
-    if both:
-        note += f"; {len(both)} that train {relation(index, gap)} with a held-out one"
-    if rest:
-        note += f"; {len(rest)} are on neither side and not used"
-    return Split(train=train, heldout=held, dropped=rest, mode="published", note=note)
+    if on_both_sides:
+        note += f"; {len(on_both_sides)} that train {relation(index, gap)} with a held-out one"
+    if unused:
+        note += f"; {len(unused)} are on neither side and not used"
+    return Split(train=train, heldout=held, dropped=unused, mode="published", note=note)
 
 
 def _by_component(index: Index, share: float, gap: float, rng: np.random.Generator) -> Split:
@@ -171,8 +171,8 @@ def _by_block(index: Index, share: float, gap: float, rng: np.random.Generator) 
         first = int(rng.integers(len(order) - count + 1))
         block = order[first : first + count]
         held += block
-        rest = sorted(set(members) - set(block))
-        dropped += _related(index, rest, block, gap)
+        others = sorted(set(members) - set(block))
+        dropped += _related(index, others, block, gap)
     gone = {*held, *dropped}
     result = Split(
         train=[i for i in range(len(index)) if i not in gone],
@@ -203,15 +203,15 @@ def _checked(result: Split, share: float, hint: str) -> Split:
     )
 
 
-def _related(index: Index, rest: list[int], block: list[int], gap: float) -> list[int]:
+def _related(index: Index, others: list[int], block: list[int], gap: float) -> list[int]:
     """Those of ``rest`` that may share an agent with ``block``; all of one recording."""
-    if identified(index, rest + block):
+    if identified(index, others + block):
         agents = {a for i in block for a in index[i]["agents"]}
-        return [i for i in rest if not agents.isdisjoint(index[i]["agents"])]
+        return [i for i in others if not agents.isdisjoint(index[i]["agents"])]
     spans = [(index[i]["start"], index[i]["end"]) for i in block]
     return [
         i
-        for i in rest
+        for i in others
         if any(
             max(_apart(end, index[i]["start"]), _apart(index[i]["end"], start)) < gap
             for start, end in spans

@@ -185,14 +185,14 @@ def _write_table(path: Path, sequences: Iterable[Sequence]) -> dict[str, Any]:
     """Write the Parquet table; returns the manifest's part that describes it."""
     index: list[dict[str, Any]] = []
     walls: list[np.ndarray] = []
-    seen: set[str] = set()
+    names: set[str] = set()
     dims = 0
     writer: pq.ParquetWriter | None = None
     try:
         for item in sequences:
-            _check(item, dims, seen)
+            _check(item, dims, names)
             dims = item.x.shape[2]
-            seen.add(item.name)
+            names.add(item.name)
             if writer is None:
                 writer = open_writer(path, dims)
             table = to_table(item)
@@ -236,9 +236,9 @@ def _entry(item: Sequence, walls: list[np.ndarray]) -> dict[str, Any]:
     }
 
 
-def _check(item: Sequence, dims: int, seen: set[str]) -> None:
+def _check(item: Sequence, dims: int, names: set[str]) -> None:
     fault = None
-    if item.name in seen:
+    if item.name in names:
         fault = "its name is used twice; names must be unique within a data set"
     elif not item.n_samples or not item.n_agents:
         fault = f"it has {item.n_samples} samples of {item.n_agents} agents, expected some"

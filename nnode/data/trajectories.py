@@ -19,15 +19,12 @@ import numpy as np
 import pandas as pd
 
 from nnode.data.identity import LATEST, given_anew, numbered
+from nnode.data.limits import HOLE, UNEVEN
 from nnode.data.options import positive
-from nnode.data.sequence import UNEVEN
 from nnode.data.smooth import across, smooth
 from nnode.errors import DataError
 
 log = logging.getLogger(__name__)
-
-#: A step longer than so many usual ones is a hole.
-HOLE = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,7 +273,7 @@ def _once(table: Trajectories, order: np.ndarray, code: np.ndarray) -> None:
         raise DataError(
             f"{table.path}, {table.where(j)}: agent {table.agent[j]}{whose} stands there a second "
             f"time at {table.time[j]:g} s (first in {table.where(i)}); expected one row per agent "
-            "and time: name the column that tells agents of one name apart (data.columns)"
+            "and time: name the column that distinguishes agents of one name (data.columns)"
         )
 
 

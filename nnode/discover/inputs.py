@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
 from nnode.data.dataset import Source, noise_of
 from nnode.data.options import DataOptions, Faults
-from nnode.data.policy import told_filled
 from nnode.data.prepare import open_data
-from nnode.data.quality import Fault
+from nnode.data.quality import Fault, interpolated_text, kinds_text, recorded
 from nnode.data.readers.recordings import natural
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.result import DataFault
@@ -77,15 +75,17 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
     Raises:
         DataError: fewer than three sequences are left, or no vehicle follows another.
     """
-    names = {item.name for item in fields(Fault)}
-    faults: dict[str, list[Fault]] = {}
-    reported = []
-    for entry in store.manifest.get("faults", []):
-        plain = {key: value for key, value in entry.items() if key in names}
-        fault = Fault(**{**plain, "agents": tuple(entry["agents"])})
-        faults.setdefault(fault.sequence, []).append(fault)
-        who = entry.get("names") or [str(i) for i in fault.agents]
-        reported.append(DataFault(fault.kind, fault.sequence, who, fault.time, fault.detail))
+    faults = recorded(store.manifest)
+    reported = [
+        DataFault(
+            entry["kind"],
+            entry["sequence"],
+            entry.get("names") or [str(i) for i in entry["agents"]],
+            entry["time"],
+            entry["detail"],
+        )
+        for entry in store.manifest.get("faults", [])
+    ]
     # a fixed order, because divisions into folds depend on it
     everything = sorted(store, key=lambda s: natural(s.name))
     sound = [s for s in everything if s.name not in faults]
@@ -108,7 +108,7 @@ def _measured(store: Source) -> list[str]:
     text = f"The {noise}."
     if noise.beyond:
         text = text[:-1] + "; starts and measured leaders are those of smoothed paths."
-    return [text] + ([f"{told_filled(filled)}."] if filled else [])
+    return [text] + ([f"{interpolated_text(filled)}."] if filled else [])
 
 
 def _check_enough(
@@ -123,8 +123,7 @@ def _check_enough(
             )
     if len(sound) >= LEAST:
         return
-    counts = Counter(kind for faults_of in faults.values() for kind in {f.kind for f in faults_of})
-    why = ", ".join(f"{kind} in {n}" for kind, n in counts.most_common())
+    why = kinds_text(faults.values())
     raise DataError(
         f"data={options.name}: {len(sound)} of {read} sequences are without a fault"
         f"{f' ({why})' if why else ''}; a diagnosis needs at least {LEAST}, some to calibrate on "

@@ -61,8 +61,8 @@ def interval_lines(system: System, intervals: Intervals) -> list[str]:
     values = system.physical()
     short, lines = short_names(values), []
     for address, (value, unit) in values.items():
-        own = intervals.get(address, {})
-        low, high = own.get("low"), own.get("high")
-        known = "no interval" if low is None or high is None else f"95 % [{low:.6g}, {high:.6g}]"
-        lines.append(f"{short[address]} = {float(value):.6g} {unit}, {known}")
+        interval = intervals.get(address, {})
+        low, high = interval.get("low"), interval.get("high")
+        words = "no interval" if low is None or high is None else f"95 % [{low:.6g}, {high:.6g}]"
+        lines.append(f"{short[address]} = {float(value):.6g} {unit}, {words}")
     return lines

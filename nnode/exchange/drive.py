@@ -99,13 +99,13 @@ def drive(
             if steer is not None:
                 steer(sumo)
             job.step()
-        found = job.found(folder / TRAJECTORIES)
+        result = job.found(folder / TRAJECTORIES)
     finally:
         sumo.close()
-    found.step, found.method = steps.seconds, steps.method
-    found.seconds = found.steps * steps.seconds
-    found.wall = time.perf_counter() - started
-    return found
+    result.step, result.method = steps.seconds, steps.method
+    result.seconds = result.steps * steps.seconds
+    result.wall = time.perf_counter() - started
+    return result
 
 
 def check_steps(steps: Steps, expected: Steps, scenario: Path) -> None:
@@ -159,18 +159,18 @@ class _Job:
 
     def step(self) -> None:
         """Speeds for those who are driven, and a step of SUMO's."""
-        sumo, drivers, told = self._sumo, self._drivers, self._sumo.told()
-        stays = np.array([name in told for name in self._names], bool)
+        sumo, drivers, subscribed = self._sumo, self._drivers, self._sumo.told()
+        stays = np.array([name in subscribed for name in self._names], bool)
         if not stays.all():
             drivers.keep(stays)
             self._zero = self._zero[stays]
-            self._names = [name for name in self._names if name in told]
+            self._names = [name for name in self._names if name in subscribed]
         if self._names:
-            seen = sumo.seen(self._names, told, twice=drivers.looks_twice)
+            views = sumo.seen(self._names, subscribed, twice=drivers.looks_twice)
             if drivers.names_places:
-                seen.x[:] = self._zero + sumo.places(self._names, told)[1]
-            sumo.set_speeds(self._names, drivers.speeds(sumo.time, seen))
-            self._speeds += float(seen.v.sum())
+                views.x[:] = self._zero + sumo.places(self._names, subscribed)[1]
+            sumo.set_speeds(self._names, drivers.speeds(sumo.time, views))
+            self._speeds += float(views.v.sum())
             self._number += len(self._names)
         before = time.perf_counter()
         sumo.step()
@@ -183,16 +183,16 @@ class _Job:
 
     def _take(self, vehicles: Sequence[str]) -> None:
         """Take over vehicles of the types."""
-        own = [name for name in vehicles if self._sumo.type_of(name) in self._types]
-        if not own:
+        taken = [name for name in vehicles if self._sumo.type_of(name) in self._types]
+        if not taken:
             return
-        for name in own:
+        for name in taken:
             self._sumo.take(name, lane_changes=self._lane_changes)
-        self._drivers.enter([self._sumo.classes_of(name) for name in own])
-        lane, way = self._sumo.places(own, self._sumo.told())
+        self._drivers.enter([self._sumo.classes_of(name) for name in taken])
+        lane, way = self._sumo.places(taken, self._sumo.told())
         self._zero = np.concatenate([self._zero, lane - way])
-        self._names += own
-        self._every.update(own)
+        self._names += taken
+        self._every.update(taken)
 
     def found(self, trajectories: Path) -> Drive:
         return Drive(

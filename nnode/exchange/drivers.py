@@ -128,10 +128,10 @@ class Drivers:
         """
         n = len(kinds)
         for name, (place, _) in self.lane.inputs.items():
-            own = drawn(self._terms[place], kinds, self._rng)
-            self._inputs[name] = np.concatenate([self._inputs[name], own])
-        for state, known in self._states.items():
-            self._states[state] = np.concatenate([known, np.zeros(n)])
+            values = drawn(self._terms[place], kinds, self._rng)
+            self._inputs[name] = np.concatenate([self._inputs[name], values])
+        for state, memories in self._states.items():
+            self._states[state] = np.concatenate([memories, np.zeros(n)])
         self._begun = np.concatenate([self._begun, np.zeros(n)])
         self._fresh = np.concatenate([self._fresh, np.ones(n, bool)])
 
@@ -142,10 +142,10 @@ class Drivers:
             who: ``(n,)`` True for who stays.
         """
         for every in (self._states, self._inputs):
-            every.update({name: known[who] for name, known in every.items()})
+            every.update({name: values[who] for name, values in every.items()})
         self._begun, self._fresh = self._begun[who], self._fresh[who]
 
-    def speeds(self, time: float, seen: Seen) -> np.ndarray:
+    def speeds(self, time: float, views: Seen) -> np.ndarray:
         """``(n,)`` speeds, m/s, at the end of the step that begins now; never negative.
 
         Args:
@@ -154,26 +154,26 @@ class Drivers:
         Raises:
             SimulationError: the law says no finite number.
         """
-        speed = self._advanced(time, seen)
+        speed = self._advanced(time, views)
         bad = ~np.isfinite([speed, *self._states.values()]).all(0)
         if bad.any():
             i = int(bad.argmax())
             raise SimulationError(
-                f"the law says no finite number at {time:g} s, v = {seen.v[i]:g} m/s and a gap of "
-                f"{seen.gap[i]:g} m; take a shorter step, or other parameters"
+                f"the law says no finite number at {time:g} s, v = {views.v[i]:g} m/s and a gap of "
+                f"{views.gap[i]:g} m; take a shorter step, or other parameters"
             )
         return np.maximum(speed, 0.0)
 
-    def _advanced(self, time: float, seen: Seen) -> np.ndarray:
+    def _advanced(self, time: float, views: Seen) -> np.ndarray:
         """``(n,)`` what the law says of the end of the step; memories are brought there."""
-        given = self._given(time, seen)
+        given = self._given(time, views)
         if self._fresh.any():
-            self._begin(time, seen, given)
+            self._begin(time, views, given)
         top, *others = self._said(given)
         for state, rate in zip(self._added, others, strict=True):
             self._states[state] = self._states[state] + self.dt * rate
-        found: np.ndarray = top if self.lane.order == 1 else given["v"] + self.dt * top
-        return found
+        speed: np.ndarray = top if self.lane.order == 1 else given["v"] + self.dt * top
+        return speed
 
     def _formulas(self) -> Rates:
         """That of the law, then those of added states."""
@@ -185,38 +185,38 @@ class Drivers:
         ready = [np.broadcast_to(part, n) for part in self._rates.at_once(given, given["gaps"])]
         if not self._rates.chained:
             return ready
-        found: list[np.ndarray] = []
+        chained: list[np.ndarray] = []
         ahead = np.array(given["dx_1"])
         for who in one_behind_the_other(lead):
             led = who[lead[who] >= 0]
-            if found:
-                ahead[led] = np.maximum(found[0][lead[led]], 0.0)
+            if chained:
+                ahead[led] = np.maximum(chained[0][lead[led]], 0.0)
             rates = self._rates.after({"dx_1": ahead[who]}, [part[who] for part in ready])
-            found = found or [np.empty(n) for _ in rates]
-            for every, rate in zip(found, rates, strict=True):
+            chained = chained or [np.empty(n) for _ in rates]
+            for every, rate in zip(chained, rates, strict=True):
                 every[who] = rate
-        return found
+        return chained
 
-    def _given(self, time: float, seen: Seen) -> dict[str, Any]:
+    def _given(self, time: float, views: Seen) -> dict[str, Any]:
         """Values of all symbols, and of the gaps."""
         n = len(self)
-        follows = seen.gap <= self._far
-        second = follows & np.isfinite(seen.gap_1)
-        gap = np.where(follows, seen.gap, self._far)
-        gap_1 = np.where(second, seen.gap_1, self._far)
-        v_1 = np.where(follows, seen.v_1, seen.v)
-        own_length = seen.length_1 if self._lengths else np.zeros(n)
+        follows = views.gap <= self._far
+        second = follows & np.isfinite(views.gap_1)
+        gap = np.where(follows, views.gap, self._far)
+        gap_1 = np.where(second, views.gap_1, self._far)
+        v_1 = np.where(follows, views.v_1, views.v)
+        own_length = views.length_1 if self._lengths else np.zeros(n)
         start = np.where(self._fresh, time, self._begun)
         return {
             **self._fixed,
             **self._states,
             **self._inputs,
-            "x": seen.x,
-            "x_1": seen.x + gap,
-            "x_2": seen.x + gap + gap_1,
-            "v": seen.v,
+            "x": views.x,
+            "x_1": views.x + gap,
+            "x_2": views.x + gap + gap_1,
+            "v": views.v,
             "v_1": v_1,
-            "v_2": np.where(second, seen.v_2, v_1),
+            "v_2": np.where(second, views.v_2, v_1),
             "dx_1": v_1,
             "length_1": np.where(follows, own_length, 0.0),
             "second": second.astype(float),
@@ -224,17 +224,17 @@ class Drivers:
             "start": start,
             "dt": np.full(n, self.dt),
             "gaps": (gap, gap_1),
-            "lead": np.where(follows, seen.lead, -1),
+            "lead": np.where(follows, views.lead, -1),
         }
 
-    def _begin(self, time: float, seen: Seen, given: dict[str, Any]) -> None:
+    def _begin(self, time: float, views: Seen, given: dict[str, Any]) -> None:
         """The states of those that have just been added."""
         new = self._fresh
         self._begun = given["start"]
         starts = self.lane.starts
         begun = numpy_function(tuple(starts.values()), _GAPS)(given, given["gaps"])
-        for state, own in zip(starts, begun, strict=True):
-            self._states[state] = np.where(new, own, self._states[state])
+        for state, start in zip(starts, begun, strict=True):
+            self._states[state] = np.where(new, start, self._states[state])
             given[state] = self._states[state]
         self._fresh = np.zeros(len(self), bool)
 
@@ -246,7 +246,7 @@ class Drivers:
         """
         v = np.array(_SPEEDS)
         inf, zero = np.full_like(v, np.inf), np.zeros_like(v)
-        seen = Seen(
+        views = Seen(
             v=v, gap=inf, v_1=v, length_1=zero, lead=zero.astype(int) - 1, gap_1=inf, v_2=v, x=zero
         )
         said = []
@@ -258,7 +258,7 @@ class Drivers:
             trial._rng = np.random.default_rng(0)
             trial.enter([()] * len(v))
             with np.errstate(all="ignore"):
-                said.append([trial._advanced(k * self.dt, seen) for k in range(3)])
+                said.append([trial._advanced(k * self.dt, views) for k in range(3)])
             said[-1] += list(trial._states.values())
         with np.errstate(all="ignore"):
             same = all(
@@ -280,14 +280,14 @@ def one_behind_the_other(lead: np.ndarray) -> list[np.ndarray]:
         lead: ``(n,)`` number of the leader; -1: none. In a ring somebody begins.
     """
     done = lead < 0
-    found = [np.flatnonzero(done)] if done.any() else []
+    groups = [np.flatnonzero(done)] if done.any() else []
     while not done.all():
         now = ~done & done[lead]
         if not now.any():
             now[int(done.argmin())] = True
-        found.append(np.flatnonzero(now))
+        groups.append(np.flatnonzero(now))
         done = done | now
-    return found
+    return groups
 
 
 def drivable(system: System) -> LaneDynamics:
@@ -324,11 +324,11 @@ def drawn(term: Term, kinds: Sequence[Collection[str]], rng: np.random.Generator
     """``(n,)`` what new drivers have of an effect: whether they belong to its class, or a number
     drawn from its normal distribution, at least what leaves a tenth of a pace."""
     if isinstance(term, VehicleClass):
-        return np.array([float(term.kind in own) for own in kinds])
+        return np.array([float(term.kind in names) for names in kinds])
     assert isinstance(term, IndividualEffect)
-    known = np.concatenate([np.zeros(0), *(np.array(own) for own in term.people.values())])
+    estimates = np.concatenate([np.zeros(0), *(np.array(names) for names in term.people.values())])
     (strength, *_) = term.strengths
     spread = float(getattr(term, strength).detach())
-    if not spread and len(known):
-        spread = float(np.sqrt(np.mean(known**2)))
+    if not spread and len(estimates):
+        spread = float(np.sqrt(np.mean(estimates**2)))
     return np.maximum(rng.normal(0.0, 1.0, len(kinds)) * spread, _SLOWEST - 1)

@@ -113,13 +113,13 @@ def jupedsim_parameters(
     """
     name = field_law(system, PEDESTRIAN_LAWS, SAME)
     if name is not None:
-        found, content = _of_the_field(system, name, scenes)
+        counterpart, content = _of_the_field(system, name, scenes)
     else:
-        found, content = _social_force(system, scenes)
-    found.notes[:0] = interval_lines(system, intervals or {})
-    content |= {"notes": found.notes, "no_counterpart": found.missing}
-    found.text = json.dumps(content, indent=2, ensure_ascii=False)
-    return found
+        counterpart, content = _social_force(system, scenes)
+    counterpart.notes[:0] = interval_lines(system, intervals or {})
+    content |= {"notes": counterpart.notes, "no_counterpart": counterpart.missing}
+    counterpart.text = json.dumps(content, indent=2, ensure_ascii=False)
+    return counterpart
 
 
 def _content(model: str, arguments: dict[str, Any], agent: dict[str, Any]) -> dict[str, Any]:
@@ -134,29 +134,29 @@ def _content(model: str, arguments: dict[str, Any], agent: dict[str, Any]) -> di
 
 def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpart, dict[str, Any]]:
     """``cfsm`` or ``gcfm``."""
-    found, law = Counterpart(), cast(Law, system.terms[0])
-    own = {p: float(getattr(law, p).detach()) for p in law.scalars}
+    counterpart, law = Counterpart(), cast(Law, system.terms[0])
+    values = {p: float(getattr(law, p).detach()) for p in law.scalars}
     fixed = {name: value for name, (value, _) in law.formulas.constants.items()}
     agent: dict[str, Any] = {"desired_speed": scenes.pace}
     if name == "cfsm":
-        agent |= {"time_gap": own["T"], "radius": own["l"] / 2}
+        agent |= {"time_gap": values["T"], "radius": values["l"] / 2}
         model = {
-            "strength_neighbor_repulsion": own["a"],
-            "range_neighbor_repulsion": own["D"],
+            "strength_neighbor_repulsion": values["a"],
+            "range_neighbor_repulsion": values["D"],
             "strength_geometry_repulsion": fixed["a_w"],
             "range_geometry_repulsion": fixed["D_w"],
         }
         content = _content("CollisionFreeSpeedModel", model, agent)
-        found.notes.append("radius: l/2")
+        counterpart.notes.append("radius: l/2")
     else:
         agent |= {
             "mass": 1.0,
-            "tau": own["tau"],
+            "tau": values["tau"],
             "a_v": fixed["tau_a"],
             **{p: fixed[p] for p in ("a_min", "b_min", "b_max")},
         }
         model = {
-            "strength_neighbor_repulsion": own["eta"],
+            "strength_neighbor_repulsion": values["eta"],
             "max_neighbor_interaction_distance": fixed["r_c"],
             "max_neighbor_repulsion_force": fixed["f_max"],
             "strength_geometry_repulsion": fixed["eta_w"],
@@ -164,14 +164,14 @@ def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpar
             "max_geometry_repulsion_force": fixed["f_w"],
         }
         content = _content("GeneralizedCentrifugalForceModel", model, agent)
-        found.missing.append(
+        counterpart.missing.append(
             "the distance of bodies: JuPedSim takes points of the ellipses that are not on the "
             "line between the centres, and interpolates the force where they are near or far, "
             "from walls as well"
         )
-    found.notes.append(_PACE)
-    found.missing += effects_without(system, 1, set())
-    return found, content
+    counterpart.notes.append(_PACE)
+    counterpart.missing += effects_without(system, 1, set())
+    return counterpart, content
 
 
 def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str, Any]]:
@@ -183,7 +183,7 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
             f"{' nor '.join(SAME)}; JuPedSim has no counterpart to it, and its released wheels "
             "take no model of one's own; leave it out of to="
         )
-    found = Counterpart()
+    counterpart = Counterpart()
     walls = force.walls and scenes.points > 0
     mass = force.mass * scenes.people
     strength, k, kappa = (float(value.detach()) for value in (force.A, force.k, force.kappa))
@@ -191,34 +191,34 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
     if walls:
         share = scenes.people / scenes.points
         obstacle = strength * share * points_per_edge(force.r, force.B, scenes.spacing)
-        found.notes.append(
+        counterpart.notes.append(
             "obstacle_scale: equals the wall points' force on a person who touches a long "
             "straight wall; farther away and at corners the two differ"
         )
-        found.missing.append(
+        counterpart.missing.append(
             "k and kappa at walls: JuPedSim has one body_force and one friction for people and "
             "walls; here contact with walls is averaged over wall points instead"
         )
-    found.notes.append(
+    counterpart.notes.append(
         f"mass: {force.mass:g} kg times the {scenes.people:.3g} people of a mean sequence, because "
         "forces are averaged over people here and summed there; accelerations between people are "
         "equal in a scene of so many"
     )
     preferred = relaxation is not None and relaxation.preferred
-    found.notes.append(
+    counterpart.notes.append(
         _PACE
         if preferred
         else "desired_speed: the median of the measured speeds; the model itself keeps everybody's "
         "present speed, which JuPedSim cannot"
     )
     if force.walls and not walls:
-        found.notes.append("obstacle_scale: 0, the data have no walls")
+        counterpart.notes.append("obstacle_scale: 0, the data have no walls")
     if force.sign < 0 and walls:
-        found.missing.append(
+        counterpart.missing.append(
             "opposing_wall_friction: JuPedSim's friction at walls has the opposite sign"
         )
-    found.missing.append("reach: JuPedSim lets nobody feel people farther away than 2.5 m")
-    found.missing += effects_without(system, 2 if relaxation else 1, set())
+    counterpart.missing.append("reach: JuPedSim lets nobody feel people farther away than 2.5 m")
+    counterpart.missing += effects_without(system, 2 if relaxation else 1, set())
     content = _content(
         "SocialForceModel",
         {"body_force": k, "friction": kappa},
@@ -232,4 +232,4 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
             "radius": force.r,
         },
     )
-    return found, content
+    return counterpart, content

@@ -122,12 +122,14 @@ class RunningSumo:
         Raises:
             ConfigError: names them.
         """
-        known = [t for t in self.api.vehicletype.getIDList() if not t.startswith("DEFAULT_")]
+        types_of_scenario = [
+            t for t in self.api.vehicletype.getIDList() if not t.startswith("DEFAULT_")
+        ]
         for name in types:
-            if name not in known:
+            if name not in types_of_scenario:
                 raise ConfigError(
                     f"vehicles={name} is no vehicle type of the scenario, it has "
-                    f"{', '.join(known) or 'none'}"
+                    f"{', '.join(types_of_scenario) or 'none'}"
                 )
             pause = float(self.api.vehicletype.getActionStepLength(name))
             if pause > self.seconds * (1 + 1e-9):
@@ -174,31 +176,31 @@ class RunningSumo:
 
     def told(self) -> Told:
         """What was subscribed to, of the vehicles that were taken over and have not arrived."""
-        found: Told = self.api.vehicle.getAllSubscriptionResults()
-        return found
+        results: Told = self.api.vehicle.getAllSubscriptionResults()
+        return results
 
-    def seen(self, vehicles: Sequence[str], told: Told, *, twice: bool) -> Seen:
+    def seen(self, vehicles: Sequence[str], subscribed: Told, *, twice: bool) -> Seen:
         """What vehicles see; those that SUMO carries elsewhere see nobody.
 
         Args:
-            told: see :meth:`told`.
+            subscribed: see :meth:`told`.
             twice: whether the second vehicle ahead is asked for.
         """
         speed, leader, every = self._speed, self._constants.VAR_LEADER, self.api.vehicle
         n = len(vehicles)
         number = {vehicle: i for i, vehicle in enumerate(vehicles)}
-        v = np.array([max(told[vehicle][speed], 0.0) for vehicle in vehicles])
+        v = np.array([max(subscribed[vehicle][speed], 0.0) for vehicle in vehicles])
         gap, v_1, length, lead = np.full(n, np.inf), v.copy(), np.zeros(n), np.full(n, -1)
         gap_1, v_2 = np.full(n, np.inf), v.copy()
         others: dict[str, float] = {}
         for i, vehicle in enumerate(vehicles):
-            found = told[vehicle][leader]
-            if not found or not found[0] or told[vehicle][speed] < _OFF_ROAD:
+            ahead = subscribed[vehicle][leader]
+            if not ahead or not ahead[0] or subscribed[vehicle][speed] < _OFF_ROAD:
                 continue
-            name = found[0]
+            name = ahead[0]
             length[i] = self._length_of(name)
             # SUMO's distance ends minGap before the bumper
-            gap[i] = found[1] + self._min_gap_of(vehicle) + length[i]
+            gap[i] = ahead[1] + self._min_gap_of(vehicle) + length[i]
             at = number.get(name, -1)
             if at < 0 and name not in others:
                 others[name] = max(float(every.getSpeed(name)), 0.0)
@@ -213,14 +215,17 @@ class RunningSumo:
             v=v, gap=gap, v_1=v_1, length_1=length, lead=lead, gap_1=gap_1, v_2=v_2, x=np.zeros(n)
         )
 
-    def places(self, vehicles: Sequence[str], told: Told) -> tuple[np.ndarray, np.ndarray]:
+    def places(self, vehicles: Sequence[str], subscribed: Told) -> tuple[np.ndarray, np.ndarray]:
         """``(n,)`` each: m along the lane, and m driven since the departure."""
         lane, way = self._constants.VAR_LANEPOSITION, self._constants.VAR_DISTANCE
-        return tuple(np.array([told[v][key] for v in vehicles]) for key in (lane, way))  # type: ignore[return-value]
+        return tuple(np.array([subscribed[v][key] for v in vehicles]) for key in (lane, way))  # type: ignore[return-value]
 
     def collisions(self) -> list[tuple[str, str]]:
         """Who runs into whom."""
-        return [(one.collider, one.victim) for one in self.api.simulation.getCollisions()]
+        return [
+            (collision.collider, collision.victim)
+            for collision in self.api.simulation.getCollisions()
+        ]
 
     def teleports(self) -> int:
         """How many vehicles SUMO has begun to carry elsewhere in the last step."""
@@ -260,7 +265,7 @@ def _loaded(program: str) -> tuple[Any, str]:
     try:
         # libsumo warns of a pyarrow of another version, which matters to tables that it would write
         with redirect_stdout(StringIO()):
-            found = importlib.import_module(program)
+            module = importlib.import_module(program)
     except ImportError as error:
         raise ConfigError(
             f"program={program} cannot be loaded ({error}); pip install nnode[sumo], or take "
@@ -268,7 +273,7 @@ def _loaded(program: str) -> tuple[Any, str]:
         ) from error
     if binary is None and program == "traci":
         raise ConfigError("no program sumo is found; pip install eclipse-sumo, or set SUMO_HOME")
-    return found, binary or "sumo"
+    return module, binary or "sumo"
 
 
 def _home() -> Path | None:
@@ -276,5 +281,5 @@ def _home() -> Path | None:
     try:
         return Path(importlib.import_module("sumo").SUMO_HOME)
     except ImportError:
-        told = os.environ.get("SUMO_HOME")
-        return Path(told) if told else None
+        folder = os.environ.get("SUMO_HOME")
+        return Path(folder) if folder else None

@@ -43,9 +43,9 @@ def traffic_of(sequences: Iterable[Sequence]) -> tuple[float, float | None]:
         speeds.append(s.velocity().ravel())
         if s.length is not None:
             lengths.append(s.length[np.isfinite(s.length)])
-    known = np.concatenate(lengths) if lengths else np.empty(0)
+    of_vehicles = np.concatenate(lengths) if lengths else np.empty(0)
     speed = float(np.median(np.concatenate(speeds)))
-    return speed, float(np.median(known)) if len(known) else None
+    return speed, float(np.median(of_vehicles)) if len(of_vehicles) else None
 
 
 def equilibrium_gap(law: Law, speed: float, time_gap: float = 0.0) -> float:
@@ -89,21 +89,21 @@ def sumo_type(
     """
     law = field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME))
     if law is not None:
-        found = _same(system, law, name, length)
+        counterpart = _same(system, law, name, length)
     else:
-        found = _of_the_gap(system, name, speed, length)
-    found.notes[:0] = interval_lines(system, intervals or {})
-    found.text = _document(found.values, found)
-    return found
+        counterpart = _of_the_gap(system, name, speed, length)
+    counterpart.notes[:0] = interval_lines(system, intervals or {})
+    counterpart.text = _document(counterpart.values, counterpart)
+    return counterpart
 
 
 def _same(system: System, law: str, name: str, length: float | None) -> Counterpart:
     """A law that SUMO has."""
-    found = Counterpart()
-    own: Any = system.terms[0]
-    s0 = _value(own, "s0")
+    counterpart = Counterpart()
+    term: Any = system.terms[0]
+    s0 = _value(term, "s0")
     size, room = (length, s0) if length is not None else _parted(s0, DEFAULT_LENGTH)
-    found.values = {
+    counterpart.values = {
         "id": name,
         "carFollowModel": SAME[law],
         "sigma": "0",
@@ -111,36 +111,36 @@ def _same(system: System, law: str, name: str, length: float | None) -> Counterp
         "speedDev": "0",
         "length": _exactly(size),
         "minGap": _exactly(room),
-        **{_SAME[p]: _exactly(_value(own, p)) for p in _SAME},
+        **{_SAME[p]: _exactly(_value(term, p)) for p in _SAME},
     }
     if law == "idm":
-        del found.values["sigma"]
+        del counterpart.values["sigma"]
     if length is None:
-        found.notes.append(
+        counterpart.notes.append(
             f"length + minGap = s0 = {s0:.4g} m: the data have no lengths, and s0 contains one"
         )
         if law == "idm":
-            found.missing.append(
+            counterpart.missing.append(
                 "gaps from front to front: SUMO's IDM divides by the gap between bumpers, the "
                 "run's by one that is a length longer; calibrate with lengths for the same paths"
             )
     else:
-        found.notes.append(f"length: the data's median, {size:.4g} m")
-    found.notes.append(
+        counterpart.notes.append(f"length: the data's median, {size:.4g} m")
+    counterpart.notes.append(
         "maxSpeed: no faster than a lane allows; leave speedFactor at 1 and limits above v0"
     )
     if law == "krauss":
-        found.missing.append(
+        counterpart.missing.append(
             "the last metre behind a vehicle at rest, which SUMO drives at decel times one step"
         )
-    found.missing += effects_without(system, 1, set())
-    return found
+    counterpart.missing += effects_without(system, 1, set())
+    return counterpart
 
 
 def _parted(whole: float, length: float) -> tuple[float, float]:
     """A gap at rest from front to front as a length and what is between bumpers, m."""
-    own = min(length, whole)
-    return own, whole - own
+    of_body = min(length, whole)
+    return of_body, whole - of_body
 
 
 def _of_the_gap(system: System, name: str, speed: float, length: float | None) -> Counterpart:
@@ -152,21 +152,21 @@ def _of_the_gap(system: System, name: str, speed: float, length: float | None) -
             "rest, and SUMO has no counterpart to it; leave it out of to=, or let it drive SUMO's "
             "vehicles itself: nnode drive"
         )
-    found = Counterpart()
+    counterpart = Counterpart()
     effects = {str(term.name): term for term in list(system.terms)[1:]}
     L, v0 = _value(law, "L"), _value(law, "v0")
-    own, room = _parted(L, DEFAULT_LENGTH if length is None else length)
+    of_body, room = _parted(L, DEFAULT_LENGTH if length is None else length)
     values = {
         "id": name,
         "carFollowModel": "Krauss",
         "sigma": "0",
         "speedDev": "0",
-        "length": _digits(own),
+        "length": _digits(of_body),
         "minGap": _digits(room),
     }
-    told = f"{own:.3g} m of it are the length, "
-    told += "SUMO's own, cut to L" if length is None else "the data's median, cut to L"
-    found.notes.append(f"length + minGap = L = {L:.4g} m, the gap at rest; {told}")
+    text = f"{of_body:.3g} m of it are the length, "
+    text += "SUMO's own, cut to L" if length is None else "the data's median, cut to L"
+    counterpart.notes.append(f"length + minGap = L = {L:.4g} m, the gap at rest; {text}")
 
     limits = [v0] if law.entry == "lin" else []
     counted = set()
@@ -176,7 +176,7 @@ def _of_the_gap(system: System, name: str, speed: float, length: float | None) -
     if limits:
         values["maxSpeed"] = _digits(min(limits))
     else:
-        found.missing.append(
+        counterpart.missing.append(
             f"v0 = {v0:.4g} m/s: it is no greatest speed in the logarithmic law, which knows none; "
             "maxSpeed stays SUMO's"
         )
@@ -188,29 +188,29 @@ def _of_the_gap(system: System, name: str, speed: float, length: float | None) -
     if speed > 0 and L < gap < math.inf:
         tau = (gap - L) / speed
         values["tau"] = _digits(tau)
-        found.notes.append(
+        counterpart.notes.append(
             f"tau: at the data's median speed of {speed:.4g} m/s gaps are the law's, {gap:.4g} m; "
             f"SUMO's steps must not be longer than tau, {tau:.3g} s"
         )
     else:
-        found.missing.append(
+        counterpart.missing.append(
             f"tau: the law has no gap at the data's median speed of {speed:.4g} m/s; SUMO's stays"
         )
     if "reaction_delay" in effects:
         delay = _value(effects["reaction_delay"], "T")
         values["actionStepLength"] = _digits(delay)
-        found.notes.append(
+        counterpart.notes.append(
             "actionStepLength: the reaction delay; SUMO's drivers decide at such intervals, which "
             "delays them by half of it on average"
         )
         counted.add("reaction_delay")
-    found.missing.append(
+    counterpart.missing.append(
         "the law's curvature, and speed as a function of the gap alone: Krauss' drivers also mind "
         "the speed ahead and accelerate by at most accel, decel, which stay SUMO's"
     )
-    found.missing += effects_without(system, 1, counted)
-    found.values = values
-    return found
+    counterpart.missing += effects_without(system, 1, counted)
+    counterpart.values = values
+    return counterpart
 
 
 def _value(effect: Module, parameter: str) -> float:
@@ -225,9 +225,9 @@ def _exactly(value: float) -> str:
     return f"{value:.12g}"
 
 
-def _document(values: dict[str, str], found: Counterpart) -> str:
+def _document(values: dict[str, str], counterpart: Counterpart) -> str:
     root = ElementTree.Element("additional")
-    lines = [*found.notes, *(f"no counterpart: {text}" for text in found.missing)]
+    lines = [*counterpart.notes, *(f"no counterpart: {text}" for text in counterpart.missing)]
     for line in lines:
         root.append(ElementTree.Comment(f" {line.replace('--', '- -')} "))
     ElementTree.SubElement(root, "vType", values)

@@ -121,8 +121,8 @@ def write_fcd(path: Path, sequences: Iterable[Sequence]) -> Path:
         if s.kind is not None:
             heads = [f"{a} type={quoteattr(b)}" for a, b in zip(heads, s.kind, strict=True)]
         if s.length is not None:
-            known = [f' length="{m}"' if np.isfinite(m) else "" for m in s.length.tolist()]
-            heads = [a + b for a, b in zip(heads, known, strict=True)]
+            attributes = [f' length="{m}"' if np.isfinite(m) else "" for m in s.length.tolist()]
+            heads = [a + b for a, b in zip(heads, attributes, strict=True)]
         for k, t in enumerate(s.time.tolist()):
             moments[round(t, 9)].append((s, k, heads))
     with (
@@ -179,10 +179,10 @@ def write_walls(path: Path, sequences: Iterable[Sequence]) -> tuple[Path | None,
     Returns:
         The path, None where nothing is written, and the number of distinct sets.
     """
-    known = {None if s.walls is None else s.walls.tobytes(): s.walls for s in sequences}
-    (walls, *others) = known.values()
+    distinct = {None if s.walls is None else s.walls.tobytes(): s.walls for s in sequences}
+    (walls, *others) = distinct.values()
     if others or walls is None:
-        return None, len(known)
+        return None, len(distinct)
     return write_csv(path, pd.DataFrame(walls, columns=["x1", "y1", "x2", "y2"])), 1
 
 
@@ -219,9 +219,11 @@ def _pedpy_file(path: Path, s: Sequence) -> Path:
             f"sequence {s.name}: PedPy's text needs two coordinates and two samples, found "
             f"{s.x.shape[2]} and {s.n_samples}; take another format"
         )
-    own = [int(name) for name in s.agents if name.isascii() and name.isdigit() and len(name) < 10]
-    numbered = len(own) == s.n_agents and len(set(own)) == len(own)
-    ids = own if numbered else list(range(1, s.n_agents + 1))
+    numbers = [
+        int(name) for name in s.agents if name.isascii() and name.isdigit() and len(name) < 10
+    ]
+    numbered = len(numbers) == s.n_agents and len(set(numbers)) == len(numbers)
+    ids = numbers if numbered else list(range(1, s.n_agents + 1))
     first = round(float(s.time[0]) / s.dt)
     # PedPy looks for the rate and for "x/cm" in every such line: the rate stands first
     head = [f"# framerate: {_rate(s.dt)}", f"# {_word(s.name)}, from {s.time[0]:.9g} s on"]

@@ -6,9 +6,10 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from nnode.data.check.scale import Range, moves_of
+from nnode.data.limits import Range
 from nnode.data.sequence import Domain
 from nnode.data.trajectories import Trajectories
+from nnode.data.units import displacements
 from nnode.plots.style import GREY, OKABE_ITO, dress, new_figure
 
 #: Paths and positions of each that are drawn; more would not be seen.
@@ -19,7 +20,7 @@ def speeds(rows: Trajectories, usual: Range) -> Figure:
     """Histograms of speeds over some samples, m/s, and of sampling steps, s."""
     figure = new_figure(8.6, 2.8)
     left, right = figure.subplots(1, 2)
-    moves = moves_of(rows)
+    moves = displacements(rows)
     values = moves.size / moves.took
     top = max(float(np.percentile(values, 99.5)) * 1.1, 1.3 * usual.high) if values.size else 1.0
     left.axvspan(usual.low, usual.high, color=OKABE_ITO["orange"], alpha=0.25, linewidth=0)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from nnode.data.options import JuelichOptions
 from nnode.data.prepare import prepare
+from nnode.data.readers.juelich import JuelichOptions
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.store import Store
 from nnode.errors import ConfigError

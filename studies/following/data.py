@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from nnode.data.clusters import clusters, index_of
-from nnode.data.options import Faults, OpenAccOptions, PairOptions
+from nnode.data.options import Faults
 from nnode.data.prepare import prepare
+from nnode.data.readers.openacc import OpenAccOptions
+from nnode.data.readers.pairs import PairOptions
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.split import TEST, TRAIN
 from nnode.data.store import Store

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nnode.data.options import DataOptions, PairOptions, Velocity, WalkwayOptions
+from nnode.data.options import DataOptions
 from nnode.data.prepare import prepare
+from nnode.data.readers.juelich import Velocity
+from nnode.data.readers.jupedsim import WalkwayOptions
+from nnode.data.readers.pairs import PairOptions
 from nnode.data.store import Store
 
 #: Scenes of the benchmark of prediction in the open.

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from nnode.data.options import EsimasOptions, Faults
+from nnode.data.options import Faults
 from nnode.data.prepare import prepare
+from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.pages.page import Block

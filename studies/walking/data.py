@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from nnode.data.options import Velocity
 from nnode.data.prepare import prepare
+from nnode.data.readers.juelich import Velocity
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.store import Store
 from studies.crowd.data import OTHERS, RECORDING, corridor

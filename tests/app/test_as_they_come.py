@@ -26,7 +26,7 @@ def at_map_coordinates(t: pd.DataFrame) -> pd.DataFrame:
 
 
 def later(t: pd.DataFrame) -> pd.DataFrame:
-    return t.assign(time=t.time + 1000.0)
+    return t.assign(time=t.time + 1e6)
 
 
 def with_dates(t: pd.DataFrame) -> pd.DataFrame:
@@ -150,7 +150,10 @@ PEOPLE: dict[str, Callable[[Sequence], Sequence]] = {
     "in a mirrored corridor": lambda s: moved_people(s, lambda x: x * [1.0, -1.0]),
     "in a corridor along y": lambda s: moved_people(s, lambda x: x[..., ::-1]),
     "later": lambda s: replace(s, time=s.time + 1e6),
-    "under other names": lambda s: replace(s, agents=tuple(f"no. {name}" for name in s.agents)),
+    # in another order of names as well
+    "under other names": lambda s: replace(
+        s, agents=tuple(f"no. {9 - i}" for i in range(s.n_agents))
+    ),
     "in another order": reversed_people,
 }
 

@@ -19,7 +19,8 @@ from nnode.app import discover as app
 from nnode.app import nearest_law
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.data.options import EsimasOptions, TableOptions
+from nnode.data.readers.esimas import EsimasOptions
+from nnode.data.readers.table import TableOptions
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.outcome import DiagnosisOutcome

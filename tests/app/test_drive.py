@@ -15,9 +15,9 @@ from benchmarks.recovery import by_sumo
 from nnode.app.drive import _has_lengths, steps_of
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from nnode.data.options import SumoOptions, TableOptions
 from nnode.data.prepare import prepare
-from nnode.data.readers.sumo import read_sumo
+from nnode.data.readers.sumo import SumoOptions, read_sumo
+from nnode.data.readers.table import TableOptions
 from nnode.errors import CheckpointError, ConfigError
 from nnode.exchange.running_sumo import Steps
 from nnode.model import build_model

@@ -19,10 +19,9 @@ from nnode.app.export import (
     targets_of,
 )
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.data.options import JuelichOptions, SumoOptions, TableOptions
-from nnode.data.readers.juelich import read_juelich
-from nnode.data.readers.sumo import read_sumo
-from nnode.data.readers.table import read_table
+from nnode.data.readers.juelich import JuelichOptions, read_juelich
+from nnode.data.readers.sumo import SumoOptions, read_sumo
+from nnode.data.readers.table import TableOptions, read_table
 from nnode.errors import CheckpointError, ConfigError
 from nnode.model import Traffic, make_law
 from nnode.model.system import Crowd

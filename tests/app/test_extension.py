@@ -19,8 +19,7 @@ import pandas as pd
 import pytest
 
 from benchmarks.recovery import by_sumo
-from nnode.data.options import SumoOptions
-from nnode.data.readers.sumo import read_sumo
+from nnode.data.readers.sumo import SumoOptions, read_sumo
 from tests.app.conftest import ROOT, Script, start_script
 from tests.discover import walkers
 from tests.discover.platoons import platoons

@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 
 import nnode
-from nnode.data.options import SumoOptions, TableOptions, WalkwayOptions
 from nnode.data.prepare import prepare
-from nnode.data.readers.jupedsim import read_walkway
-from nnode.data.readers.sumo import read_sumo
+from nnode.data.readers.jupedsim import WalkwayOptions, read_walkway
+from nnode.data.readers.sumo import SumoOptions, read_sumo
+from nnode.data.readers.table import TableOptions
 from nnode.errors import CheckpointError, ConfigError
 from tests.app.conftest import ROOT, Script
 from tests.app.following import table

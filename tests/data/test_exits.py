@@ -9,10 +9,9 @@ import pandas as pd
 import pytest
 
 from nnode.data.exits import FAR, destinations, exits_of, read_exits
-from nnode.data.options import JuelichOptions, TableOptions
 from nnode.data.prepare import prepare
-from nnode.data.readers.juelich import read_juelich
-from nnode.data.readers.table import read_table
+from nnode.data.readers.juelich import JuelichOptions, read_juelich
+from nnode.data.readers.table import TableOptions, read_table
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, DataError
 

@@ -11,9 +11,10 @@ import pytest
 
 from nnode.data.clusters import clusters
 from nnode.data.identity import given_anew, identify
-from nnode.data.options import Agents, Faults, SplitOptions, TableOptions
+from nnode.data.limits import LIMITS
+from nnode.data.options import Agents, Faults, SplitOptions
 from nnode.data.prepare import prepare
-from nnode.data.quality import LIMITS
+from nnode.data.readers.table import TableOptions
 from nnode.data.sequence import Sequence
 from nnode.data.split import split
 
@@ -232,7 +233,8 @@ def test_faults_are_told_with_the_source_s_identifiers(tmp_path: Path) -> None:
 
 @pytest.mark.real
 def test_real_recordings_keep_their_identifiers(real_data: Path, tmp_path: Path) -> None:
-    from nnode.data.options import JuelichOptions, VehicleTableOptions
+    from nnode.data.readers.juelich import JuelichOptions
+    from nnode.data.readers.vehicles import VehicleTableOptions
 
     corridor = JuelichOptions(source=str(real_data), walls={"*": [0.0, 4.0]}, t_seq=3.0)
     road = VehicleTableOptions(

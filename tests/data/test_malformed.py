@@ -13,13 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat
 
-from nnode.data.options import JuelichOptions, TableOptions, VehicleTableOptions
 from nnode.data.readers import matlab
 from nnode.data.readers.esimas import read_esimas
-from nnode.data.readers.juelich import read_juelich
+from nnode.data.readers.juelich import JuelichOptions, read_juelich
 from nnode.data.readers.matlab import Other, read_matlab
-from nnode.data.readers.table import read_table
-from nnode.data.readers.vehicles import read_vehicles
+from nnode.data.readers.table import TableOptions, read_table
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.errors import DataError, NNodeError
 
 

@@ -13,17 +13,13 @@ from omegaconf import OmegaConf
 from scipy.io import savemat
 
 import nnode.data.prepare as module
-from nnode.data.options import (
-    DataOptions,
-    EsimasOptions,
-    Faults,
-    JuelichOptions,
-    SplitOptions,
-    TableOptions,
-    VehicleTableOptions,
-)
-from nnode.data.policy import LISTED
+from nnode.data.options import DataOptions, Faults, SplitOptions
 from nnode.data.prepare import open_data, plain, prepare
+from nnode.data.quality import LISTED
+from nnode.data.readers.esimas import EsimasOptions
+from nnode.data.readers.juelich import JuelichOptions
+from nnode.data.readers.table import TableOptions
+from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError, FaultError
 from nnode.plots.quality import plot_faults

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nnode.data import quality
-from nnode.data.options import JuelichOptions, VehicleTableOptions
-from nnode.data.quality import KINDS, LIMITS, Fault, find_faults, usable
+from nnode.data.limits import LIMITS
+from nnode.data.quality import KINDS, Fault, find_faults, usable
 from nnode.data.readers.esimas import read_esimas
-from nnode.data.readers.juelich import juelich_files, read_juelich
-from nnode.data.readers.vehicles import read_vehicles
+from nnode.data.readers.juelich import JuelichOptions, juelich_files, read_juelich
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
 from nnode.plots.quality import MAX_PANELS, STYLES, plot_faults

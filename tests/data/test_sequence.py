@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -147,3 +149,20 @@ def test_collate_refuses_what_does_not_fit_together() -> None:
     flat = Sequence(name="c", recording="r", time=0.2 * np.arange(3), x=np.zeros((3, 2, 2)))
     with pytest.raises(DataError, match="a and c differ in their number of dimensions"):
         collate([platoon("a", 3, 2), flat])
+
+
+@pytest.mark.parametrize("dims", [1, 2])
+def test_single_precision_keeps_the_places_of_a_map(dims: int) -> None:
+    """Numbers of float32 are 0.5 m apart at 7,000 km; a batch counts from its own origin."""
+    x = 3.0 * np.random.default_rng(1).random((5, 3, dims)).cumsum(axis=0)
+    walls = None if dims == 1 else np.array([[0.0, 0.0, 9.0, 0.0]])
+    here = Sequence(name="a", recording="a", time=0.1 * np.arange(5), x=x, walls=walls)
+    by = np.array([7e6, -3e6])[:dims]
+    there = replace(here, x=x + by, walls=None if walls is None else walls + np.tile(by, 2))
+    local, mapped = (
+        batch.relative_to(batch.origins())
+        for batch in (collate([s]).to(dtype=torch.float32) for s in (here, there))
+    )
+    assert mapped.x.dtype == torch.float32
+    for name in ("x", "destination", "walls"):
+        torch.testing.assert_close(getattr(mapped, name), getattr(local, name), rtol=0, atol=1e-6)

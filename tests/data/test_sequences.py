@@ -9,8 +9,10 @@ import pandas as pd
 import pytest
 
 import nnode
-from nnode.data.options import PairOptions, TableOptions, VehicleTableOptions
 from nnode.data.prepare import prepare
+from nnode.data.readers.pairs import PairOptions
+from nnode.data.readers.table import TableOptions
+from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.errors import ConfigError, DataError
 from tests.app.following import pairs, table
 

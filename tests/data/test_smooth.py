@@ -12,22 +12,19 @@ import pandas as pd
 import pytest
 from scipy.io import savemat
 
-from nnode.data.options import (
-    DataOptions,
-    EsimasOptions,
-    NgsimOptions,
-    OpenAccOptions,
-    PairOptions,
-    SumoOptions,
-    TableOptions,
-    VehicleTableOptions,
-    WalkwayOptions,
-)
+from nnode.data.limits import BEARABLE
+from nnode.data.options import DataOptions
 from nnode.data.prepare import prepare
-from nnode.data.readers.ngsim import read_ngsim
-from nnode.data.readers.vehicles import read_vehicles
+from nnode.data.readers.esimas import EsimasOptions
+from nnode.data.readers.jupedsim import WalkwayOptions
+from nnode.data.readers.ngsim import NgsimOptions, read_ngsim
+from nnode.data.readers.openacc import OpenAccOptions
+from nnode.data.readers.pairs import PairOptions
+from nnode.data.readers.sumo import SumoOptions
+from nnode.data.readers.table import TableOptions
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.data.sequence import Sequence
-from nnode.data.smooth import BEARABLE, measured_noise, smooth
+from nnode.data.smooth import measured_noise, smooth
 from nnode.data.trajectories import Grid, Record, Trajectories, records
 from nnode.errors import ConfigError
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from nnode.app.python.inputs import model_options
-from nnode.data.options import TableOptions
+from nnode.data.readers.table import TableOptions
 from nnode.discover.inputs import Inputs, read_inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.outcome import DiagnosisOutcome

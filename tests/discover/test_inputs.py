@@ -7,8 +7,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from nnode.data.options import EsimasOptions, Faults, TableOptions
+from nnode.data.options import Faults
 from nnode.data.prepare import prepare
+from nnode.data.readers.esimas import EsimasOptions
+from nnode.data.readers.table import TableOptions
 from nnode.discover.inputs import read_inputs
 from nnode.errors import DataError, FaultError
 from tests.discover.recorded import lane

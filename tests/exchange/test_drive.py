@@ -18,8 +18,7 @@ import torch
 from benchmarks.recovery import by_sumo, laws
 from benchmarks.recovery.cases import SLOWLY
 from nnode.app.python.inputs import model_options
-from nnode.data.options import SumoOptions
-from nnode.data.readers.sumo import read_sumo
+from nnode.data.readers.sumo import SumoOptions, read_sumo
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
 from nnode.exchange.drive import Drive, drive

@@ -14,9 +14,10 @@ import torch
 
 from benchmarks.recovery.by_sumo import call, network
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.data.options import Faults, SumoOptions, WalkwayOptions
+from nnode.data.options import Faults
 from nnode.data.prepare import prepare
-from nnode.data.readers.jupedsim import read_walkway, walls_of
+from nnode.data.readers.jupedsim import WalkwayOptions, read_walkway, walls_of
+from nnode.data.readers.sumo import SumoOptions
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
 from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of

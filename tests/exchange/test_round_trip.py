@@ -17,8 +17,7 @@ import torch
 from benchmarks.recovery import by_jupedsim, by_sumo
 from benchmarks.recovery.cases import SLOWLY
 from nnode.calibrate.problem import ResidualProblem, pooled
-from nnode.data.options import SumoOptions
-from nnode.data.readers.sumo import read_sumo
+from nnode.data.readers.sumo import SumoOptions, read_sumo
 from nnode.data.sequence import Sequence, collate
 from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import SAME, sumo_type

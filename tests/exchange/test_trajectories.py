@@ -12,10 +12,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nnode.data.options import JuelichOptions, SumoOptions, TableOptions
-from nnode.data.readers.juelich import read_juelich
-from nnode.data.readers.sumo import read_sumo
-from nnode.data.readers.table import read_table
+from nnode.data.readers.juelich import JuelichOptions, read_juelich
+from nnode.data.readers.sumo import SumoOptions, read_sumo
+from nnode.data.readers.table import TableOptions, read_table
 from nnode.data.sequence import Batch, Sequence
 from nnode.errors import ConfigError, DataError
 from nnode.exchange.trajectories import (

@@ -20,9 +20,10 @@ from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.options import TrainerOptions
 from nnode.data.check.recognise import NEEDED, has_columns, recognised
 from nnode.data.dataset import Source
-from nnode.data.options import DataOptions, TableOptions, with_present_names
+from nnode.data.options import DataOptions, with_present_names
 from nnode.data.prepare import FORMATS
 from nnode.data.readers.columns import Table as DataTable
+from nnode.data.readers.table import TableOptions
 from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
 from nnode.errors import ConfigError

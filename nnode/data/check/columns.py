@@ -167,39 +167,40 @@ class Meaning:
     rivals: tuple[str, ...] = ()
 
 
-def clock_of(found: Collection[str]) -> str:
+def clock_of(meanings: Collection[str]) -> str:
     """The meaning of the column that times are from, ``time`` or ``frame``."""
-    return "time" if "time" in found else "frame"
+    return "time" if "time" in meanings else "frame"
 
 
-def are_pairs(found: Collection[str]) -> bool:
+def are_pairs(meanings: Collection[str]) -> bool:
     """Whether meanings are those of a follower and its leader, with or without positions."""
-    return {"x_follower", "x_leader"} <= set(found) or is_spaced(found)
+    return {"x_follower", "x_leader"} <= set(meanings) or is_spaced(meanings)
 
 
-def is_spaced(found: Collection[str]) -> bool:
+def is_spaced(meanings: Collection[str]) -> bool:
     """Whether meanings are those of pairs whose positions follow from spacing and speeds."""
-    return {"spacing", "v_follower", "v_leader"} <= set(found) and not (
-        {"x", "x_follower", "x_leader"} & set(found)
+    return {"spacing", "v_follower", "v_leader"} <= set(meanings) and not (
+        {"x", "x_follower", "x_leader"} & set(meanings)
     )
 
 
-def rivals(found: Mapping[str, Meaning]) -> dict[str, str]:
+def rivals(meanings: Mapping[str, Meaning]) -> dict[str, str]:
     """By meaning, that more than one column may have it, in words."""
     return {
-        meaning: f"the column of {meaning} may be {one.column} or {' or '.join(one.rivals)}, which "
-        f"hold different values; say which, as in data.columns.{meaning}={one.column}"
-        for meaning, one in found.items()
-        if one.rivals
+        meaning: f"the column of {meaning} may be {column.column} or "
+        f"{' or '.join(column.rivals)}, which hold different values; say which, as in "
+        f"data.columns.{meaning}={column.column}"
+        for meaning, column in meanings.items()
+        if column.rivals
     }
 
 
 def plain(name: str) -> tuple[str, str]:
     """A column's name in small letters and digits, and the unit that it ends in."""
     unit = ""
-    found = _ENDING.search(name)
-    if found and found.start() > 0:
-        unit, name = UNITS[found[1].lower()], name[: found.start()]
+    match = _ENDING.search(name)
+    if match and match.start() > 0:
+        unit, name = UNITS[match[1].lower()], name[: match.start()]
     return re.sub(r"[^a-z0-9]", "", name.lower()), unit
 
 
@@ -237,38 +238,40 @@ def meanings(raw: Raw) -> dict[str, Meaning]:
     frame = raw.table.frame
     if not raw.named:
         return {m: Meaning(c, raw.unit or "", "holds") for m, c in _by_content(frame).items()}
-    found: dict[str, Meaning] = {}
-    known = {str(name): plain(str(name)) for name in frame.columns}
-    whole = {name: re.sub(r"[^a-z0-9]", "", name.lower()) for name in known}
+    recognised: dict[str, Meaning] = {}
+    parsed = {str(name): plain(str(name)) for name in frame.columns}
+    whole = {name: re.sub(r"[^a-z0-9]", "", name.lower()) for name in parsed}
     taken: set[str] = set()
     for meaning, usual in NAMES.items():
-        own = {column: usual.index(w) for column, w in whole.items() if w in usual}
-        own |= {
+        candidates = {column: usual.index(w) for column, w in whole.items() if w in usual}
+        candidates |= {
             column: usual.index(word)
-            for column, (word, _) in known.items()
-            if column not in own and word in usual
+            for column, (word, _) in parsed.items()
+            if column not in candidates and word in usual
         }
         fit = [
             column
-            for column in sorted(own, key=lambda c: own[c])
+            for column in sorted(candidates, key=lambda c: candidates[c])
             if column not in taken
             and (meaning not in _NUMERIC or np.isfinite(numbers(frame, column)).mean() > MOSTLY)
         ]
         if fit:
             column = fit[0]
             sure = "named" if column == meaning else "like"
-            unit = "" if whole[column] in usual else known[column][1]
+            unit = "" if whole[column] in usual else parsed[column][1]
             # the own name of a meaning leaves no doubt
             others = () if whole[column] == usual[0] else _others(frame, column, fit[1:])
-            found[meaning] = Meaning(column, unit, sure, others)
+            recognised[meaning] = Meaning(column, unit, sure, others)
             taken.add(column)
-    return found
+    return recognised
 
 
 def _others(frame: pd.DataFrame, column: str, rivals: list[str]) -> tuple[str, ...]:
     """Those of some columns that part the rows otherwise than a column does."""
-    own = pd.factorize(frame[column])[0]
-    return tuple(one for one in rivals if not np.array_equal(pd.factorize(frame[one])[0], own))
+    groups = pd.factorize(frame[column])[0]
+    return tuple(
+        rival for rival in rivals if not np.array_equal(pd.factorize(frame[rival])[0], groups)
+    )
 
 
 def _by_content(frame: pd.DataFrame) -> dict[str, str]:
@@ -296,6 +299,6 @@ def _roughness(agent: np.ndarray, frame: np.ndarray, places: list[np.ndarray]) -
     if not same.any():
         return np.inf
     steps = np.sqrt(sum(np.diff(place[order]) ** 2 for place in places))
-    found = float(np.nanmedian(steps[same])) if np.isfinite(steps[same]).any() else np.inf
+    usual = float(np.nanmedian(steps[same])) if np.isfinite(steps[same]).any() else np.inf
     ties = float((np.diff(frame[order])[same] == 0).mean())
-    return np.inf if ties > 0.5 else found
+    return np.inf if ties > 0.5 else usual

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from nnode.data.check import findings as find
 from nnode.data.check.columns import (
     Meaning,
     are_pairs,
@@ -18,19 +17,26 @@ from nnode.data.check.columns import (
     meanings,
     rivals,
 )
-from nnode.data.check.findings import Finding
 from nnode.data.check.raw import Raw, read_raw
+from nnode.data.check.recognise import Recognised, native_source, source_of, source_of_native
 from nnode.data.check.rows import scaled
-from nnode.data.check.scale import LIKELY, SURE, Medians, Scale, medians
-from nnode.data.check.source import Recognised, native_source, source_of, source_of_native
 from nnode.data.cut import Reading
-from nnode.data.policy import without
 from nnode.data.prepare import FORMATS
-from nnode.data.quality import Fault, find_faults
+from nnode.data.quality import (
+    Fault,
+    Finding,
+    cell_findings,
+    find_faults,
+    left_out_texts,
+    order_findings,
+    row_findings,
+    sequence_findings,
+)
 from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
 from nnode.data.trajectories import Trajectories
+from nnode.data.units import Medians, Scale, medians
 from nnode.errors import NNodeError
 
 #: Sequences in which faults are looked for.
@@ -76,19 +82,12 @@ class Examination:
         return self.scales[0]
 
 
-def sure(probability: float) -> str:
-    """A probability in words."""
-    if probability >= SURE:
-        return "sure"
-    return "likely" if probability >= LIKELY else "a guess"
-
-
 def examine(path: Path, domain: Domain | None = None, rate: float | None = None) -> Examination:
     """Look at a file of trajectories.
 
     Args:
         domain: of the data; None looks for itself.
-        rate: frames per second that the file is said to have; None: what the file tells.
+        rate: frames per second that the file is said to have; None: what the file states.
 
     Raises:
         ConfigError: there is no such file.
@@ -99,11 +98,11 @@ def examine(path: Path, domain: Domain | None = None, rate: float | None = None)
         if raw.native:
             return _native(raw)
         raw = in_seconds(raw)
-        found = meanings(raw)
-        native = native_source(raw, found)
+        columns = meanings(raw)
+        native = native_source(raw, columns)
         if native is not None:
             return _native(replace(raw, native=native))
-        return _table(raw, found, domain, rate)
+        return _table(raw, columns, domain, rate)
 
 
 def _native(raw: Raw) -> Examination:
@@ -113,8 +112,8 @@ def _native(raw: Raw) -> Examination:
     rows = _rows_of(raw, sequences)
     domain: Domain = "crowd" if rows.x.shape[1] == 2 else "traffic"
     scale = replace(_SI, domain=domain)
-    found = Examination(raw.path, raw, {}, [scale], medians(rows, domain), rows, [], source)
-    return _judged(found, sequences, None)
+    examined = Examination(raw.path, raw, {}, [scale], medians(rows, domain), rows, [], source)
+    return _judged(examined, sequences, None)
 
 
 def _rows_of(raw: Raw, sequences: list[Sequence]) -> Trajectories:
@@ -156,33 +155,35 @@ def _rows_of(raw: Raw, sequences: list[Sequence]) -> Trajectories:
 
 
 def _table(
-    raw: Raw, found: dict[str, Meaning], domain: Domain | None, rate: float | None
+    raw: Raw, columns: dict[str, Meaning], domain: Domain | None, rate: float | None
 ) -> Examination:
     table = raw.table
     assert table is not None
-    seen = scaled(raw, found, domain, rate)
-    found = seen.meanings
+    measured = scaled(raw, columns, domain, rate)
+    columns = measured.meanings
     rate = rate or raw.rate
-    source = source_of(raw, seen)
-    examined = Examination(raw.path, raw, found, seen.scales, seen.known, seen.rows, [], source)
+    source = source_of(raw, measured)
+    examined = Examination(
+        raw.path, raw, columns, measured.scales, measured.known, measured.rows, [], source
+    )
     needed: dict[str, str] = {
-        m: found[m].column
-        for m in ("agent", clock_of(found), "x", "y", "x_follower", "x_leader")
-        if m in found
+        m: columns[m].column
+        for m in ("agent", clock_of(columns), "x", "y", "x_follower", "x_leader")
+        if m in columns
     }
-    if is_spaced(found):
-        needed |= {m: found[m].column for m in ("spacing", "v_follower", "v_leader")}
-    examined.findings += find.cells(table, needed)
-    stand = seen.table.at(np.arange(len(table)))
-    examined.findings += find.order(stand, int(table.frame.duplicated().sum()))
-    doubts = [("units", text) for text in seen.doubts(rate).values()]
-    doubts += [("columns", text) for text in rivals(found).values()]
+    if is_spaced(columns):
+        needed |= {m: columns[m].column for m in ("spacing", "v_follower", "v_leader")}
+    examined.findings += cell_findings(table, needed)
+    stand = measured.table.at(np.arange(len(table)))
+    examined.findings += order_findings(stand, int(table.frame.duplicated().sum()))
+    doubts = [("units", text) for text in measured.doubts(rate).values()]
+    doubts += [("columns", text) for text in rivals(columns).values()]
     examined.findings += [Finding(kind, "warning", text) for kind, text in doubts]
     sequences = _tried(source, examined.findings)
     return _judged(examined, sequences, rate)
 
 
-def _read(source: Recognised) -> list[Sequence]:
+def _read(source: Recognised) -> Reading:
     kind = FORMATS[type(source.options)]
     return kind.sequences(kind.files(source.options), source.options)
 
@@ -191,11 +192,9 @@ def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
     """The sequences that the reader makes of the file; what it refuses is a finding."""
     try:
         made = _read(source)
-        left_out = made.left_out if isinstance(made, Reading) else []
-        findings += [Finding("left_out", "warning", text) for text in without(made, [], left_out)]
+        texts = {"left_out": left_out_texts(len(made), [], made.left_out), "resampled": made.notes}
         findings += [
-            Finding("resampled", "warning", text)
-            for text in (made.notes if isinstance(made, Reading) else [])
+            Finding(kind, "warning", text) for kind, of_kind in texts.items() for text in of_kind
         ]
         return made
     except NNodeError as error:
@@ -203,31 +202,32 @@ def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
         return []
 
 
-def _judged(found: Examination, sequences: list[Sequence], rate: float | None) -> Examination:
+def _judged(examined: Examination, sequences: list[Sequence], rate: float | None) -> Examination:
     """With everything that rows and sequences show."""
-    rows, domain = found.rows, found.scale.domain
-    found.findings += find.sampling(rows)
-    found.findings += find.time_scale(found.known, found.scale, rate)
-    found.findings += find.accelerations(rows)
-    found.findings += find.direction(rows, domain)
-    whole = found.raw.native not in _CUT and not are_pairs(found.meanings)
-    found.findings += find.coming_and_going(rows, domain, whole)
-    found.sequences = sequences[:: max(1, -(-len(sequences) // MOST))]
-    noise = measured_noise(found.sequences)
-    known = 0.0 if found.source.options.published else noise.position
-    found.faults = {s.name: own for s in found.sequences if (own := find_faults(s, domain, known))}
-    found.findings += find.measurement(noise, found.sequences, domain)
-    found.findings += find.faults(found.faults, len(found.sequences))
-    found.findings += _made(found, len(sequences))
-    found.findings.sort(key=lambda one: _LEVELS.index(one.level))
-    return found
+    rows, domain = examined.rows, examined.scale.domain
+    whole = examined.raw.native not in _CUT and not are_pairs(examined.meanings)
+    examined.findings += row_findings(rows, examined.known, examined.scale, rate, whole)
+    examined.sequences = sequences[:: max(1, -(-len(sequences) // MOST))]
+    noise = measured_noise(examined.sequences)
+    position_noise = 0.0 if examined.source.options.published else noise.position
+    examined.faults = {
+        s.name: faults
+        for s in examined.sequences
+        if (faults := find_faults(s, domain, position_noise))
+    }
+    examined.findings += sequence_findings(examined.sequences, examined.faults, noise, domain)
+    examined.findings += _made(examined, len(sequences))
+    examined.findings.sort(key=lambda finding: _LEVELS.index(finding.level))
+    return examined
 
 
-def _made(found: Examination, number: int) -> Iterator[Finding]:
+def _made(examined: Examination, number: int) -> Iterator[Finding]:
     if number:
-        looked = f"; faults were looked for in {len(found.sequences)}" * (
-            len(found.sequences) < number
+        looked = f"; faults were looked for in {len(examined.sequences)}" * (
+            len(examined.sequences) < number
         )
         yield Finding(
-            "sequences", "note", f"data={found.source.group} makes {number} sequences of it{looked}"
+            "sequences",
+            "note",
+            f"data={examined.source.group} makes {number} sequences of it{looked}",
         )

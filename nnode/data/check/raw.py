@@ -33,8 +33,8 @@ class Raw:
         table: the cells, None for a native format.
         named: whether the file names its columns.
         separator: ``,``, ``;``, tab, or a space for any white space; empty for Parquet.
-        rate: frames per second that a comment tells.
-        unit: of positions that a comment tells, ``cm`` or ``m``.
+        rate: frames per second that a comment states.
+        unit: of positions that a comment states, ``cm`` or ``m``.
         dated: columns of dates, clock times or durations; in ``table`` these are seconds.
     """
 
@@ -91,21 +91,21 @@ def _parquet(path: Path) -> Table:
 
 
 def _text(path: Path, text: str, whole: bool) -> Raw:
-    found = layout(text, whole)
-    if found is None:
+    form = layout(text, whole)
+    if form is None:
         raise DataError(f"{path} has no rows below its comments; expected rows of trajectories")
-    if found.cells < 3:
+    if form.cells < 3:
         raise DataError(
-            f"{path} is no table of trajectories: its first line {found.first[:60]!r} has "
-            f"{found.cells} cell{'s' * (found.cells > 1)}; expected at least an agent, a time and "
+            f"{path} is no table of trajectories: its first line {form.first[:60]!r} has "
+            f"{form.cells} cell{'s' * (form.cells > 1)}; expected at least an agent, a time and "
             "a position, separated by commas, semicolons, tabs or spaces"
         )
-    rate, unit = _RATE.search(found.comments), _UNIT.search(found.comments)
+    rate, unit = _RATE.search(form.comments), _UNIT.search(form.comments)
     return Raw(
         path,
         table=Table(path, encoding_errors="replace"),
-        named=found.named,
-        separator=found.separator,
+        named=form.named,
+        separator=form.separator,
         rate=_positive(rate[1]) if rate else None,
         unit=unit[1].lower() if unit else None,
     )

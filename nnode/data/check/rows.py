@@ -10,9 +10,9 @@ import pandas as pd
 
 from nnode.data.check.columns import Meaning, are_pairs, clock_of, is_spaced, numbers
 from nnode.data.check.raw import Raw
-from nnode.data.check.scale import FAIR, LAG, LIKELY, Medians, Scale, medians, scales
 from nnode.data.sequence import Domain
-from nnode.data.trajectories import Trajectories
+from nnode.data.trajectories import Trajectories, driven
+from nnode.data.units import FAIR, LAG, LIKELY, Medians, Scale, medians, scales, share
 from nnode.errors import DataError
 
 #: Columns whose names tell a unit.
@@ -46,20 +46,20 @@ class Scaled:
     @property
     def share(self) -> float:
         """Probability of the units, whatever the rate of frames."""
-        return sum(s.probability for s in self.scales if s.units == self.scale.units)
+        return share(self.scales)
 
-    def rates(self, told: float | None) -> list[float]:
-        """Frames per second that fit, where times are frames and nothing tells their rate."""
-        if told is not None or self.scale.rate is None:
+    def rates(self, stated: float | None) -> list[float]:
+        """Frames per second that fit, where times are frames and nothing states their rate."""
+        if stated is not None or self.scale.rate is None:
             return []
         same = (s for s in self.scales if s.units == self.scale.units and s.probability > FAIR)
         return sorted({s.rate for s in same if s.rate})
 
-    def doubts(self, told: float | None) -> dict[str, str]:
+    def doubts(self, stated: float | None) -> dict[str, str]:
         """What may be two things, ``units`` and ``rate``, in words.
 
         Args:
-            told: frames per second as the file or the user tells.
+            stated: frames per second that the file or the user states.
         """
         sentences, best = {}, self.scale
         if self.share < LIKELY:
@@ -68,7 +68,7 @@ class Scaled:
                 f"its numbers may be {best} or {other}; say which, with {best.options} or "
                 f"{other.options}"
             )
-        if rates := self.rates(told):
+        if rates := self.rates(stated):
             fit = " or ".join(f"{rate:g}" for rate in rates)
             sentences["rate"] = (
                 f"times are frames of a rate that the file does not tell; {fit} frames/s fit: say "
@@ -89,7 +89,7 @@ def scaled(
     Args:
         meanings: column by meaning.
         domain, rate: see :func:`examine`.
-        told_units: units by ``position``, ``time``, ``speed``, as the user tells them.
+        told_units: units by ``position``, ``time``, ``speed``, as the user states them.
 
     Raises:
         DataError: a column that is needed was not recognised, or nothing moves.
@@ -160,24 +160,36 @@ def _domains(
     return ["traffic"] if "lane" in meanings else ["crowd", "traffic"]
 
 
-def _rows(raw: Raw, found: Mapping[str, Meaning]) -> Trajectories:
-    """The rows as they stand: what tells recordings and sequences apart is part of the name."""
-    table, pairs = raw.table, are_pairs(found)
+def _rows(raw: Raw, meanings_of_columns: Mapping[str, Meaning]) -> Trajectories:
+    """The rows as they stand; names of recordings and sequences are part of the agents' names."""
+    table, pairs = raw.table, are_pairs(meanings_of_columns)
     assert table is not None
-    _check_needed(raw, found, pairs)
+    _check_needed(raw, meanings_of_columns, pairs)
 
     def cells(*meanings: str) -> list[np.ndarray]:
-        return [numbers(table.frame, found[m].column) for m in meanings if m in found]
+        return [
+            numbers(table.frame, meanings_of_columns[m].column)
+            for m in meanings
+            if m in meanings_of_columns
+        ]
 
     def names(*meanings: str) -> list[np.ndarray]:
-        return [table.names(found[m].column, empty=True) for m in meanings if m in found]
+        return [
+            table.names(meanings_of_columns[m].column, empty=True)
+            for m in meanings
+            if m in meanings_of_columns
+        ]
 
     parts = names("recording", "sequence")
-    (time,) = cells(clock_of(found))
+    (time,) = cells(clock_of(meanings_of_columns))
     if pairs:
-        pair = _pairs(raw, found)
+        pair = _pairs(raw, meanings_of_columns)
         leads = ["follower", "leader"]
-        x = _integrated(raw, found) if is_spaced(found) else cells("x_follower", "x_leader")
+        x = (
+            _integrated(raw, meanings_of_columns)
+            if is_spaced(meanings_of_columns)
+            else cells("x_follower", "x_leader")
+        )
         v = cells("v_follower", "v_leader")
         return Trajectories(
             path=raw.path,
@@ -193,7 +205,7 @@ def _rows(raw: Raw, found: Mapping[str, Meaning]) -> Trajectories:
     agents = _joined([*parts, agent])
     agents[agent == ""] = None
     # along the lane where there are lanes
-    x = cells("x") if "lane" in found else cells("x", "y")
+    x = cells("x") if "lane" in meanings_of_columns else cells("x", "y")
     v = cells("vx", "vy")[: len(x)]
     speed = [np.sqrt(sum(part**2 for part in v))] if len(v) == len(x) else cells("speed")
     part = _joined(parts) if parts else None
@@ -260,30 +272,26 @@ def _of_pairs(raw: Raw, meanings: dict[str, Meaning]) -> dict[str, Meaning]:
 def _integrated(raw: Raw, meanings: Mapping[str, Meaning]) -> list[np.ndarray]:
     """Positions of followers and leaders in the unit of the spacing, by the reader's rule.
 
-    What distance a unit of speed times time is follows from how spacings change with the speeds:
-    the ratio of root mean squares of both changes.
+    The distance that a unit of speed covers in a unit of time follows from how spacings change
+    with the speeds: the ratio of the root mean squares of both changes over LAG samples.
     """
     assert raw.table is not None
     columns = [
         meanings[m].column for m in (clock_of(meanings), "spacing", "v_follower", "v_leader")
     ]
     time, spacing, follower, leader = (numbers(raw.table.frame, c) for c in columns)
-    pair = pd.factorize(_pairs(raw, meanings))[0]
-    order = np.lexsort((time, pair))
-    same = np.diff(pair[order]) == 0
-
-    def gone(v: np.ndarray) -> np.ndarray:
-        step = np.diff(time[order]) * (v[order][1:] + v[order][:-1]) / 2
-        return np.concatenate([[0.0], np.nancumsum(np.where(same, step, 0.0))])
-
-    relative, lag = gone(leader - follower), LAG
-    whole = pair[order][lag:] == pair[order][:-lag]
-    change = (spacing[order][lag:] - spacing[order][:-lag])[whole]
-    said = (relative[lag:] - relative[:-lag])[whole]
-    finite = np.isfinite(change)
-    unit = float(np.sqrt((change[finite] ** 2).sum() / max((said[finite] ** 2).sum(), 1e-300)))
-    if not (finite.any() and 0 < unit < 1e6):
-        unit = 1.0
-    x = np.empty(len(time))
-    x[order] = unit * gone(leader)
+    x, measured, expected = np.full(len(time), np.nan), [], []
+    names = _pairs(raw, meanings)
+    for pair in pd.Series(names).groupby(names).indices.values():
+        rows = pair[np.isfinite(time[pair])]
+        rows = rows[np.argsort(time[rows], kind="stable")]
+        x[rows] = driven(time[rows], leader[rows])
+        relative = x[rows] - driven(time[rows], follower[rows])
+        measured.append(spacing[rows][LAG:] - spacing[rows][:-LAG])
+        expected.append(relative[LAG:] - relative[:-LAG])
+    change, of_speeds = np.concatenate(measured), np.concatenate(expected)
+    known = np.isfinite(change)
+    squares = max(float((of_speeds[known] ** 2).sum()), 1e-300)
+    unit = float(np.sqrt((change[known] ** 2).sum() / squares))
+    x *= unit if known.any() and 0 < unit < 1e6 else 1.0
     return [x - spacing, x]

@@ -6,13 +6,16 @@ import difflib
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from nnode.data.options import one_of, positive
+from nnode.data.sequence import LENGTH_UNITS, SPEED_UNITS, TIME_UNITS
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 from nnode.files import csv_cell
 
@@ -28,6 +31,20 @@ _WHOLE = 2.0**63
 #: So many bytes and lines are looked at to tell how a text is laid out.
 LOOKED_AT, _LINES = 1 << 16, 20
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|nan|inf", re.IGNORECASE)
+
+
+@dataclass
+class ColumnOptions:
+    """Columns and units of any table.
+
+    ``columns`` names the table's columns by what they mean, as each reader lists them. A column
+    that bears the name of its meaning need not be listed; null leaves an optional one out.
+    """
+
+    columns: dict[str, str | None] = field(default_factory=dict)  # {meaning: column}
+    position_unit: str = "m"  # m | ft | cm | km, of positions, lengths and destinations
+    time_unit: str = "s"  # s | ms | us | ns | frame; dates and durations need none
+    frame_rate: float | None = None  # 1/s, with time_unit=frame
 
 
 @dataclass(frozen=True)
@@ -181,8 +198,8 @@ class Table:
         except OSError as error:
             raise DataError(f"{path} cannot be read: {error.strerror}") from error
         text = start.decode("utf-8-sig", errors="replace")
-        found = layout(text, whole=len(start) < LOOKED_AT)
-        return (None, csv) if found is None else (found.names, {**found.options, **csv})
+        form = layout(text, whole=len(start) < LOOKED_AT)
+        return (None, csv) if form is None else (form.names, {**form.options, **csv})
 
     def _take(self, frame: pd.DataFrame) -> None:
         self.frame = frame
@@ -234,7 +251,7 @@ class Table:
                 raise ConfigError(
                     f"data.columns.{key} is unknown; expected {', '.join(required + optional)}"
                 )
-        found = {}
+        chosen = {}
         for key in required + optional:
             if key in names and names[key] is None:
                 if key in required:
@@ -242,10 +259,10 @@ class Table:
                 continue
             column = names.get(key) or key
             if column in self.frame.columns:
-                found[key] = column
+                chosen[key] = column
             elif key in required or key in names:
                 raise DataError(self._missing(key, column, mapped=mapped))
-        return found
+        return chosen
 
     def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
         """The column as ``(rows,)`` float64.
@@ -308,21 +325,21 @@ class Table:
                 return None
             cells = cells.astype("string")
         try:
-            found = self._instants(cells).dt.as_unit("ns")
+            instants = self._instants(cells).dt.as_unit("ns")
         except (ValueError, OverflowError) as error:  # beyond the years that nanoseconds count
             raise DataError(
                 f"{self.path}: column {column!r} holds no dates of our time: {error}"
             ) from error
-        known = found.notna().to_numpy()
-        if not known.all():
-            i = int(np.flatnonzero(~known)[0])
+        valid = instants.notna().to_numpy()
+        if not valid.all():
+            i = int(np.flatnonzero(~valid)[0])
             shown = "nothing" if cells.isna().iloc[i] else repr(str(cells.iloc[i])[:40])
             raise DataError(
                 f"{self.path}, {self.row(i)}: column {column!r} holds {shown}; expected seconds, "
                 "or dates (2020-01-31 08:00:00.2), clock times (08:00:00.2) or durations in all "
                 "rows"
             )
-        return np.asarray(found.astype("int64"))
+        return np.asarray(instants.astype("int64"))
 
     @staticmethod
     def _instants(cells: pd.Series) -> pd.Series:
@@ -350,10 +367,10 @@ class Table:
         Raises:
             DataError: a cell without such; names the row.
         """
-        found = self.instants(column)
-        if found is not None:
-            first = int(found.min())
-            return first, (found - first) / 1e9
+        instants = self.instants(column)
+        if instants is not None:
+            first = int(instants.min())
+            return first, (instants - first) / 1e9
         values = self.numbers(column)
         whole = pd.api.types.is_integer_dtype(self.frame[column])
         if whole and np.abs(values).max() < _WHOLE:
@@ -397,8 +414,8 @@ class Table:
             # NumPy takes text with zero characters behind it for the same text without them
             text = text.str.rstrip("\0").str.strip()
         except (TypeError, ValueError):  # bytes that are no text, or lists in cells
-            known = map(int, np.flatnonzero(~absent))
-            i = next((i for i in known if not _is_text(cells, i)), 0)
+            filled = map(int, np.flatnonzero(~absent))
+            i = next((i for i in filled if not _is_text(cells, i)), 0)
             raise DataError(
                 f"{self.path}, {self.row(i)}: column {column!r} holds {_quoted(cells, i)}; "
                 "expected a name or number"
@@ -447,10 +464,10 @@ class Table:
 def floats(cells: pd.Series) -> np.ndarray:
     """A column's cells ``(rows,)`` as float64, NaN where they hold no real number."""
     try:
-        found = pd.to_numeric(cells, errors="coerce")
-        if found.dtype.kind == "c":  # which would lose its imaginary part
+        numbers = pd.to_numeric(cells, errors="coerce")
+        if numbers.dtype.kind == "c":  # which would lose its imaginary part
             return np.full(len(cells), np.nan)
-        return np.array(found, dtype=np.float64)
+        return np.array(numbers, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):  # such as whole numbers beyond float64
         return np.array([_float(cell) for cell in cells])
 
@@ -506,3 +523,65 @@ def _since_first(values: np.ndarray, unit: float) -> tuple[int, np.ndarray]:
 def opened(source: Path | str | Table) -> Table:
     """A table by its path; one that is open already is taken as it is."""
     return source if isinstance(source, Table) else Table(Path(source))
+
+
+def seconds_per_unit(options: ColumnOptions) -> float:
+    """Seconds in a unit of a table's times.
+
+    Raises:
+        ConfigError: an unknown unit, or frames without their rate.
+    """
+    scale = one_of("time_unit", options.time_unit, {**TIME_UNITS, "frame": np.nan})
+    if options.time_unit == "frame":
+        scale = 1.0 / positive("frame_rate", options.frame_rate)
+    return scale
+
+
+def table_rows(
+    table: Table,
+    names: Mapping[str, str],
+    options: ColumnOptions,
+    axes: tuple[str, ...] = ("x",),
+) -> Trajectories:
+    """The columns of any table, by what they mean.
+
+    Rows of different recordings, or of different sequences, never meet: both are the name of the
+    recording.
+
+    Args:
+        names: of the columns by their meaning.
+        axes: meanings of the positions' columns.
+
+    Raises:
+        ConfigError: an unknown unit.
+        DataError: cells that are missing or hold no number; names the row.
+    """
+    metres = one_of("position_unit", options.position_unit, LENGTH_UNITS)
+
+    def words(key: str) -> np.ndarray | None:
+        return table.names(names[key], empty=True) if key in names else None
+
+    v = length = recording = None
+    if "speed" in names:
+        unit = one_of("speed_unit", getattr(options, "speed_unit", "m/s"), SPEED_UNITS)
+        v = np.abs(table.numbers(names["speed"]))[:, None] * unit
+    if "length" in names:
+        own_unit = getattr(options, "length_unit", None) or options.position_unit
+        length = table.positive(names["length"]) * one_of("length_unit", own_unit, LENGTH_UNITS)
+    parts = [table.names(names[key]) for key in ("recording", "sequence") if key in names]
+    if parts:
+        recording = np.array([" ".join(cells) for cells in zip(*parts, strict=True)], dtype=object)
+    return Trajectories(
+        path=table.path,
+        name=table.path.stem,
+        where=table.row,
+        agent=table.names(names["vehicle" if "vehicle" in names else "agent"]),
+        time=table.times(names["time"], seconds_per_unit(options))[1],
+        x=np.stack([table.measured(names[axis]) for axis in axes], -1) * metres,
+        v=v,
+        recording=recording,
+        lane=table.names(names["lane"]) if "lane" in names else None,
+        length=length,
+        kind=words("kind"),
+        group=words("group"),
+    )

@@ -8,13 +8,14 @@ A file holds a MATLAB cell array ``sequences`` of structs ``Xarr`` (cars x K pos
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from nnode.data.cut import Reading, by_sequence
-from nnode.data.options import EsimasOptions
+from nnode.data.options import DataOptions
 from nnode.data.readers.matlab import read_matlab
 from nnode.data.readers.recordings import natural, raw_files
 from nnode.data.trajectories import Trajectories
@@ -27,6 +28,18 @@ _NAME = {
     2: re.compile(r"sequence_data_(.+)\.mat"),
     3: re.compile(r"sequence_data(?!_)(.+)\.mat"),
 }
+
+
+@dataclass
+class EsimasOptions(DataOptions):
+    """The preprocessed ESIMAS sequences (.mat)."""
+
+    published: ClassVar[bool] = True
+
+    name: str = "esimas"
+    domain: str = "traffic"
+    fill: float = 0.0  # the published sequences as they are
+    min_vehicles: int = 3  # 2 or 3: which of the two published families
 
 
 def esimas_files(options: EsimasOptions) -> dict[str, Path]:
@@ -115,10 +128,10 @@ def _load(path: Path) -> list[Any]:
         raise DataError(
             f"{path}: expected a cell array 'sequences', found {', '.join(content) or 'nothing'}"
         )
-    found = content["sequences"]
-    if isinstance(found, np.ndarray):
-        return list(found.ravel())
-    return found if isinstance(found, list) else [found]
+    sequences = content["sequences"]
+    if isinstance(sequences, np.ndarray):
+        return list(sequences.ravel())
+    return sequences if isinstance(sequences, list) else [sequences]
 
 
 def _field(cell: Any, name: str, where: str) -> np.ndarray:

@@ -6,12 +6,12 @@ that grow as it drives on, whichever way that is.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from nnode.data.cut import Reading, by_lane, check_cutting
-from nnode.data.options import HighDOptions
+from nnode.data.cut import LaneOptions, Reading, by_lane, check_cutting
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import table_path
 from nnode.data.trajectories import Trajectories
@@ -22,6 +22,13 @@ TRACKS, TRACKS_META, RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_record
 
 #: drivingDirection of tracks that drive towards smaller, and towards larger positions.
 LEFT, RIGHT = 1, 2
+
+
+@dataclass
+class HighDOptions(LaneOptions):
+    """highD's tracks, with the tables ``tracksMeta`` and ``recordingMeta`` beside them."""
+
+    name: str = "highd"
 
 
 def highd_files(options: HighDOptions) -> dict[str, Path]:
@@ -85,11 +92,11 @@ def read_highd(files: dict[str, Path], options: HighDOptions) -> Reading:
 
 def _rate(path: Path) -> float:
     table = Table(path)
-    (rate, *more) = table.numbers(table.choose(("frameRate",))["frameRate"])
-    if more or not rate > 0:
+    (rate, *further) = table.numbers(table.choose(("frameRate",))["frameRate"])
+    if further or not rate > 0:
         raise DataError(
             f"{path}: expected one row with a positive frameRate (1/s), found "
-            f"{1 + len(more)} rows, the first with {rate:g}"
+            f"{1 + len(further)} rows, the first with {rate:g}"
         )
     return float(rate)
 

@@ -10,17 +10,19 @@ import logging
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from enum import Enum
 from fnmatch import fnmatch
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from nnode.data.cut import Member, Reading, by_presence, sequence_of, told_uneven
+from nnode.data.cut import Member, Reading, by_presence, sequence_of, uneven_text
 from nnode.data.exits import Exit, destinations, exits_of, read_exits
-from nnode.data.options import JuelichOptions, Velocity, one_of, positive
+from nnode.data.options import DataOptions, one_of, positive
 from nnode.data.readers.recordings import natural, raw_files
 from nnode.data.sequence import Sequence
 from nnode.data.trajectories import Grid, Record, Trajectories, records
@@ -40,6 +42,41 @@ _NAME = re.compile(r"(.+)\.txt")
 
 #: Rows of people, and their sampling interval (s).
 People = tuple[Trajectories, float]
+
+
+class Velocity(str, Enum):
+    """Finite difference that velocities are computed with.
+
+    ``forward`` looks only at the positions of the sequence itself; ``central`` and ``backward``
+    use the neighbouring frames of the whole trajectory where there are such.
+    """
+
+    forward = "forward"
+    central = "central"
+    backward = "backward"
+
+
+@dataclass
+class JuelichOptions(DataOptions):
+    """Trajectory text files of the Jülich archive: id frame x y z."""
+
+    name: str = "juelich"
+    domain: str = "crowd"
+    fill: float = 0.0  # the published recordings as they are
+    t_seq: float = 1.0  # s, length of a sequence
+    frame_rate: float | None = None  # 1/s; null reads it from the file's header
+    unit: str | None = None  # cm | m; null reads it from the file's header
+    walking_axis: str = "x"  # x | y; walls run along it
+    walls: dict[str, list[float]] = field(default_factory=dict)  # recording: [low, high], m
+    view: list[float] | None = None  # [from, to] along the walking axis, m; null takes all
+    velocity: Velocity = Velocity.forward
+    min_agents: int = 1  # fewest people in a sequence
+    # {name: {line: [x1, y1, x2, y2], direction: +x}}, m: destinations on exit lines, by where
+    # people walk (+x | -x | +y | -y | [x, y]); null: their last position in the sequence
+    exits: Any = None
+    # s before a sequence in which preferred velocities are measured, for model.desired=direction;
+    # 0 measures none. Who is not tracked so long before has the velocity of his first sample
+    history: float = 1.0
 
 
 def juelich_files(options: JuelichOptions) -> dict[str, Path]:
@@ -98,43 +135,43 @@ def cut_people(people: People, options: JuelichOptions, walls: np.ndarray | None
         )
     if walls is None:
         walls = _walls(path.stem, options.walls, axis, rows.x, view)
-    found: list[Sequence] = []
+    sequences: list[Sequence] = []
     notes: list[str] = []
-    for (name,), own in rows.parts("recording"):
+    for (name,), of_recording in rows.parts("recording"):
         recording = name or rows.name
-        grid = Grid(dt, float(own.time.min()))
-        every = records(own, grid, fill=options.fill, smoothing=options.smooth)
+        grid = Grid(dt, float(of_recording.time.min()))
+        every = records(of_recording, grid, fill=options.fill, smoothing=options.smooth)
         every = [_with_velocity(record, dt, options) for record in every]
-        notes += told_uneven(every, dt)
-        goals = _goals(own, read_exits(options.exits))
+        notes += uneven_text(every, dt)
+        goals = _goals(of_recording, read_exits(options.exits))
         before = round(options.history / dt)
-        for number, (there, first, last) in enumerate(
+        for number, (present, first, last) in enumerate(
             by_presence(every, steps, max(options.min_agents, 1), axis, view)
         ):
-            there.sort(key=lambda record: natural(record.agent))
-            of = [Member(record.agent, record.row, [record]) for record in there]
-            found.append(
+            present.sort(key=lambda record: natural(record.agent))
+            of = [Member(record.agent, record.row, [record]) for record in present]
+            sequences.append(
                 sequence_of(
                     f"{recording}/{number:03d}",
-                    own,
+                    of_recording,
                     of,
                     first,
                     last,
                     grid,
                     recording=recording,
-                    destination=_destinations(goals, there, first, last),
-                    preferred=_before(every, there, first, before, dt),
+                    destination=_destinations(goals, present, first, last),
+                    preferred=_before(every, present, first, before, dt),
                     walls=walls,
                 )
             )
-    if not found:
+    if not sequences:
         span = float(rows.time.max() - rows.time.min()) + dt
         raise DataError(
             f"{path}: no sequence; nowhere are {max(options.min_agents, 1)} people present for "
             f"{options.t_seq:g} s ({len(set(rows.agent))} people, {span:g} s in all); lower "
             "data.t_seq or data.min_agents, widen data.view, or leave it out of data.recording"
         )
-    return Reading(found, notes=notes)
+    return Reading(sequences, notes=notes)
 
 
 def _with_velocity(record: Record, dt: float, options: JuelichOptions) -> Record:
@@ -159,18 +196,18 @@ def _goals(rows: Trajectories, exits: list[Exit]) -> _Goals:
     names, first = np.unique(agent, return_index=True)
     last = len(agent) - 1 - np.unique(agent[::-1], return_index=True)[1]
     try:
-        own = exits_of(exits, rows.x[order[first]], rows.x[order[last]], names.tolist())
+        goals = exits_of(exits, rows.x[order[first]], rows.x[order[last]], names.tolist())
     except DataError as error:
         raise DataError(f"{rows.path}: {error}") from error
-    return dict(zip(names.tolist(), own, strict=True))
+    return dict(zip(names.tolist(), goals, strict=True))
 
 
-def _destinations(goals: _Goals, there: list[Record], first: int, last: int) -> np.ndarray:
+def _destinations(goals: _Goals, present: list[Record], first: int, last: int) -> np.ndarray:
     """``(N, 2)`` m: nearest points of exits, or the last positions of the sequence."""
     if not goals:
-        return np.stack([record.x[last - record.first] for record in there])
-    x = np.stack([record.x[first - record.first] for record in there])
-    return destinations([goals[record.agent] for record in there], x)
+        return np.stack([record.x[last - record.first] for record in present])
+    x = np.stack([record.x[first - record.first] for record in present])
+    return destinations([goals[record.agent] for record in present], x)
 
 
 def _interval(option: str, value: list[float] | None) -> tuple[float, float] | None:
@@ -209,7 +246,7 @@ def load_people(path: Path, options: JuelichOptions) -> People:
         raise ConfigError(
             f"{path}: the header and data.frame_rate={rate}, data.unit={options.unit} do not "
             f"settle the frame rate and the unit: {error} Set data.frame_rate (1/s) and "
-            "data.unit (cm, m) where the header lacks them, and to null where it tells them"
+            "data.unit (cm, m) where the header lacks them, and to null where it has them"
         ) from error
     table = trajectory.data[["id", "frame", "x", "y"]].reset_index(drop=True)
     if not np.isfinite(table[["x", "y"]].to_numpy()).all():
@@ -286,7 +323,7 @@ def _check_lines(path: Path) -> None:
 
 
 def _before(
-    every: list[Record], there: list[Record], first: int, steps: int, dt: float
+    every: list[Record], present: list[Record], first: int, steps: int, dt: float
 ) -> np.ndarray | None:
     """Mean velocities (m/s) of people so many steps before a time, NaN of who was not tracked."""
     at = first - steps
@@ -294,10 +331,10 @@ def _before(
         return None
     then = {r.agent: r.x[at - r.first] for r in every if r.first <= at <= r.last}
     nowhere = np.full(2, np.nan)
-    found: np.ndarray = np.stack(
-        [(r.x[first - r.first] - then.get(r.agent, nowhere)) / (steps * dt) for r in there]
+    velocity: np.ndarray = np.stack(
+        [(r.x[first - r.first] - then.get(r.agent, nowhere)) / (steps * dt) for r in present]
     )
-    return found if np.isfinite(found).any() else None
+    return velocity if np.isfinite(velocity).any() else None
 
 
 def _walls(

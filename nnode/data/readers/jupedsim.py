@@ -10,19 +10,19 @@ import math
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import shapely
+from omegaconf import MISSING
 from shapely.geometry.polygon import orient
 
 from nnode.data.cut import Reading
-from nnode.data.options import WalkwayOptions
-from nnode.data.readers.columns import EXACT, Table, opened
-from nnode.data.readers.juelich import People, cut_people, load_people, people_of
+from nnode.data.readers.columns import EXACT, ColumnOptions, Table, opened, table_rows
+from nnode.data.readers.juelich import JuelichOptions, People, cut_people, load_people, people_of
 from nnode.data.readers.recordings import table_path
-from nnode.data.readers.vehicles import table_rows
 from nnode.data.sequence import check_interval
 from nnode.errors import ConfigError, DataError
 
@@ -44,6 +44,16 @@ REQUIRED, OPTIONAL = ("agent", "time", "x", "y"), ("recording", "sequence")
 _COLUMNS = ("id", "frame", "pos_x", "pos_y")
 
 
+@dataclass
+class WalkwayOptions(ColumnOptions, JuelichOptions):
+    """One file of walking people: PedPy's text, JuPedSim's SQLite database, or a table."""
+
+    name: str = "pedpy"
+    fill: float = 0.5  # s of missing frames of a person that are interpolated; 0: none
+    path: str = MISSING  # the file; relative to data.source where that is given
+    geometry: str | None = None  # text file with the walkable area as WKT, m
+
+
 def walkway_files(options: WalkwayOptions, table: Table | None = None) -> dict[str, Path | Table]:
     """The trajectories, or their path, and the path of the walkable area where it has a file of
     its own."""
@@ -62,12 +72,12 @@ def read_walkway(
         path: SQLite database as JuPedSim's writer makes it; text ``id frame x y z``; or a table
             (CSV, Parquet, in memory, or any text whose ``columns`` are given).
         options: those of the Jülich reader. ``frame_rate`` and ``unit`` are for texts without a
-            header; a database tells its own, and a table has units.
+            header; a database states its own, and a table has units.
         geometry: text file with the walkable area as WKT (m); it takes the place of the area
             that a database holds.
 
     Returns:
-        Sequences named ``recording/number`` after the file. Where neither file tells an area,
+        Sequences named ``recording/number`` after the file. Where neither file has an area,
         walls are those of ``options.walls``.
 
     Raises:

@@ -61,7 +61,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
     if len(content) < 128 or content[126:128] not in (b"IM", b"MI"):
         raise ValueError("no header of a MATLAB file of level 5")
     order = "<" if content[126:128] == b"IM" else ">"
-    found: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     at, room = 128, MOST_BYTES
     while at < len(content):
         kind, data, at = _element(content, at, order)
@@ -71,19 +71,19 @@ def read_matlab(path: Path) -> dict[str, Any]:
             kind, data, _ = _element(data, 0, order)
         if kind == _MATRIX:
             name, value = _matrix(data, order, 0)
-            found[name] = value
-    return found
+            variables[name] = value
+    return variables
 
 
 def _unpacked(data: bytes, room: int) -> bytes:
     unpacker = zlib.decompressobj()
     try:
-        found = unpacker.decompress(data, room)
+        unpacked = unpacker.decompress(data, room)
     except zlib.error as error:
         raise ValueError(f"a packed variable is damaged: {error}") from error
     if not unpacker.eof:
         raise ValueError(f"a packed variable is truncated, or has more than {room} bytes")
-    return found
+    return unpacked
 
 
 def _element(data: bytes, at: int, order: str) -> tuple[int, bytes, int]:
@@ -145,13 +145,13 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
 def _each(data: bytes, at: int, order: str, number: int, depth: int) -> list[Any]:
     if number > (len(data) - at) // 8:
         raise ValueError(f"{number} elements do not fit into the {len(data) - at} bytes left")
-    found = []
+    elements = []
     for _ in range(number):
         kind, part, at = _element(data, at, order)
         if kind != _MATRIX:
             raise ValueError(f"a cell or field of the unknown type {kind}")
-        found.append(_matrix(part, order, depth + 1)[1])
-    return found
+        elements.append(_matrix(part, order, depth + 1)[1])
+    return elements
 
 
 def _structs(
@@ -166,8 +166,8 @@ def _structs(
         text[i : i + size].partition(b"\0")[0].decode("latin-1") for i in range(0, len(text), size)
     ]
     values = _each(data, at, order, number * len(names), depth)
-    found = [
+    structs = [
         dict(zip(names, values[i * len(names) : (i + 1) * len(names)], strict=True))
         for i in range(number if names else 0)
     ]
-    return found[0] if len(found) == 1 else found
+    return structs[0] if len(structs) == 1 else structs

@@ -11,15 +11,16 @@ and Supporting Data, doi 10.21949/1504477, with its dictionary of columns.
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nnode.data.cut import Reading, by_lane, check_cutting
-from nnode.data.options import NgsimOptions, VehicleTableOptions
+from nnode.data.cut import LaneOptions, Reading, by_lane, check_cutting
 from nnode.data.readers.columns import EXACT, Table
-from nnode.data.readers.vehicles import LENGTH_UNITS, read_vehicles
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
+from nnode.data.sequence import LENGTH_UNITS
 from nnode.data.trajectories import Trajectories
 from nnode.errors import DataError
 
@@ -69,6 +70,13 @@ APART = 7.5 * 60e3
 
 #: Hours by which the clocks of both freeways, in April and June, were behind UTC.
 BEHIND_UTC = 7
+
+
+@dataclass
+class NgsimOptions(LaneOptions):
+    """NGSIM's public trajectories of freeways, in feet and ms, as they are published."""
+
+    name: str = "ngsim"
 
 
 def read_ngsim(path: Path, options: NgsimOptions) -> Reading:
@@ -163,20 +171,20 @@ def _periods(table: Table) -> Trajectories:
             f"{table.path}, {table.row(int(odd[0]))}: Global_Time and Frame_ID put frame 0 at "
             f"{start[odd[0]]:g} ms since 1970; correct them"
         )
-    found: dict[str, np.ndarray] = {}
+    periods: dict[str, np.ndarray] = {}
     for location in dict.fromkeys(place[roads]):
-        own = roads[place[roads] == location]
-        own = own[np.argsort(start[own], kind="stable")]
-        breaks = np.flatnonzero(np.diff(start[own]) > APART) + 1
-        for rows in np.split(own, breaks):
+        at_location = roads[place[roads] == location]
+        at_location = at_location[np.argsort(start[at_location], kind="stable")]
+        breaks = np.flatnonzero(np.diff(start[at_location]) > APART) + 1
+        for rows in np.split(at_location, breaks):
             name = called = f"{location}_{_clock(start[rows[0]])}"
-            while name in found:  # of another day
-                name = f"{called}-{1 + sum(known.startswith(called) for known in found)}"
+            while name in periods:  # of another day
+                name = f"{called}-{1 + sum(period.startswith(called) for period in periods)}"
             rows = np.sort(rows)
             same = np.stack([number[needed][rows] for needed in _NEEDED], axis=1)
             # rows that stand there twice are taken once
-            found[name] = rows[np.sort(np.unique(same, axis=0, return_index=True)[1])]
-    return _vehicles(table, number, found, start)
+            periods[name] = rows[np.sort(np.unique(same, axis=0, return_index=True)[1])]
+    return _vehicles(table, number, periods, start)
 
 
 def _roads(table: Table, place: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
@@ -206,27 +214,31 @@ def _clock(start: float) -> str:
 
 
 def _vehicles(
-    table: Table, number: dict[str, np.ndarray], found: dict[str, np.ndarray], start: np.ndarray
+    table: Table, number: dict[str, np.ndarray], periods: dict[str, np.ndarray], start: np.ndarray
 ) -> Trajectories:
     """Periods in SI units, times since frame 0 of each.
 
     Args:
-        found: rows by the period's name.
+        periods: rows by the period's name.
         start: ms, of frame 0 by the row.
     """
-    rows = np.concatenate(list(found.values()))
-    origin = np.concatenate([np.full(len(own), start[own].min()) for own in found.values()])
-    own = {name: values[rows] for name, values in number.items()}
-    speed, length, kind = (own.get(name) for name in ("v_Vel", "v_Length", "v_Class"))
+    rows = np.concatenate(list(periods.values()))
+    origin = np.concatenate(
+        [np.full(len(values_of), start[values_of].min()) for values_of in periods.values()]
+    )
+    values_of = {name: values[rows] for name, values in number.items()}
+    speed, length, kind = (values_of.get(name) for name in ("v_Vel", "v_Length", "v_Class"))
     return Trajectories(
         path=table.path,
         name=table.path.stem,
         where=lambda i: table.row(int(rows[i])),
-        recording=np.repeat(np.array(list(found), dtype=object), [len(o) for o in found.values()]),
-        agent=_text(own["Vehicle_ID"]),
-        time=(own["Global_Time"] - origin) * 1e-3,
-        x=own["Local_Y"][:, None] * FOOT,
-        lane=_text(own["Lane_ID"]),
+        recording=np.repeat(
+            np.array(list(periods), dtype=object), [len(o) for o in periods.values()]
+        ),
+        agent=_text(values_of["Vehicle_ID"]),
+        time=(values_of["Global_Time"] - origin) * 1e-3,
+        x=values_of["Local_Y"][:, None] * FOOT,
+        lane=_text(values_of["Lane_ID"]),
         v=None if speed is None else np.abs(speed)[:, None] * FOOT,
         length=None if length is None else length * FOOT,
         kind=None if kind is None else _text(kind),
@@ -236,5 +248,5 @@ def _vehicles(
 def _text(values: np.ndarray) -> np.ndarray:
     """Whole numbers as they are written, empty where there is none."""
     whole = [f"{value:.0f}" if np.isfinite(value) else "" for value in np.unique(values)]
-    known = np.array(whole, dtype=object)
-    return known[np.unique(values, return_inverse=True)[1]]
+    words = np.array(whole, dtype=object)
+    return words[np.unique(values, return_inverse=True)[1]]

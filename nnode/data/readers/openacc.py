@@ -13,18 +13,21 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from nnode.data.cut import by_spacing
-from nnode.data.options import OpenAccOptions, check_known, one_of, positive, wanted
+from nnode.data.cut import Member, Reading, sequence_of, whole_steps, windows
+from nnode.data.options import DataOptions, check_known, one_of, positive, wanted
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import raw_files, tables_below
 from nnode.data.sequence import Sequence
-from nnode.data.trajectories import Trajectories, driven
+from nnode.data.smooth import smooth
+from nnode.data.trajectories import Grid, Record, Trajectories, driven
 from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -35,8 +38,13 @@ HEAD = ("Date", "Vehicle_order", "Number_of_vehicles", "ACC", "Distance_setting"
 #: Places in a platoon; its vehicles are tens.
 MOST_VEHICLES = 1000
 
-#: What may be told of a vehicle.
+#: Properties of a vehicle that models may be given.
 KNOWN = ("make", "setting", "acc", "order")
+
+#: Times of a run, with those that no row stands for.
+MOST_TIMES = 10**6
+#: Times and places of a run may be so many, or so many times the rows that stand there.
+_CELLS, _SPARSE = 10**7, 10
 
 _FLAT = ("run", "position", "t", "v", "gap")
 
@@ -47,6 +55,35 @@ CLOSED = 0.01
 BACK = 10.0
 #: m that a vehicle must have been away by in between.
 AWAY = 50.0
+
+
+@dataclass
+class OpenAccOptions(DataOptions):
+    """Platoons on test tracks of OpenACC: speeds, and gaps from bumper to bumper.
+
+    Each vehicle has a ``make``, ``setting`` (the distance setting of the adaptive cruise
+    control, ``none`` for people), ``acc`` (``ACC`` or ``people``), ``order`` (1 leads).
+    """
+
+    name: str = "openacc"
+    domain: str = "traffic"
+    # a file, or a folder of files, relative to data.source where that is given; null: the published
+    path: str | None = None
+    # patterns of the files of a folder, of which the first that fits any is taken
+    files: list[str] = field(default_factory=lambda: ["**/*.csv", "**/*.parquet"])
+    kind: str | None = "make"  # make | setting | acc | order; null: not given to the models
+    group: str | None = "setting"  # make | setting | acc | order; null: not given to the models
+    # m, that every vehicle is taken to have, as it is not published: positions are gaps and
+    # lengths; null: positions are gaps alone
+    length: float | None = 5.0
+    dt: float | None = None  # s, a multiple of the files' step; null: that
+    # m by which a gap may change between two samples otherwise than the speeds tell, without being
+    # taken for unknown: the error that one position may have; null: whatever
+    max_error: float | None = 0.5
+    fill: float = 0.9  # s that may be missing of a vehicle; a longer hole is not interpolated
+    window: float | None = None  # s; null: maximal intervals with the same vehicles in view
+    min_vehicles: int = 2  # fewest vehicles of a platoon
+    min_duration: float = 5.0  # s, shortest sequence where window is null
 
 
 def openacc_files(options: OpenAccOptions) -> dict[str, Path]:
@@ -66,7 +103,7 @@ def openacc_files(options: OpenAccOptions) -> dict[str, Path]:
     )
 
 
-def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> list[Sequence]:
+def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> Reading:
     """Read runs and cut them into sequences.
 
     Where a vehicle's record has a hole longer than ``fill``, or a vehicle has no columns, the
@@ -75,7 +112,7 @@ def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> list[Seq
 
     Args:
         files: see :func:`openacc_files`.
-        options: what is told of vehicles, time grid and the way of cutting.
+        options: what is known of vehicles, time grid and the way of cutting.
 
     Returns:
         Sequences named ``run/number``, with measured speeds. Vehicles are called ``make``, with
@@ -92,7 +129,7 @@ def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> list[Seq
     if asked is not None and options.path is not None:
         check_known(asked, [run.name for run in runs])
         runs = [run for run in runs if run.name in asked]
-    sequences: list[Sequence] = []
+    sequences = Reading()
     for run in runs:
         check_laps(run)
         sequences += by_spacing(run, options)
@@ -254,6 +291,168 @@ def _positions(table: Table) -> np.ndarray:
             f"the platoon, a whole number from 1 to {MOST_VEHICLES}"
         )
     return positions.astype(int)
+
+
+def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
+    """Cut a platoon whose vehicles are known by their speeds and spacings.
+
+    The foremost vehicle of a sequence is where its integrated speed brings it, those behind it are
+    the spacings and lengths further back. Where the speed or the spacing of a vehicle has a hole
+    longer than ``fill``, the platoon is cut in two at its place.
+
+    Args:
+        rows: of one run, the first vehicle in front; ``x`` is not looked at.
+        options: ``dt``, ``fill``, ``max_error`` and the way of cutting.
+
+    Returns:
+        Sequences named ``run/number``, in order of time, the leader last.
+
+    Raises:
+        ConfigError: a ``dt`` or ``window`` that is no whole number of steps.
+        DataError: times that are not equally spaced, or a vehicle twice at one time.
+    """
+    start, step, (speed, spacing) = _equally_spaced(rows, rows.v, rows.spacing)
+    most = int(options.fill / step + 1e-6)  # samples that may be missing
+    v = _filled(speed, most)
+    sound = _sound(rows, spacing, np.diff(v, axis=1), step, options.max_error)
+    gap = _filled(sound, most)
+    added = (np.isfinite(v) & np.isnan(speed)) | (np.isfinite(gap) & np.isnan(sound))
+    way = np.stack([driven(step * np.arange(len(v)), column) for column in v.T], 1)
+    every = 1 if options.dt is None else whole_steps("dt", options.dt, step)
+    v, gap, way, added = v[::every], gap[::every], way[::every], added[::every]
+    grid = Grid(step * every, start)
+    # with the vehicle in front; the first has nobody there
+    linked = np.isfinite(v) & np.isfinite(gap)
+    linked[:, 1:] &= np.isfinite(v[:, :-1])
+    linked[:, 0] = False
+    first_row = pd.Series(np.arange(len(rows))).groupby(rows.agent, sort=False).first()
+    table = replace(rows, x=rows.x[:, :1])
+    sequences: list[Sequence] = []
+    for first, last in _linked_intervals(linked, grid.dt, options):
+        part = slice(first, last + 1)
+        heads = np.flatnonzero(~linked[part].all(axis=0))
+        for i, end in pairwise([*heads.tolist(), linked.shape[1]]):
+            if end - i < options.min_vehicles or not np.isfinite(v[part, i]).all():
+                continue
+            front, platoon = way[part, i], []
+            for n in range(i, end):
+                front = front - (gap[part, n] + (options.length or 0.0) if n > i else 0.0)
+                x, speeds = front, v[part, n]
+                if options.smooth is not None:
+                    x, speeds = smooth(grid.dt * np.arange(len(x)), x, options.smooth)
+                    speeds = np.maximum(speeds, 0.0)
+                record = Record(
+                    str(first_row.index[n]),
+                    int(first_row.iloc[n]),
+                    first,
+                    x[:, None],
+                    speeds[:, None],
+                    added[part, n],
+                    np.zeros(len(x), dtype=bool),
+                )
+                platoon.append(Member(record.agent, record.row, [record]))
+            name = f"{rows.name}/{len(sequences):03d}"
+            sequences.append(sequence_of(name, table, platoon[::-1], first, last, grid))
+    return sequences
+
+
+def _equally_spaced(
+    rows: Trajectories, *columns: np.ndarray | None
+) -> tuple[float, float, list[np.ndarray]]:
+    """Time of the first sample, step (s), and columns ``(K, N)``, NaN where there is no row."""
+    time, at = np.unique(np.round(rows.time, 6), return_inverse=True)
+    agent, names = pd.factorize(rows.agent)
+    if len(time) < 2:
+        raise DataError(f"{rows.path}: all rows of {rows.name} stand at one time")
+    step = round(float(np.median(np.diff(time))), 9)
+    number = (time - time[0]) / step
+    if not number[-1] < MOST_TIMES:
+        raise DataError(
+            f"{rows.path}: times go from {time[0]:g} to {time[-1]:g} s in steps of {step:g} s; "
+            f"expected at most {MOST_TIMES:.0e} steps: look for a time that is wrong"
+        )
+    k = np.round(number).astype(int)
+    odd = np.flatnonzero(np.abs(number - k) > 0.1)
+    if odd.size:
+        raise DataError(
+            f"{rows.path}: the time {time[odd[0]]:g} s is no whole number of steps of {step:g} s "
+            f"from the first, {time[0]:g} s"
+        )
+    shape = (int(k[-1]) + 1, len(names))
+    if shape[0] * shape[1] > max(_CELLS, _SPARSE * len(rows)):
+        raise DataError(
+            f"{rows.path}: {len(rows)} rows stand at {shape[0]} equally spaced times of {shape[1]} "
+            "vehicles; look for a time or a position that is wrong, or cut the file"
+        )
+    cell = k[at] * shape[1] + agent
+    if len(np.unique(cell)) < len(cell):
+        raise DataError(
+            f"{rows.path}: run {rows.name} has two rows of one position at one time; expected one "
+            "row per vehicle and time"
+        )
+    wide_columns = []
+    for column in columns:
+        wide = np.full(shape, np.nan)
+        if column is not None:
+            wide.ravel()[cell] = column.ravel()
+        wide_columns.append(wide)
+    return float(time[0]), step, wide_columns
+
+
+def _filled(values: np.ndarray, most: int) -> np.ndarray:
+    """``(K, N)`` values with holes of at most ``most`` samples interpolated."""
+    full = values.copy()
+    for column in full.T:
+        missing, measured = (np.flatnonzero(np.isnan(column) == where) for where in (True, False))
+        after = np.searchsorted(measured, missing)
+        inside = (after > 0) & (after < len(measured))
+        missing, after = missing[inside], after[inside]
+        short = missing[measured[after] - measured[after - 1] <= most + 1]
+        column[short] = np.interp(short, measured, column[measured]) if short.size else 0.0
+    return full
+
+
+def _sound(
+    rows: Trajectories, spacing: np.ndarray, faster: np.ndarray, dt: float, most: float | None
+) -> np.ndarray:
+    """``(K, N)`` spacings without those that are none: not above 0, or between samples of which
+    one contradicts the speeds by more than ``most`` m.
+
+    Args:
+        faster: ``(K, N - 1)`` m/s, how much faster each follower is than the vehicle in front.
+    """
+    sound = np.where(spacing > 0, spacing, np.nan)
+    if most is not None:
+        expected = -(faster[1:] + faster[:-1]) / 2 * dt
+        off = np.abs(np.diff(sound[:, 1:], axis=0) - expected) > most
+        sound[1:, 1:][off] = np.nan
+        sound[:-1, 1:][off] = np.nan
+    names = list(dict.fromkeys(rows.agent))
+    bad = np.isfinite(spacing) & np.isnan(sound)
+    for i in np.flatnonzero(bad.any(axis=0)):
+        log.info(
+            "%s: %d of %d gaps of %s to %s are not above 0, or change otherwise than their speeds "
+            "tell (data.max_error); they count as unknown",
+            rows.name,
+            bad[:, i].sum(),
+            np.isfinite(spacing[:, i]).sum(),
+            names[i],
+            names[i - 1],
+        )
+    return sound
+
+
+def _linked_intervals(
+    linked: np.ndarray, dt: float, options: OpenAccOptions
+) -> Iterator[tuple[int, int]]:
+    """First and last sample of windows, or of maximal intervals with the same links."""
+    if options.window is not None:
+        yield from windows(0, len(linked) - 1, whole_steps("window", options.window, dt))
+        return
+    changes = np.flatnonzero((linked[1:] != linked[:-1]).any(axis=1)) + 1
+    for first, after in pairwise([0, *changes.tolist(), len(linked)]):
+        if (after - 1 - first) * dt >= options.min_duration - 1e-6:
+            yield first, after - 1
 
 
 def check_laps(run: Trajectories) -> None:

@@ -10,20 +10,32 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from enum import Enum
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from omegaconf import MISSING
 
-from nnode.data.cut import Reading, by_pair, chosen_lanes, told_uneven
-from nnode.data.options import PairOptions, check_known, one_of, positive, wanted
-from nnode.data.readers.columns import Table, opened
+from nnode.data.cut import (
+    Member,
+    Reading,
+    chosen_lanes,
+    numbered_parts,
+    spans,
+    uneven_text,
+    whole_steps,
+    windows,
+)
+from nnode.data.limits import LIMITS, UNEVEN
+from nnode.data.options import DataOptions, check_known, one_of, positive, wanted
+from nnode.data.readers.columns import ColumnOptions, Table, opened, seconds_per_unit
 from nnode.data.readers.recordings import natural, place_below, tables_below
-from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS, seconds_per_unit
-from nnode.data.trajectories import Record, Trajectories, driven
+from nnode.data.sequence import LENGTH_UNITS, SPEED_UNITS
+from nnode.data.trajectories import Grid, Record, Trajectories, driven, records
 from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -41,9 +53,48 @@ OPTIONAL = (*_LENGTHS, "spacing", *_SPEEDS, *_WORDS)
 #: Key of the table that lists the files.
 INDEX = "index"
 
-#: m by which a length that follows from spacings may vary within a pair: the error that a single
-#: position may have without being a fault (:mod:`nnode.data.quality`).
-UNSTEADY = 0.5
+
+class Gaps(str, Enum):
+    """What becomes of a record whose equally spaced times have a gap."""
+
+    cut = "cut"
+    error = "error"
+
+
+@dataclass
+class PairOptions(ColumnOptions, DataOptions):
+    """Pairs of a follower and its leader: one row per pair and time, in one file or many.
+
+    ``columns`` names the tables' columns by what they mean: ``time``, ``x_follower``,
+    ``x_leader`` (or, in their place, ``spacing`` and both speeds), and where they exist ``pair``,
+    ``v_follower``, ``v_leader``, ``leader_length``,
+    ``follower_length``, ``spacing`` (bumper to bumper), ``follower``, ``leader`` (identifiers),
+    ``run``, ``lane``, ``split`` (train, test), ``leader_kind``, ``follower_kind``. A column that
+    bears the name of its meaning need not be listed; null leaves an optional one out.
+    """
+
+    name: str = "pairs"
+    domain: str = "traffic"
+    path: str = MISSING  # a file, or a folder of files; relative to data.source where that is given
+    # patterns of the files of a folder, of which the first that fits any is taken
+    files: list[str] = field(default_factory=lambda: ["**/*.csv", "**/*.parquet"])
+    # a table in that folder with a row per file: path, and meanings that the files have no columns
+    # of; where it is there, no other file is read
+    index: str | None = None
+    # a regular expression, searched for in a file's path below the folder: its named groups are
+    # meanings that the file has no column of
+    pattern: str | None = None
+    constant: dict[str, str] = field(default_factory=dict)  # {meaning: its value in every row}
+    position_unit: Any = "m"  # m | ft | cm | km, or by pattern of the file's name {"*.csv": ft}
+    speed_unit: Any = "m/s"  # m/s | km/h | ft/s | mph, or by pattern of the file's name
+    # m, of leaders where the table has neither positions nor lengths; the gap does not depend on it
+    length: float | None = 5.0
+    kinds: Any = field(default_factory=dict)  # {class code: name}
+    lane: Any = None  # a lane or a list of lanes; null takes every lane
+    dt: float | None = None  # s, grid to interpolate to; null: the times as they are
+    gaps: Gaps = Gaps.cut  # what becomes of a gap in the times of a pair
+    window: float | None = None  # s, length of a sequence; null: a pair is as long as it is
+    min_samples: int = 3  # fewest times of a sequence
 
 
 def pair_files(options: PairOptions, table: Table | None = None) -> dict[str, Path | Table]:
@@ -91,7 +142,7 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
         Speeds are the measured ones where the source has those of both. A pair without a column
         of it is a file; without a run, all are of one recording, which is called like the data. A
         vehicle without an identifier is called after the pair and is in no other one.
-        ``left_out`` tells of pairs that are too short.
+        ``left_out`` lists pairs that are too short.
 
     Raises:
         ConfigError: an option out of its range, an unknown recording or lane.
@@ -153,7 +204,7 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             anonymous,
             len(pairs),
         )
-    reading.notes = told_uneven(every, dt)
+    reading.notes = uneven_text(every, dt)
     return reading
 
 
@@ -190,7 +241,7 @@ def _unit(option: str, value: Any, path: Path, units: dict[str, float]) -> float
 
 
 def _listed(path: Path | Table | None) -> dict[str, dict[str, str]]:
-    """What an index tells of every file, by the file's path."""
+    """Properties of every file that an index lists, by the file's path."""
     if path is None:
         return {}
     table = opened(path)
@@ -242,7 +293,8 @@ def _rows(
         if integrated:
             assert v is not None
             length = float(options.length or np.nan) if np.isnan(length) else length
-            x[rows] = _integrated(time[rows], v[rows, 1], spacing[rows], length)
+            front = driven(time[rows], v[rows, 1])
+            x[rows] = np.stack([front - np.nan_to_num(length) - spacing[rows], front], -1)
         elif _LENGTHS[0] not in names:
             length = _leader(table, x[rows, 1] - x[rows, 0] - spacing[rows], rows)
         leader[rows] = length
@@ -301,14 +353,6 @@ def _columns(table: Table, options: PairOptions) -> tuple[dict[str, str], bool]:
         ) from error
 
 
-def _integrated(
-    time: np.ndarray, v_leader: np.ndarray, spacing: np.ndarray, length: float
-) -> np.ndarray:
-    """``(K, 2)`` m, fronts of follower and leader, see :func:`read_pairs`."""
-    leader = driven(time, v_leader)
-    return np.stack([leader - np.nan_to_num(length) - spacing, leader], -1)
-
-
 def _everywhere(
     key: str, path: Path, options: PairOptions, listed: dict[str, str], held: set[str]
 ) -> dict[str, str]:
@@ -339,7 +383,7 @@ def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:
         return float("nan")
     usual = float(np.nanmedian(length))
     off = np.abs(length - usual)
-    if np.nanmax(off) > UNSTEADY:
+    if np.nanmax(off) > LIMITS["traffic"].noise:
         i = int(rows[np.nanargmax(off)])
         raise DataError(
             f"{table.path}, {table.row(i)}: x_leader - x_follower - spacing is "
@@ -354,3 +398,57 @@ def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:
             "data.columns.spacing=null, or correct it"
         )
     return usual
+
+
+def by_pair(rows: Trajectories, dt: float, options: PairOptions) -> tuple[Reading, list[Record]]:
+    """Cut a pair where either is not there, or into windows without such a gap.
+
+    Args:
+        rows: of one pair, the follower's and then as many of the leader's.
+        dt: s, of the time grid; it begins at 0 where ``options.dt`` says it, otherwise with the
+            pair.
+
+    Returns:
+        Sequences named ``recording/sequence``, with a number behind where there are several, and
+        both records.
+
+    Raises:
+        ConfigError: a ``dt`` finer than the rows, or a ``window`` that is no whole number of steps.
+        DataError: a gap, where ``gaps=error``; or one agent twice at one time.
+    """
+    ((run, number), _), *_ = rows.parts("recording", "sequence")
+    name = f"{run}/{number}"
+    if options.dt is not None and dt < rows.dt * (1 - UNEVEN):
+        raise ConfigError(
+            f"data.dt={dt:g} s is finer than the {rows.dt:g} s of {rows.path}: pair {number}; "
+            "expected no more times than were measured"
+        )
+    grid = Grid(dt, 0.0 if options.dt is not None else float(rows.time.min()))
+    pair_records = records(rows, grid, fill=options.fill, smoothing=options.smooth)
+    vehicles = [Member(str(rows.agent[i]), i) for i in (0, len(rows) // 2)]
+    for record in pair_records:
+        vehicles[record.row >= len(rows) // 2].records.append(record)
+    parts = spans(vehicles)
+    if len(parts) > 1 and options.gaps is Gaps.error:
+        end, start = (grid.origin + dt * k for k in (parts[0][1], parts[1][0]))
+        row = int(np.argmin(np.where(rows.time >= start - dt / 2, rows.time, np.inf)))
+        raise DataError(
+            f"{rows.path}: pair {number} steps from {end:g} s to {start:g} s "
+            f"({rows.where(row)}), expected steps of {dt:g} s ({len(parts) - 1} such gaps); "
+            "data.gaps=cut cuts the pair there"
+        )
+    if options.window is not None:
+        steps = whole_steps("window", options.window, dt)
+        parts = [piece for part in parts for piece in windows(*part, steps)]
+    parts = [(a, b) for a, b in parts if b - a + 1 >= options.min_samples]
+    made = Reading(numbered_parts(name, rows, [vehicles] * len(parts), parts, grid, recording=run))
+    if not made:
+        times = f"data.min_samples={options.min_samples} times"
+        if len(rows) // 2 < options.min_samples:
+            why = f"fewer than {times}"
+        elif options.window is not None:
+            why = f"no data.window={options.window:g} s without a gap"
+        else:
+            why = f"no {times} without a gap"
+        made.left_out.append({"name": name, "why": why})
+    return made, pair_records

@@ -80,7 +80,9 @@ def raw_files(
     """
     dataset = options.name if options.name in download.FILES else default
     public = _matches(pattern, download.FILES[dataset])
-    local = _matches(pattern, _held(options.source, dataset))
+    source = options.source or os.environ.get(download.FOLDER_VARIABLE) or ""
+    folder = None if "://" in source or not source else Path(source).expanduser()
+    local = _matches(pattern, [] if folder is None else sorted(download.held(folder, dataset)))
     asked = wanted(options.recording)
     if asked is None:
         asked = public if set(public) & set(local) or not local else local
@@ -151,9 +153,9 @@ def tables_below(options: DataOptions, path: str, patterns: Iterable[str]) -> di
     if place.is_file():
         return {place.name: place}
     for pattern in patterns:
-        found = sorted(path for path in place.glob(pattern) if path.is_file())
-        if found:
-            return {path.relative_to(place).as_posix(): path for path in found}
+        files = sorted(path for path in place.glob(pattern) if path.is_file())
+        if files:
+            return {path.relative_to(place).as_posix(): path for path in files}
     raise DataError(
         f"data.path: the folder {place} holds no file like {' or '.join(patterns)} (data.files)"
         f"{_published(options.name)}"
@@ -172,14 +174,5 @@ def _published(name: str) -> str:
 
 
 def _matches(pattern: re.Pattern[str], names: Iterable[str]) -> list[str]:
-    found = (pattern.fullmatch(name) for name in names)
-    return [match.group(1) for match in found if match]
-
-
-def _held(source: str | None, dataset: str) -> list[str]:
-    """Names of the files in a local source folder and in its sub-folder of the data set."""
-    source = source or os.environ.get(download.FOLDER_VARIABLE)
-    if not source or "://" in source:
-        return []
-    places = [Path(source).expanduser(), Path(source).expanduser() / dataset]
-    return sorted({p.name for place in places if place.is_dir() for p in place.iterdir()})
+    matches = (pattern.fullmatch(name) for name in names)
+    return [match.group(1) for match in matches if match]

@@ -10,20 +10,27 @@ import gzip
 import math
 import zlib
 from array import array
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, cast
 from xml.parsers import expat
 
 import numpy as np
 
-from nnode.data.cut import Reading, by_lane, check_cutting
-from nnode.data.options import SumoOptions
+from nnode.data.cut import LaneOptions, Reading, by_lane, check_cutting
 from nnode.data.readers.recordings import table_path
 from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
 #: Lanes within a junction have names that begin with this sign.
 INTERNAL = ":"
+
+
+@dataclass
+class SumoOptions(LaneOptions):
+    """SUMO's floating car data (fcd-output, XML, also gzipped)."""
+
+    name: str = "sumo"
 
 
 def sumo_files(options: SumoOptions) -> dict[str, Path]:
@@ -178,8 +185,8 @@ class _Content:
             self.time.append(self.now)
             self.x.append(self._number(name, attributes, "pos"))
             for key, column in (("speed", self.speed), ("length", self.length)):
-                known = key in attributes
-                column.append(self._number(name, attributes, key) if known else math.nan)
+                given = key in attributes
+                column.append(self._number(name, attributes, key) if given else math.nan)
             self.line.append(self.parser.CurrentLineNumber)
 
     def _end(self, name: str) -> None:

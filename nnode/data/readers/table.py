@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from omegaconf import MISSING
 
 from nnode.data.cut import Reading, by_sequence
 from nnode.data.exits import destinations, exits_of, read_exits
-from nnode.data.options import TableOptions, check_known, wanted
-from nnode.data.readers.columns import Table, opened
+from nnode.data.options import DataOptions, check_known, wanted
+from nnode.data.readers.columns import ColumnOptions, Table, opened, table_rows
 from nnode.data.readers.recordings import natural, table_path
-from nnode.data.readers.vehicles import LENGTH_UNITS, table_rows
+from nnode.data.sequence import LENGTH_UNITS
 from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
@@ -23,6 +25,24 @@ _WALL = ("x1", "y1", "x2", "y2")
 
 #: Keys of the files of a table.
 TABLE, WALLS = "table", "walls"
+
+
+@dataclass
+class TableOptions(ColumnOptions, DataOptions):
+    """A user's own tidy table (CSV or Parquet), one row per sequence, time and agent.
+
+    ``columns`` names the table's columns by what they mean: ``sequence``, ``time``, ``agent``,
+    ``x``, and where they exist ``y``, ``length``, ``kind``, ``group``, ``dest_x``, ``dest_y``,
+    ``recording``. A column that bears the name of its meaning need not be listed; null leaves an
+    optional one out.
+    """
+
+    name: str = "table"
+    path: str = MISSING  # the table; relative to data.source where that is given
+    walls: str | None = None  # CSV with x1, y1, x2, y2 (m), the walkable side on the left
+    # {name: {line: [x1, y1, x2, y2], direction: +x, group: NAME}}, m: destinations on exit lines,
+    # in place of the columns dest_x, dest_y
+    exits: Any = None
 
 
 def table_files(options: TableOptions, table: Table | None = None) -> dict[str, Path | Table]:
@@ -44,7 +64,7 @@ def read_table(source: Path | Table, options: TableOptions, walls: Path | None =
 
     Returns:
         Sequences named ``recording/sequence``, in the order of their names, whatever that of the
-        rows. Samples that no row or an empty cell tells are filled where no more than ``fill`` s
+        rows. Samples without a row, or with an empty cell, are filled where no more than ``fill`` s
         are missing, and uneven times are interpolated, see
         :func:`nnode.data.trajectories.records`. A platoon is cut into the parts in which all its
         vehicles are there, with a number behind the name where there are several; where these are
@@ -65,9 +85,9 @@ def read_table(source: Path | Table, options: TableOptions, walls: Path | None =
         check_known(asked, rows.recording)
         rows = rows.at(np.flatnonzero(np.isin(rows.recording, asked)))
     segments = None if walls is None else _segments(walls)
-    found = by_sequence(rows, options, natural)
-    found[:] = [replace(s, walls=segments) for s in found]
-    return found
+    sequences = by_sequence(rows, options, natural)
+    sequences[:] = [replace(s, walls=segments) for s in sequences]
+    return sequences
 
 
 def _rows(table: Table, options: TableOptions) -> Trajectories:
@@ -118,14 +138,14 @@ def _goals(rows: Trajectories, options: TableOptions) -> np.ndarray:
     """``(R, 2)`` m, the destinations of people by their exits."""
     exits, goal = read_exits(options.exits), np.full_like(rows.x, np.nan)
     code = pd.DataFrame({"r": rows.recording, "s": rows.sequence, "a": rows.agent})
-    known = np.isfinite(rows.x).all(axis=1)
+    measured = np.isfinite(rows.x).all(axis=1)
     for numbers in code.groupby(["r", "s", "a"], sort=False).indices.values():
-        own = np.asarray(numbers)[np.argsort(rows.time[numbers], kind="stable")]
-        there = own[known[own]] if known[own].any() else own
-        start, end = rows.x[there[:1]], rows.x[there[-1:]]
-        group = None if rows.group is None else [str(rows.group[own[0]])]
-        chosen = exits_of(exits, start, end, [str(rows.agent[own[0]])], group)
-        goal[own] = destinations(chosen, start)
+        of_person = np.asarray(numbers)[np.argsort(rows.time[numbers], kind="stable")]
+        located = of_person[measured[of_person]] if measured[of_person].any() else of_person
+        start, end = rows.x[located[:1]], rows.x[located[-1:]]
+        group = None if rows.group is None else [str(rows.group[of_person[0]])]
+        chosen = exits_of(exits, start, end, [str(rows.agent[of_person[0]])], group)
+        goal[of_person] = destinations(chosen, start)
     return goal
 
 

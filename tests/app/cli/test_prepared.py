@@ -14,8 +14,10 @@ import pytest
 import nnode
 from nnode.app.cli.prepared import prepared_group
 from nnode.app.cli.typed import written
-from nnode.data.options import EsimasOptions, TableOptions, WalkwayOptions
 from nnode.data.prepare import FORMATS, prepare
+from nnode.data.readers.esimas import EsimasOptions
+from nnode.data.readers.jupedsim import WalkwayOptions
+from nnode.data.readers.table import TableOptions
 from nnode.errors import DataError
 from tests.discover.recorded import lane
 

@@ -15,9 +15,8 @@ from benchmarks.truths.crowd.catalogue import CATALOGUE, EFFECTS
 from benchmarks.truths.crowd.closure import crowd_costs
 from benchmarks.truths.crowd.replay import Windows, cost_by_sequence
 from benchmarks.truths.measure import closure
-from nnode.data.options import TableOptions
 from nnode.data.quality import find_faults
-from nnode.data.readers.table import read_table
+from nnode.data.readers.table import TableOptions, read_table
 
 
 def small(*effects: str, **options) -> Case:

@@ -16,9 +16,8 @@ from benchmarks.truths.case import TABLE, TRUTH
 from benchmarks.truths.traffic.case import TrafficCase
 from benchmarks.truths.traffic.catalogue import CATALOGUE, EFFECTS
 from benchmarks.truths.traffic.replay import cost_by_sequence
-from nnode.data.options import TableOptions
 from nnode.data.quality import find_faults
-from nnode.data.readers.table import read_table
+from nnode.data.readers.table import TableOptions, read_table
 from nnode.errors import ConfigError
 
 

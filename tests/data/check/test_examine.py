@@ -11,11 +11,14 @@ import pandas as pd
 import pytest
 
 import nnode
-from nnode.data.check.examine import Examination, examine, sure
+from nnode.data.check.examine import Examination, examine
 from nnode.data.check.recognise import recognised
-from nnode.data.options import PairOptions, VehicleTableOptions, WalkwayOptions
 from nnode.data.prepare import FORMATS
-from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
+from nnode.data.readers.jupedsim import WalkwayOptions
+from nnode.data.readers.pairs import PairOptions
+from nnode.data.readers.vehicles import VehicleTableOptions
+from nnode.data.sequence import LENGTH_UNITS, SPEED_UNITS
+from nnode.data.units import certainty
 from nnode.errors import ConfigError, DataError
 from tests.data.check.planted import cars, people, saved, text
 
@@ -38,7 +41,7 @@ def test_a_sound_table_is_read_with_the_options_that_are_told(tmp_path: Path) ->
     assert options.columns == {"vehicle": "veh", "time": "t", "speed": "v"}
     assert (options.position_unit, options.time_unit, options.speed_unit) == ("m", "s", "m/s")
     assert (options.direction, options.dt) == (1, 0.2)
-    assert sure(found.scale.probability) == "sure"
+    assert certainty(found.scale.probability) == "sure"
     kind = FORMATS[type(options)]
     (platoon,) = kind.read(kind.files(options), options)
     assert platoon.n_agents == 12
@@ -157,7 +160,7 @@ def test_cells_rows_and_holes(tmp_path: Path) -> None:
     assert "column 'x' (x) holds no number in 1 of" in wrong["cells"]
     assert "first 'oops' in line 102" in wrong["cells"]
     assert (
-        "2 rows have an agent and a time that stood there before (2 of them" in wrong["duplicates"]
+        "2 rows repeat the agent and the time of an earlier row (2 of them" in wrong["duplicates"]
     )
     assert "refuses it" in wrong["reader"]
     assert "the longest of 4.1 s" in said(found, "note")["holes"]
@@ -196,7 +199,7 @@ def test_people_in_centimetres_whose_rate_nobody_tells(tmp_path: Path) -> None:
 def test_a_wrong_rate_is_told_by_peoples_gait_alone(tmp_path: Path) -> None:
     head = "# framerate: 30 fps\n# id frame x/m y/m z/m\n"
     text_ = said(examine(text(people(), tmp_path, head)))["time_scale"]
-    walk = re.search(r"at the 30 frames/s that are told, people walk ([\d.]+) m/s", text_)
+    walk = re.search(r"at the stated 30 frames/s, people walk ([\d.]+) m/s", text_)
     assert walk is not None
     assert float(walk[1]) == pytest.approx(1.3 * 30 / 16, rel=0.1)
     assert "16 frames/s fit" in text_ or "15 frames/s fit" in text_
@@ -215,7 +218,7 @@ def test_the_copied_eth_set_and_its_rate(tmp_path: Path) -> None:
     assert found.meanings["agent"].column == "column 2"
     assert found.meanings["y"].column == "column 5"
     text_ = said(found)["time_scale"]
-    assert "at the 25 frames/s that are told, people walk 2.4" in text_
+    assert "at the stated 25 frames/s, people walk 2.4" in text_
     assert "its own velocities say 1.4" in text_
     assert "15 frames/s fit" in text_
     # and the file that would be read says so

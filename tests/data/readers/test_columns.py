@@ -10,13 +10,12 @@ import pandas as pd
 import pytest
 
 import nnode
-from nnode.data.options import NgsimOptions, OpenAccOptions, SumoOptions, VehicleTableOptions
 from nnode.data.readers.columns import Table, floats
-from nnode.data.readers.ngsim import read_ngsim
-from nnode.data.readers.openacc import read_openacc
+from nnode.data.readers.ngsim import NgsimOptions, read_ngsim
+from nnode.data.readers.openacc import OpenAccOptions, read_openacc
 from nnode.data.readers.recordings import reading
-from nnode.data.readers.sumo import read_sumo
-from nnode.data.readers.vehicles import read_vehicles
+from nnode.data.readers.sumo import SumoOptions, read_sumo
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.errors import ConfigError, DataError
 
 

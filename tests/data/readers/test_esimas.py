@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
-from nnode.data.options import EsimasOptions
-from nnode.data.readers.esimas import esimas_files, read_esimas
+from nnode.data.readers.esimas import EsimasOptions, esimas_files, read_esimas
 from nnode.errors import ConfigError, DataError
 
 

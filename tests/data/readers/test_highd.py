@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.data.options import Faults, HighDOptions
+from nnode.data.options import Faults
 from nnode.data.prepare import prepare
-from nnode.data.readers.highd import highd_files, read_highd
+from nnode.data.readers.highd import HighDOptions, highd_files, read_highd
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 

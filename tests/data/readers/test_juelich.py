@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nnode.data.options import JuelichOptions, Velocity
-from nnode.data.readers.juelich import juelich_files, read_juelich
+from nnode.data.readers.juelich import JuelichOptions, Velocity, juelich_files, read_juelich
 from nnode.errors import ConfigError, DataError
 
 HEADER = "# framerate: 25 fps\n# id frame x/cm y/cm z/cm\n"

@@ -14,9 +14,16 @@ import shapely
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nnode.data.options import Faults, WalkwayOptions
+from nnode.data.options import Faults
 from nnode.data.prepare import prepare
-from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, read_walkway, walkway_files, walls_of
+from nnode.data.readers.jupedsim import (
+    GEOMETRY,
+    PEOPLE,
+    WalkwayOptions,
+    read_walkway,
+    walkway_files,
+    walls_of,
+)
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 

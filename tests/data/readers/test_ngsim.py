@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.data.options import Agents, NgsimOptions, VehicleTableOptions
+from nnode.data.options import Agents
 from nnode.data.prepare import prepare
-from nnode.data.readers.ngsim import read_ngsim
-from nnode.data.readers.vehicles import read_vehicles
+from nnode.data.readers.ngsim import NgsimOptions, read_ngsim
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.errors import ConfigError, DataError
 from tests.data.readers.ngsim_file import COLUMNS, FOOT, STREET, period, published, quarter
 

@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 
 from nnode.data import download
-from nnode.data.options import Agents, OpenAccOptions
+from nnode.data.options import Agents
 from nnode.data.prepare import prepare
-from nnode.data.readers.openacc import find_laps, openacc_files, read_openacc
+from nnode.data.readers.openacc import OpenAccOptions, find_laps, openacc_files, read_openacc
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 

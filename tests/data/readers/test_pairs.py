@@ -13,10 +13,10 @@ from scipy.integrate import cumulative_trapezoid
 
 from nnode.data.clusters import clusters, index_of
 from nnode.data.cut import Reading
-from nnode.data.options import Gaps, PairOptions, SplitMode, SplitOptions
+from nnode.data.options import SplitMode, SplitOptions
 from nnode.data.prepare import prepare
 from nnode.data.quality import find_faults
-from nnode.data.readers.pairs import pair_files, read_pairs
+from nnode.data.readers.pairs import Gaps, PairOptions, pair_files, read_pairs
 from nnode.data.sequence import Sequence
 from nnode.data.split import split
 from nnode.errors import ConfigError, DataError

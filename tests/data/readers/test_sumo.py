@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nnode.data.options import Faults, SumoOptions
+from nnode.data.options import Faults
 from nnode.data.prepare import prepare
-from nnode.data.readers.sumo import read_sumo, sumo_files
+from nnode.data.readers.sumo import SumoOptions, read_sumo, sumo_files
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError, NNodeError
 

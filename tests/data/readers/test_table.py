@@ -9,9 +9,8 @@ import pandas as pd
 import pytest
 
 from nnode.data.cut import Reading
-from nnode.data.options import TableOptions
 from nnode.data.quality import find_faults
-from nnode.data.readers.table import read_table, table_files
+from nnode.data.readers.table import TableOptions, read_table, table_files
 from nnode.errors import ConfigError, DataError
 
 

@@ -121,11 +121,12 @@ def test_seconds_stay_as_they_are() -> None:
 
 
 def test_short_sequences_since_1970_have_one_interval() -> None:
-    """Seconds since 1970 are rounded to 2e-7 s: three samples would give intervals that differ."""
+    """Seconds since 1970 are rounded to 2e-7 s: intervals of 0.02 s would differ by 1e-5."""
     parts = []
     for i in range(20):
         rows = drive()[drive().time < 0.5]
-        parts.append(rows.assign(sequence=f"s{i}", time=rows.time + 7.3 * i))
+        time = rows.time / 10 + 7.31 * i
+        parts.append(rows.assign(sequence=f"s{i}", time=time, x=rows.x / 10))
     table = pd.concat(parts)
     epoch = table.assign(time=(1_577_865_600_000 + 1000 * table.time).round().astype("int64"))
     assert len(sequences(epoch, time_unit="ms")) == 20

@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.data.options import VehicleTableOptions
-from nnode.data.readers.vehicles import read_vehicles, vehicle_files
+from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles, vehicle_files
 from nnode.errors import ConfigError, DataError
 
 

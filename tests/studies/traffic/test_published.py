@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from nnode.calibrate.cost import sequence_costs
-from nnode.data.options import EsimasOptions, Faults
+from nnode.data.options import Faults
 from nnode.data.prepare import prepare
+from nnode.data.readers.esimas import EsimasOptions
 from nnode.model.build import build_model
 from nnode.model.system import System
 from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver

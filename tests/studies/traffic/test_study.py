@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.data.options import EsimasOptions, Faults
+from nnode.data.options import Faults
 from nnode.data.prepare import prepare
+from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.sequence import Sequence
 from nnode.data.store import write_store
 from nnode.errors import ConfigError

@@ -17,35 +17,12 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from nnode.data.readers.vehicles import LENGTH_UNITS, SPEED_UNITS
-from nnode.data.sequence import TIME_UNITS, Domain
+from nnode.data.limits import AGREE, INTERVAL, SWAYS, USUAL, Domain
+from nnode.data.sequence import LENGTH_UNITS, SPEED_UNITS, TIME_UNITS
 from nnode.data.trajectories import Trajectories
 
 #: Frame rates of cameras and of published files, 1/s, the usual ones first: they win ties.
 RATES = (25.0, 30.0, 10.0, 16.0, 15.0, 50.0, 60.0, 20.0, 24.0, 29.97, 12.5, 5.0, 2.5)
-
-
-@dataclass(frozen=True)
-class Range:
-    """Where a median lies, and by what factor (its logarithm's standard deviation) it may miss it.
-
-    Attributes:
-        low, high: SI units.
-        spread: of the logarithm.
-        source: in words.
-    """
-
-    low: float
-    high: float
-    spread: float
-    source: str
-
-    def score(self, value: float) -> float:
-        """Logarithm of the likelihood, 0 within; at least -12: one median shall not decide all."""
-        if not (value > 0 and math.isfinite(value)):
-            return 0.0
-        away = max(math.log(self.low / value), math.log(value / self.high), 0.0) / self.spread
-        return max(-0.5 * away**2, -12.0)
 
 
 #: How sure something is, by its probability.
@@ -53,47 +30,7 @@ SURE, LIKELY = 0.95, 0.7
 #: A rate that is no less probable than this fits.
 FAIR = 0.05
 
-#: What is usual, by domain and quantity.
-USUAL: dict[Domain, dict[str, Range]] = {
-    "crowd": {
-        "speed": Range(
-            0.2,
-            1.6,
-            0.19,
-            "free walking 1.34 ± 0.26 m/s (Weidmann 1993), less in a crowd",
-        ),
-        "nearest": Range(
-            0.4,
-            6.0,
-            0.3,
-            "5.4 people on a square metre at most (Weidmann 1993), 0.43 m from each other",
-        ),
-        "sway": Range(
-            0.8,
-            1.08,
-            0.08,
-            "people sway once in two steps, of which they make 2.0 ± 0.13 in a second (MacDougall "
-            "& Moore 2005), 1.6 in a dense crowd",
-        ),
-    },
-    "traffic": {
-        "speed": Range(1.0, 42.0, 0.2, "from a jam to 150 km/h"),
-        "nearest": Range(
-            5.5,
-            120.0,
-            0.25,
-            "a car's length and the gap of standing cars (Treiber & Kesting 2013: 2 m); at most "
-            "about 5 s behind at 25 m/s",
-        ),
-        "length": Range(3.5, 7.0, 0.12, "cars are 3.5 to 5 m long; up to half trucks"),
-    },
-}
-#: s; sampled more coarsely, people's sway does not show.
-SWAYS = 1 / 3
-INTERVAL = Range(0.02, 1.0, 0.4, "recordings take 1 to 50 samples in a second")
-#: How near speeds in a file are to those of its positions; beyond, one of them is wrong.
-AGREE = Range(0.995, 1.005, 0.025, "two measurements of one motion")
-#: What units are expected at all, without a name that tells: most data are in SI units.
+#: Prior weights of units where no column's name has one: most data are in SI units.
 _BEFORE = {
     "m": 1.0,
     "cm": 0.1,
@@ -131,7 +68,7 @@ LAG = 10
 
 
 @dataclass(frozen=True)
-class Moves:
+class Displacements:
     """Displacements.
 
     Attributes:
@@ -145,7 +82,7 @@ class Moves:
     took: np.ndarray
 
 
-def moves_of(rows: Trajectories, lag: int = LAG) -> Moves:
+def displacements(rows: Trajectories, lag: int = LAG) -> Displacements:
     """Displacements over ``lag`` unbroken samples of rows in order; over fewer where no agent has
     so many."""
 
@@ -160,7 +97,7 @@ def moves_of(rows: Trajectories, lag: int = LAG) -> Moves:
         first = unbroken(min(lag, len(rows)))
     last = first + lag
     size = np.linalg.norm(rows.x[last] - rows.x[first], axis=1)
-    return Moves(first, last, size, rows.time[last] - rows.time[first])
+    return Displacements(first, last, size, rows.time[last] - rows.time[first])
 
 
 @dataclass(frozen=True)
@@ -236,8 +173,8 @@ class Scale:
 
 
 def medians(rows: Trajectories, domain: Domain) -> Medians:
-    """What the scale is told by, of rows in order."""
-    moves = moves_of(rows)
+    """The medians of rows in order by which the scale is recognised."""
+    moves = displacements(rows)
     speed = ratio = float("nan")
     if moves.size.size:
         each = moves.size / moves.took
@@ -302,7 +239,7 @@ def _length(x: np.ndarray) -> float:
     return float(np.hypot(*np.diff(parts, axis=0).T).sum())
 
 
-def _ratio(rows: Trajectories, moves: Moves, moving: np.ndarray) -> float:
+def _ratio(rows: Trajectories, moves: Displacements, moving: np.ndarray) -> float:
     """Median over displacements of how far it was, by how far speed times time says."""
     if rows.v is None:
         return float("nan")
@@ -344,9 +281,9 @@ def scales(
 
     Args:
         measured: medians by the domains that come into question.
-        stated: units by ``position``, ``time``, ``speed`` as the file tells them.
-        frames: whether times may be frames; then they are where ``told`` says so.
-        rate: frames per second as the file or the user tells.
+        stated: units by ``position``, ``time``, ``speed`` as the file states them.
+        frames: whether times may be frames; then they are where ``stated`` says so.
+        rate: frames per second that the file or the user states.
         speeds: whether the file has speeds.
     """
     scored = []
@@ -370,6 +307,18 @@ def scales(
     return [
         Scale(**{**vars(scored[i][1]), "probability": float(weights[i])}) for i in order.tolist()
     ]
+
+
+def share(every: list[Scale]) -> float:
+    """Probability of the first one's units, whatever the rate of frames."""
+    return sum(scale.probability for scale in every if scale.units == every[0].units)
+
+
+def certainty(probability: float) -> str:
+    """A probability in words."""
+    if probability >= SURE:
+        return "sure"
+    return "likely" if probability >= LIKELY else "a guess"
 
 
 def _times(frames: bool, rate: float | None) -> Iterator[tuple[str, float | None]]:
