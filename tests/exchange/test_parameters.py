@@ -173,7 +173,7 @@ def test_a_law_with_another_formula_is_none_of_sumo_s() -> None:
     assert not has_type(system)
     beside = law_from("idm", CAR_FOLLOWING_LAWS["idm"], network=4)
     assert not has_type(Traffic([beside], leader="measured"))
-    with pytest.raises(ConfigError, match=r"neither idm nor krauss.*drive\.py"):
+    with pytest.raises(ConfigError, match=r"neither idm nor krauss.*nnode drive"):
         sumo_type(system, "x", 15.0, None)
 
 
@@ -230,7 +230,7 @@ def test_no_gap_at_the_recorded_speed(speed: float) -> None:
     [crowd(), Traffic([make_law("network_speed", hidden=4)])],
 )
 def test_sumo_knows_no_other_model(model: System) -> None:
-    with pytest.raises(ConfigError, match=r"to=sumo: .* nor a law with a gap at rest.*drive\.py"):
+    with pytest.raises(ConfigError, match=r"to=sumo: .* nor a law with a gap at rest.*nnode drive"):
         sumo_type(model, "x", 15.0, None)
 
 
