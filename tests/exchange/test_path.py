@@ -81,7 +81,7 @@ def scenario(sumo: Path, folder: Path) -> None:
 def commands() -> list[list[str]]:
     """The words of the README's commands, in their order."""
     page = (ROOT / "README.md").read_text(encoding="utf-8")
-    (text,) = re.findall(r"^## From a table to SUMO\n.*?^```sh\n(.*?)^```", page, re.M | re.S)
+    (text,) = re.findall(r"^### SUMO, JuPedSim, PedPy\n.*?^```sh\n(.*?)^```", page, re.M | re.S)
     return [shlex.split(line, comments=True) for line in text.splitlines()]
 
 
