@@ -199,16 +199,19 @@ def test_costs_do_not_rise_from_one_step_of_the_training_loop_to_the_next() -> N
 @pytest.mark.thorough
 def test_noise_of_0_3_m_does_not_bias_what_is_fitted_by_default() -> None:
     table = noisy(0.3)
-    own = nnode.Calibrator("idm", leader="measured", method="rk4").fit(table)
-    estimate = own.parameters_["estimate"]
     wanted = {"v0": 30.0, "T": 1.4, "s0": 2.0, "a": 1.2, "b": 1.5}
-    for name, value in wanted.items():
-        assert estimate[f"idm.{name}"] == pytest.approx(value, rel=0.1), name
-    assert own.result_.noise.position == pytest.approx(0.3, rel=0.1)
-    assert own.result_.start_speeds["kind"] == "fitted"
-    assert "speeds are those of smoothed paths" in own.result_.summary()
+    for drivers, kind in ((None, "fitted to each driver"), ("none", "fitted")):
+        own = nnode.Calibrator("idm", leader="measured", method="rk4", drivers=drivers).fit(table)
+        estimate = own.parameters_["estimate"]
+        for name, value in wanted.items():
+            assert estimate[f"idm.{name}"] == pytest.approx(value, rel=0.1), (name, kind)
+        assert own.result_.noise.position == pytest.approx(0.3, rel=0.1)
+        assert own.result_.start_speeds["kind"] == kind
+        assert "speeds are those of smoothed paths" in own.result_.summary()
     given = [replace(s, v=np.maximum(s.velocity(), 0.0)) for s in table]
-    raw = nnode.Calibrator("idm", leader="measured", method="rk4", start_speeds="given").fit(given)
+    raw = nnode.Calibrator(
+        "idm", leader="measured", method="rk4", start_speeds="given", drivers="none"
+    ).fit(given)
     away = raw.parameters_["estimate"] / np.array(list(wanted.values())) - 1
     assert away.abs().max() > 0.1
     assert "estimates are biased" in raw.result_.summary()
