@@ -86,7 +86,7 @@ def platoons(
     gap = gap * rng.uniform(0.9, 1.2, shape)
     x = rng.uniform(0, 300, (number, 1)) - np.insert(gap.cumsum(1), 0, 0.0, 1)
     v, push = np.repeat(mean, vehicles, 1), PUSH[law] * rng.normal(size=shape)
-    keep, late = np.exp(-STEP / LASTS), round(sizes.get("reaction_delay", 0.0) / STEP)
+    late = round(sizes.get("reaction_delay", 0.0) / STEP)
     mood, kick = np.zeros(shape), np.zeros((number, vehicles))
     past: list[tuple[np.ndarray, np.ndarray]] = []
     slow, rows = np.repeat(mean, vehicles - 1, 1), []
@@ -101,7 +101,7 @@ def platoons(
         at, speed = past[0] if late else (x, v)
         wish = v0.copy()
         if nature == "moods":
-            mood = _lasting(rng, mood, 30.0)
+            mood = _next(mood, rng.normal(size=shape), STEP, 30.0)
             wish = v0 * np.exp(0.08 * mood)
         if "speed_zone" in sizes:
             wish[(x[:, 1:] > ZONE[0]) & (x[:, 1:] < ZONE[1])] *= sizes["speed_zone"]
@@ -124,7 +124,7 @@ def platoons(
         shock = rng.normal(size=shape)
         if nature == "heavy":
             shock = rng.standard_t(4, size=shape) / np.sqrt(2.0)
-        push = keep * push + PUSH[law] * np.sqrt(1 - keep**2) * shock
+        push = _next(push, shock, STEP, LASTS, PUSH[law])
     return _table(law, np.array(rows))
 
 
@@ -144,16 +144,22 @@ def _factors(
     )
 
 
-def _lasting(rng: np.random.Generator, now: np.ndarray, lasts: float) -> np.ndarray:
-    """The next value, one step later, of something of variance 1 that lasts so many s."""
-    keep = np.exp(-STEP / lasts)
-    return np.asarray(keep * now + np.sqrt(1 - keep**2) * rng.normal(size=now.shape))
+def _next(
+    now: np.ndarray, shock: np.ndarray, step: float, lasts: float, size: float = 1.0
+) -> np.ndarray:
+    """The next value, ``step`` s later, of what lasts for some s and has a standard deviation.
+
+    Args:
+        shock: standard normal numbers. size: the standard deviation.
+    """
+    keep = np.exp(-step / lasts)
+    return np.asarray(keep * now + size * np.sqrt(1 - keep**2) * shock)
 
 
 def _error(rng: np.random.Generator, before: np.ndarray, nature: str) -> np.ndarray:
-    """The error of the next sample, of variance 1."""
-    keep = np.exp(-DT) if nature == "lasting" else 0.0
-    return np.asarray(keep * before + np.sqrt(1 - keep**2) * rng.normal(size=before.shape))
+    """The error of the next sample, of standard deviation 1."""
+    shock = rng.normal(size=before.shape)
+    return _next(before, shock, DT, 1.0) if nature == "lasting" else shock
 
 
 def _wanted(x: np.ndarray, v0: np.ndarray, sizes: dict[str, float]) -> np.ndarray:

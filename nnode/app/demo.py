@@ -18,13 +18,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from hydra import compose, initialize_config_dir
 from omegaconf import open_dict
 from scipy.optimize import least_squares
 
 import nnode
 from nnode.app.cli.runs import RESULT
-from nnode.app.cli.saved import GROUPS
+from nnode.app.cli.saved import GROUPS, composed
 from nnode.app.python.report import Report
 from nnode.app.train import train
 from nnode.config import register
@@ -45,7 +44,6 @@ from nnode.pages.page import (
     write_page,
 )
 from nnode.plots import force_figure, measured_gaps, speed_curves
-from nnode.program import configuration
 from nnode.simulation.base import DEFAULT_STEP
 
 #: Steps of Euler's scheme of the compared calibrations, s: the paper's, and ten times that.
@@ -82,7 +80,7 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
     calibration = _calibration(raw["nothing_hidden"], truth, folder)
     _step("4/6 What does the law lack? A slow zone is hidden")
     report = _diagnosed(raw["table"], folder / "diagnosis")
-    found = _found(report, truth)
+    lacking = _lacking(report, truth)
     _step("5/6 The same table with nothing hidden")
     nothing = _diagnosed(raw["nothing_hidden"], None)
     absent = _absent(nothing)
@@ -96,10 +94,10 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
             *data,
             *checked,
             *calibration,
-            *found,
+            *lacking,
             *absent,
             *crowd,
-            *_own(folder),
+            *_own_table(),
             Provenance({**facts, "Seed of the data": f"{seed}", "Time": f"{seconds:.0f} s"}),
         ],
         folder,
@@ -352,7 +350,7 @@ def _diagnosed(path: Path, folder: Path | None) -> Report:
     return report
 
 
-def _found(report: Report, truth: SlowZone) -> list[Block]:
+def _lacking(report: Report, truth: SlowZone) -> list[Block]:
     d, gap = report.diagnosis, report.gap
     hidden = {"alpha": truth.alpha, "a": truth.a, "b": truth.b}
     zone = next((one for one in report.effects if one.name == "speed_zone"), None)
@@ -425,8 +423,8 @@ def _found(report: Report, truth: SlowZone) -> list[Block]:
 
 
 def _absent(report: Report) -> list[Block]:
-    words = f"{report.sentence} {_missed(report)}"
-    print(_missed(report))
+    missed = _missed(report)
+    print(missed)
     rows = [
         {
             "effect": one.name,
@@ -439,7 +437,7 @@ def _absent(report: Report) -> list[Block]:
     ]
     return [
         Heading("The same table with nothing hidden"),
-        Text(words),
+        Text(f"{report.sentence} {missed}"),
         TableBlock(
             "absences",
             pd.DataFrame(rows),
@@ -477,8 +475,7 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
         f"data.source={path.parents[1].absolute()}",
         f"trainer.max_epochs={epochs}",
     ]
-    with initialize_config_dir(str(configuration().absolute()), version_base="1.3"):
-        config = compose("train", words, return_hydra_config=True)
+    config = composed("train", words)
     with open_dict(config):
         groups = config.pop("hydra").runtime.choices
         config.groups = {name: groups[name] for name in GROUPS}
@@ -512,7 +509,7 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
     ]
 
 
-def _own(folder: Path) -> list[Block]:
+def _own_table() -> list[Block]:
     return [
         Heading("Your own table"),
         Text(

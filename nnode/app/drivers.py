@@ -61,7 +61,8 @@ def planned(
     if given is None:
         if not exact or model.order == 1 or options.pooling is not Pooling.pooled:
             return NONE
-        able = obstacle(model, sequences()) is None and drivers_differ(model, sequences())
+        training = sequences()
+        able = obstacle(model, training) is None and drivers_differ(model, training)
         return None if able else NONE
     if given != AUTO and not _names(given):
         raise ConfigError(

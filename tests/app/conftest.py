@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from benchmarks.config import register
+from nnode.app.cli import saved
 from nnode.data.synthetic import demo_data
 from tests.app.forked import Forks
 
@@ -59,8 +59,7 @@ def composed(name: str, *words: str) -> DictConfig:
         )
     ]
     register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(name, first, return_hydra_config=True)
+    return saved.composed(name, first)
 
 
 def environment() -> dict[str, str]:

@@ -13,7 +13,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
-from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -32,6 +31,7 @@ from omegaconf.errors import (
     ValidationError,
 )
 
+from nnode.app.cli.saved import composed
 from nnode.errors import ConfigError
 from nnode.program import configuration
 
@@ -280,8 +280,7 @@ def _composed(name: str, overrides: list[str], flags: list[str]) -> DictConfig |
             kept.append(f"hydra.searchpath=[file://{Path(flag).absolute()}]")
     try:
         GlobalHydra.instance().clear()
-        with initialize_config_dir(str(configuration().absolute()), version_base="1.3"):
-            return compose(name, kept, return_hydra_config=True)
+        return composed(name, kept)
     except Exception:  # a second mistake: it is told when the first one is mended
         return None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, cast
 
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -14,7 +15,7 @@ from nnode.config import choices
 from nnode.data.options import with_present_names
 from nnode.errors import CheckpointError, ConfigError
 from nnode.model.laws import CAR_FOLLOWING_LAWS
-from nnode.program import own_choices
+from nnode.program import configuration, own_choices
 
 GROUPS = ("model", "data", "optimizer", "solver")
 
@@ -26,6 +27,12 @@ _chosen: set[str] = set()
 def in_hydra() -> bool:
     """Whether Hydra runs now; a job that has ended leaves its configuration behind."""
     return HydraConfig.initialized() and GlobalHydra.instance().is_initialized()
+
+
+def composed(name: str, overrides: list[str]) -> DictConfig:
+    """The configuration of a command with some overrides, Hydra's part with it."""
+    with initialize_config_dir(str(configuration().absolute()), version_base="1.3"):
+        return compose(name, overrides, return_hydra_config=True)
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +76,7 @@ class Candidate:
 
 
 def calibrated(
-    engine: Engine, before: Fit, score: Score, hopeless: float, hints: list[System] | None = None
+    engine: Engine, before: Fit, score: Score, hopeless: float, hints: Sequence[System] = ()
 ) -> Fit:
     """Calibrate the model with one more effect, from the score's settings and from hints.
 
@@ -88,7 +89,7 @@ def calibrated(
     """
     system, place = extended(before.system, score.effect(**score.options))
     fits = []
-    for start in (system, *(hints or [])):
+    for start in (system, *hints):
         try:
             fits.append(refine(engine, start, tolerance=ROUGH, hopeless=hopeless))
         except SimulationError:

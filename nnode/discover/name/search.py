@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -117,7 +117,7 @@ def search(
     variables: list[Variable] | None = None,
     levels: dict[str, np.ndarray] | None = None,
     within: Callable[[float], None] = lambda part: None,
-    hints: list[System] | None = None,
+    hints: Sequence[System] = (),
 ) -> Selection:
     """Add effects until none passes, then eliminate those that are not needed.
 
@@ -147,7 +147,7 @@ def search(
         selection.first = selection.first or selection.scores
         if len(selection.steps) >= max_effects:
             break
-        step = _next_step(engine, selection, alpha, hints or [])
+        step = _next_step(engine, selection, alpha, hints)
         if step is None:
             break
         if _curve_predicts_better(engine, selection.fit, step.chosen, variables or []):
@@ -222,7 +222,7 @@ def _columns(columns: dict[int, np.ndarray], _: Engine, fit: Fit) -> np.ndarray:
 
 
 def _next_step(
-    engine: Engine, selection: Selection, alpha: float, hints: list[System]
+    engine: Engine, selection: Selection, alpha: float, hints: Sequence[System]
 ) -> Step | None:
     """The best effect that passes all tests, with its rivals; None if no effect passes."""
     scores, screen = selection.scores, selection.screen
@@ -262,7 +262,7 @@ def _ranked(
     engine: Engine,
     selection: Selection,
     ranked: list[Score],
-    hints: list[System],
+    hints: Sequence[System],
     significant: bool,
 ) -> list[Candidate]:
     """The candidates calibrated with the model, the best first; none if the model fits exactly.
@@ -334,7 +334,7 @@ def apart_at(first: Candidate, second: Candidate) -> float:
     )
 
 
-def _hinted(hints: list[System], system: System, name: str) -> list[System]:
+def _hinted(hints: Sequence[System], system: System, name: str) -> list[System]:
     """Hints that contain all effects of a model and one more, each without its other effects."""
     required, starts = {effect.name for effect in effects_of(system)} | {name}, []
     for hint in hints:
