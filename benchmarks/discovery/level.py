@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from benchmarks.discovery.task import ERROR
-from benchmarks.truths.score import LEADS, LEVEL, UNKNOWN
+from benchmarks.truths.score import LEVEL, UNKNOWN
 
 #: A gate keeps its level where the one-sided test against it is not rejected at this probability.
 REJECTED = 0.025
@@ -42,7 +42,7 @@ def level(frame: pd.DataFrame) -> pd.DataFrame:
                 "first screen, p": above(screened),
                 "final names": int(names.sum()),
                 "final names, p": above(names),
-                "unconfirmed": int((part["verdict"] == LEADS).sum()),
+                "hypotheses": int((part["leads"] != "").sum()),
                 "unknown": int((part["verdict"] == UNKNOWN).sum()),
                 "not testable": int((part["verdict"] == "not_testable").sum()),
             }

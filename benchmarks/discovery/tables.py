@@ -8,7 +8,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from benchmarks.discovery.criteria import OTHER, headline
-from benchmarks.truths.score import LEADS, UNKNOWN
+from benchmarks.truths.score import UNKNOWN
 
 
 def frame_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
@@ -48,7 +48,7 @@ def by_arm(frame: pd.DataFrame) -> pd.DataFrame:
                 "right": 100 * part["right"].mean(),
                 "95 %": interval(part["right"]),
                 "any false name": 100 * (part["false_names"] != "").mean(),
-                "unconfirmed": 100 * (part["verdict"] == LEADS).mean(),
+                "hypotheses": 100 * (part["leads"] != "").mean(),
                 "unknown": 100 * part["unknown"].mean(),
                 "false faults": 100 * (part["faults_false"] > 0).mean(),
                 "failed": 100 * (part["failure"] != "").mean(),
@@ -69,7 +69,7 @@ def by_effect(frame: pd.DataFrame) -> pd.DataFrame:
                 "exact": 100 * part["exact"].astype(float).mean(),
                 "among equals": 100 * part["among_equals"].astype(float).mean(),
                 "right class": 100 * part["class_right"].astype(float).mean(),
-                "unconfirmed, exact": 100 * part["lead_exact"].astype(float).mean(),
+                "hypothesis, exact": 100 * part["lead_exact"].astype(float).mean(),
                 "any false name": 100 * (part["false_names"] != "").mean(),
                 "unknown": 100 * part["unknown"].mean(),
                 "nothing named": 100 * (part["named"] == "nothing").mean(),
@@ -105,9 +105,7 @@ def confusion(frame: pd.DataFrame, domain: str) -> pd.DataFrame:
     part = headline(frame[frame["domain"] == domain])
     part = part[part["arm"].isin(["single", "nothing", "outside"]) & ~part["strength"].isin(OTHER)]
     first = part["named"].str.split("+").str[0]
-    first = first.where(
-        (first != "nothing") | ~part["verdict"].isin([UNKNOWN, LEADS]), part["verdict"]
-    )
+    first = first.where((first != "nothing") | ~(part["verdict"] != UNKNOWN), part["verdict"])
     hidden = part["hidden"].where(part["arm"] != "outside", "(" + part["hidden"] + ")")
     table = pd.crosstab(hidden, first, normalize="index")
     rows = list(dict.fromkeys(hidden))

@@ -8,7 +8,7 @@ from typing import Any
 from benchmarks.truths.measure import Measures, closure, coefficient_rows, located_faults, overlap
 
 #: Verdicts; under every other one the effects of a report are names.
-NAMED, EQUALS, LEADS, UNKNOWN = "named", "indistinguishable", "unconfirmed", "unknown"
+NAMED, EQUALS, UNKNOWN = "named", "indistinguishable", "unknown"
 #: Error probability that each gate of a diagnosis states.
 LEVEL = 0.05
 
@@ -33,7 +33,7 @@ def score(
           or where these data cannot show it;
         * ``among_equals``: the verdict is ``indistinguishable``, and the hidden effects are those
           that are listed, or among their equals; None as above;
-        * ``lead_exact``: the same as ``exact`` for the leads of ``unconfirmed``;
+        * ``lead_exact``: the same as ``exact`` for the leads, if nothing is named;
         * ``class_right``: under these two verdicts, names and hidden effects match one to one
           within their classes, or as equals;
         * ``found``: so many of the hidden effects are named;
@@ -76,7 +76,7 @@ def score(
     measured: dict[str, bool | None] = {
         "exact": verdict == NAMED and exactly(names),
         "among_equals": verdict == EQUALS and matched(lambda n, t: t in equals[n]),
-        "lead_exact": verdict == LEADS and exactly(leads),
+        "lead_exact": not names and exactly(leads),
         "class_right": verdict in (NAMED, EQUALS)
         and matched(lambda n, t: t in equals[n] or akin(n, t)),
     }
@@ -142,9 +142,8 @@ def _gap(truth: dict[str, Any], report: dict[str, Any]) -> Measures:
     return {
         "before": before,
         "after": after,
-        # a model to which nothing was added is as good as before, to rounding; what was not
-        # confirmed is not handed over
-        "worse": bool(after > before * (1 + 1e-9)) and report["verdict"] != LEADS,
+        # a model to which nothing was added is as good as before, to rounding
+        "worse": bool(after > before * (1 + 1e-9)),
         "closure": closure(truth, report),
     }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import time
 from dataclasses import dataclass, replace
 from itertools import count
@@ -52,6 +51,7 @@ from nnode.discover.result import (
     Verdict,
 )
 from nnode.discover.rules import applied, rules
+from nnode.discover.statistics.combination import least_confirmation
 from nnode.discover.statistics.power import PowerSimulation
 from nnode.discover.statistics.random_effects import IndividualEstimate, estimate_individual
 from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
@@ -178,6 +178,7 @@ def _diagnosed(
         [sequences[i] for i in division.confirmation],
         division.label[division.confirmation],
         numbers.sealed,
+        options.alpha,
         options.seed,
     )
     kinds = [effect for effect in offered if issubclass(effect, IndividualEffect)]
@@ -185,9 +186,8 @@ def _diagnosed(
     selection, unconfirmed = confirmation.confirmed(engine, selection)
     unexplained = _unexplained(exploration, selection)
     assert selection.screen is not None
-    absent_effects = absences(
-        selection, PowerSimulation(selection.screen, options.alpha, numbers.sealed)
-    )
+    power = PowerSimulation(selection.screen, options.alpha, numbers.sealed if testable else 0)
+    absent_effects = absences(selection, power)
     corrected = confirmation.corrected(selection)
     if unconfirmed:
         # an unconfirmed effect that was removed could otherwise show as a difference of agents
@@ -214,7 +214,10 @@ def _diagnosed(
     removed_share = 1 - square_of(engine, selection.fit.system) / square_of(engine, base_system)
     tests = confirmation.tests
     effects_named = [
-        *(named(engine, corrected, s, tests[s.chosen.name].p_value) for s in selection.steps),
+        *(
+            named(engine, corrected, step, test.confirmation, test.p_value)
+            for step, test in ((step, tests[step.chosen.name]) for step in selection.steps)
+        ),
         *(
             named_agents(estimate, agent.confirmed, system.order)
             for estimate, agent in tested
@@ -236,7 +239,6 @@ def _diagnosed(
             unexplained,
             removed_share,
             bool(named_individuals),
-            bool(hypotheses),
             testable,
             bool(imitations),
         ),
@@ -326,7 +328,7 @@ def _without_imitations(
     steps, p_value = explained_by_law(
         engine, selection, division.label[division.exploration], nearer
     )
-    imitations = [named(engine, selection.fit, step, math.nan) for step in steps]
+    imitations = [named(engine, selection.fit, step) for step in steps]
     if steps:
         names = ", ".join(step.chosen.name for step in steps)
         notes.append(
@@ -382,7 +384,6 @@ def _explore(
         engine,
         base,
         effects,
-        alpha=options.alpha,
         max_effects=options.max_effects if testable else 0,
         seed=options.seed,
         variables=variables,
@@ -414,17 +415,16 @@ def _least_clusters(options: DiscoverOptions, effects: int) -> int:
 def _clusters(exploration: _Exploration, options: DiscoverOptions, effects: int) -> Clusters:
     """The numbers of clusters, and the numbers that are needed."""
     division, least_exploration = exploration.division, _least_clusters(options, effects)
-    least_confirmation = least_number(rules().level, sided=1)
     sufficient = next(
         number
         for number in count(2)
-        if least_confirmation <= round(options.sealed * number) <= number - least_exploration
+        if least_confirmation() <= round(options.sealed * number) <= number - least_exploration
     )
     return Clusters(
         open=int(exploration.engine.cluster.max()) + 1,
         sealed=0 if division.note else division.number(division.confirmation),
         least=least_exploration,
-        least_sealed=least_confirmation,
+        least_sealed=least_confirmation(),
         enough=sufficient,
         why=division.why,
         simultaneous=exploration.simultaneity.plain(),
@@ -468,7 +468,6 @@ def _verdict(
     unexplained: list[Curves],
     removed: float,
     individuals_named: bool,
-    hypotheses: bool,
     testable: bool,
     imitated: bool,
 ) -> Verdict:
@@ -477,7 +476,6 @@ def _verdict(
     Args:
         removed: share of the squared errors that the named effects removed.
         individuals_named: whether agent-specific parameters were confirmed.
-        hypotheses: whether effects were selected but not confirmed.
         imitated: whether effects were selected that a better-fitting law does not need.
     """
     if not testable:
@@ -490,7 +488,7 @@ def _verdict(
         return "named"
     if unexplained or imitated:
         return "unknown"
-    return "unconfirmed" if hypotheses else "none"
+    return "none"
 
 
 def _shift(before: System, after: System) -> dict[str, dict[str, Any]]:

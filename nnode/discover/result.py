@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-Verdict = Literal["named", "none", "unknown", "indistinguishable", "unconfirmed", "not_testable"]
+Verdict = Literal["named", "none", "unknown", "indistinguishable", "not_testable"]
 
 
 @dataclass
@@ -71,6 +71,7 @@ class NamedEffect:
         p_value: of its score test, corrected for all candidate effects.
         gain: held-out share of the whitened cost that it removed when it was added.
         confirmed: one-sided p-value of its score test on the confirmation clusters.
+        combined: p-value of exploration and confirmation clusters together.
     """
 
     name: str
@@ -82,6 +83,7 @@ class NamedEffect:
     p_value: float = float("nan")
     gain: float = float("nan")
     confirmed: float = float("nan")
+    combined: float = float("nan")
 
 
 @dataclass

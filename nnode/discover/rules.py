@@ -16,9 +16,13 @@ from dataclasses import dataclass
 class Rules:
     """Chosen levels and thresholds, in addition to ``discover.alpha``."""
 
-    # level of every test after the first screen: score tests on held-out and confirmation clusters,
+    # level of the tests between models in exploration clusters: score tests on held-out clusters,
     # J tests between effects, comparisons of effects with curves
     level: float = 0.05
+    # level that the first screen and the confirmation clusters must each reach on their own. The
+    # error rate is that of both together, ``discover.alpha``; without this one, strong evidence in
+    # one part would name an effect that the other part contradicts
+    each: float = 0.25
     # stricter level, where errors mislead most: unexplained structure, and similar effects
     sure: float = 0.01
     least: float = 0.02  # smallest share of the squared errors that is worth naming

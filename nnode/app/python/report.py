@@ -38,7 +38,7 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """``named``, ``none``, ``unknown``, ``indistinguishable``, ``unconfirmed`` or
+        """``named``, ``none``, ``unknown``, ``indistinguishable`` or
         ``not_testable``."""
         return self.diagnosis.verdict
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -21,6 +22,7 @@ from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
 from nnode.discover.rules import rules
+from nnode.discover.statistics.combination import combined
 from nnode.discover.statistics.paired import gains
 from nnode.discover.statistics.random_effects import (
     IndividualEstimate,
@@ -37,7 +39,10 @@ class _ModelTest:
     """A comparison of two models on the confirmation clusters.
 
     Attributes:
-        p_value: one-sided, of the score test of the first model toward the second.
+        p_value: of exploration and confirmation clusters together.
+        confirmation: one-sided p-value of the confirmation clusters alone, of the score test of the
+            first model toward the second.
+        alpha: level of ``p_value``.
         likelihood_rises: whether the predictive likelihood of the second model is larger.
         errors_fall: whether the errors of positions become smaller; required only if the first
             model has no effect.
@@ -45,6 +50,8 @@ class _ModelTest:
     """
 
     p_value: float
+    confirmation: float
+    alpha: float
     likelihood_rises: bool
     errors_fall: bool
     before: float
@@ -52,7 +59,8 @@ class _ModelTest:
 
     @property
     def confirmed(self) -> bool:
-        return self.p_value <= rules().level and self.likelihood_rises and self.errors_fall
+        significant = self.p_value <= self.alpha and self.confirmation <= rules().each
+        return significant and self.likelihood_rises and self.errors_fall
 
     def weakness(self) -> tuple[bool, float]:
         """A sort key: larger if the evidence for the second model is weaker."""
@@ -60,10 +68,15 @@ class _ModelTest:
 
     @property
     def reason(self) -> str:
-        if self.p_value > rules().level:
+        if self.confirmation > rules().each:
             return (
-                "the sealed clusters do not lean the way that it bends predictions "
-                f"(one-sided p = {self.p_value:.3f}, asked for {rules().level:g})"
+                "the residuals of the confirmation clusters do not correlate with its predicted "
+                f"change (one-sided p = {self.confirmation:.3f}, required {rules().each:g})"
+            )
+        if self.p_value > self.alpha:
+            return (
+                "exploration and confirmation clusters together are not significant "
+                f"(p = {self.p_value:.3f}, required {self.alpha:g})"
             )
         if not self.likelihood_rises:
             return "the sealed clusters are not predicted better with it"
@@ -117,6 +130,7 @@ class ConfirmationSet:
         exploration, confirmation: sequences.
         label: ``(S,)`` clusters of the confirmation sequences.
         clusters: the number of them that are independent of the exploration clusters.
+        alpha: level of exploration and confirmation clusters together.
         seed: of simulations.
 
     Attributes:
@@ -131,8 +145,10 @@ class ConfirmationSet:
         confirmation: list[Sequence],
         label: np.ndarray,
         clusters: int,
+        alpha: float,
         seed: int,
     ) -> None:
+        self.alpha, self.n_exploration = alpha, int(engine.cluster.max()) + 1
         self.domain = str(base.domain)
         self.base, self.exploration, self.sequences = base, exploration, confirmation
         self.label, self.clusters, self.seed = label, clusters, seed
@@ -159,14 +175,15 @@ class ConfirmationSet:
         reduced = None
         if len(unconfirmed) < len(selection.steps):
             reduced = self._bias_corrected(self._without(engine, selection.fit, unconfirmed))
-            test = self._compared(self.base, reduced.system)
+            kept = [step for step in selection.steps if step not in unconfirmed]
+            test = self._compared(self.base, reduced.system, kept)
             if not test.confirmed:
                 reduced, unconfirmed = None, selection.steps
                 self.tests = {step.chosen.name: test for step in unconfirmed}
         # the intervals need the whitening of the full model, which without_steps refits
         hypotheses = [
-            named(engine, full_fit, step, self.tests[step.chosen.name].p_value)
-            for step in unconfirmed
+            named(engine, full_fit, step, test.confirmation, test.p_value)
+            for step, test in ((step, self.tests[step.chosen.name]) for step in unconfirmed)
         ]
         remaining = without_steps(engine, selection, unconfirmed, self.base)
         self._corrected_fit = reduced or remaining.fit
@@ -188,17 +205,23 @@ class ConfirmationSet:
                 reduced = self._bias_corrected(
                     self._without(engine, selection.fit, list(subset))
                 ).system
-            test = self._compared(reduced, full_fit.system)
+            test = self._compared(reduced, full_fit.system, subset)
             for name in names:
                 weakest[name] = max(weakest.get(name, test), test, key=_ModelTest.weakness)
         return weakest
 
-    def _compared(self, before: System, after: System) -> _ModelTest:
-        """The tests of two models on the confirmation clusters."""
+    def _compared(self, before: System, after: System, steps: Iterable[Step]) -> _ModelTest:
+        """The tests of two models.
+
+        Args:
+            steps: the effects in which they differ. The weakest one stands for the evidence of the
+                exploration clusters.
+        """
         scores, squares = self.comparison.scores, self.comparison.squares
-        p_value = 1.0
+        confirmation = 1.0
         if not too_few(self.clusters):
-            p_value = better(self.comparison.score_toward(before, after))
+            confirmation = better(self.comparison.score_toward(before, after))
+        exploration = max(step.chosen.score.p_value for step in steps)
         likelihood_rises = bool(gains(scores(before), scores(after)).mean() > 0)
         error_before, error_after = (
             float(np.nanmean(squares(system))) for system in (before, after)
@@ -206,7 +229,18 @@ class ConfirmationSet:
         errors_fall = (
             error_after < error_before or before is not self.base or self.comparison.drivers
         )
-        return _ModelTest(p_value, likelihood_rises, errors_fall, error_before, error_after)
+        return _ModelTest(
+            self._combined(exploration, confirmation),
+            confirmation,
+            self.alpha,
+            likelihood_rises,
+            errors_fall,
+            error_before,
+            error_after,
+        )
+
+    def _combined(self, exploration: float, confirmation: float) -> float:
+        return float(combined(exploration, confirmation, self.n_exploration, self.clusters))
 
     def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
         return refine(engine, without(fit.system, *(step.chosen.name for step in steps)))
@@ -226,7 +260,9 @@ class ConfirmationSet:
         results = [(item.confirmed, item.named, item.reason) for item in agents if item.found]
         if self.tests:
             tests = sorted(self.tests.values(), key=_ModelTest.weakness)
-            results = [(test.p_value, test.confirmed, shortage or test.reason) for test in tests]
+            results = [
+                (test.confirmation, test.confirmed, shortage or test.reason) for test in tests
+            ]
         if not results:
             return Confirmation(None, self.clusters, None, shortage)
         p_value, confirmed, reason = results[-1]

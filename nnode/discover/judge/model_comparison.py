@@ -1,8 +1,9 @@
 """Comparison of models on the confirmation clusters.
 
 The test of presence is a one-sided score test by sign flips of clusters: it asks whether the
-whitened residuals of the model without the effect correlate with the effect's predicted change. At
-a level of 5 % it needs at least five clusters. A significant improvement of predictions is a
+whitened residuals of the model without the effect correlate with the effect's predicted change. Its
+p-value is combined with that of the exploration clusters
+(:mod:`nnode.discover.statistics.combination`). A significant improvement of predictions is a
 stricter question: it needs an effect of more than half the strength that was estimated in the
 exploration clusters, and its standardised distance is half that of the score test. Therefore the
 sum of squared residuals and the mean square error of positions only have to fall. With several
@@ -18,7 +19,6 @@ from __future__ import annotations
 import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.data.clusters import least_number
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.lanes.engine import TrafficEngine
@@ -26,7 +26,7 @@ from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import sums
-from nnode.discover.rules import rules
+from nnode.discover.statistics.combination import least_confirmation
 from nnode.discover.statistics.paired import score_toward
 from nnode.model.system import System
 from nnode.population.followers import drivers_differ
@@ -120,7 +120,7 @@ class ModelComparison:
 
 def too_few(clusters: int) -> str:
     """Why this number of confirmation clusters cannot confirm anything; empty if it can."""
-    required = least_number(rules().level, sided=1)
+    required = least_confirmation()
     if clusters >= required:
         return ""
     available = {0: "no sealed cluster is", 1: "one sealed cluster is"}.get(

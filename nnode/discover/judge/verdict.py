@@ -39,11 +39,13 @@ from nnode.model.extend import place_of
 WIDE = 1.96
 
 
-def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect:
+def named(
+    engine: Engine, fit: Fit, step: Step, confirmed: float = math.nan, combined: float = math.nan
+) -> NamedEffect:
     """An accepted effect with its coefficients in a fit.
 
     Args:
-        confirmed: p-value of the confirmation clusters.
+        confirmed: p-value of the confirmation clusters. combined: of both parts together.
     """
     effect = step.chosen.score.effect
     coefficients = _coefficients(engine, fit, step)
@@ -67,6 +69,7 @@ def named(engine: Engine, fit: Fit, step: Step, confirmed: float) -> NamedEffect
         p_value=step.chosen.score.p_value,
         gain=step.chosen.gain.gain,
         confirmed=confirmed,
+        combined=combined,
     )
 
 

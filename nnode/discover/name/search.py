@@ -111,7 +111,6 @@ def search(
     fit: Fit,
     effects: list[type[Effect]],
     *,
-    alpha: float = 0.05,
     max_effects: int = 4,
     seed: int = 0,
     variables: list[Variable] | None = None,
@@ -129,7 +128,6 @@ def search(
         engine: of the exploration sequences.
         fit: the calibrated model, with the engine's whitening fitted to its residuals.
         effects: the candidates.
-        alpha: familywise error rate of the score tests.
         max_effects: the largest number of effects that are added.
         seed: of the sign flips.
         variables: no effect is accepted if a curve of one of these predicts better, because then
@@ -143,11 +141,11 @@ def search(
     # the state before an effect was added that predicts worse than a curve
     doubtful: Selection | None = None
     while True:
-        screen = _screened(engine, selection, effects, seed, levels, within, alpha)
+        screen = _screened(engine, selection, effects, seed, levels, within)
         selection.first = selection.first or selection.scores
         if len(selection.steps) >= max_effects:
             break
-        step = _next_step(engine, selection, alpha, hints)
+        step = _next_step(engine, selection, hints)
         if step is None:
             break
         if _curve_predicts_better(engine, selection.fit, step.chosen, variables or []):
@@ -168,7 +166,7 @@ def search(
         log.info("added %s", step.chosen.name)
     if doubtful is not None:  # the whitening was fitted with more effects
         selection = replace(doubtful, fit=converged_fit(engine, doubtful.fit.system, rounds=1))
-        _screened(engine, selection, effects, seed, levels, within, alpha)
+        _screened(engine, selection, effects, seed, levels, within)
     return _eliminated(engine, selection)
 
 
@@ -179,7 +177,6 @@ def _screened(
     seed: int,
     levels: dict[str, np.ndarray],
     within: Callable[[float], None],
-    alpha: float,
 ) -> Screen:
     """Compute the score tests of all effects that the model lacks."""
     present = {effect.name for effect in effects_of(selection.fit.system)}
@@ -192,7 +189,7 @@ def _screened(
     within((n_steps + 0.5) / (n_steps + 2))
     selection.screen = Screen(selection.fit, engine.cluster, seed + n_steps, levels=levels)
     selection.scores = selection.screen.scores(effect_traces)
-    significant = {score.effect.name for score in selection.scores if score.p_value <= alpha}
+    significant = {score.effect.name for score in selection.scores if score.p_value <= rules().each}
     if significant and (simulated := simulated_fits(engine, selection.fit, seed)):
         for effect in candidates:
             if effect.name in significant:
@@ -221,16 +218,14 @@ def _columns(columns: dict[int, np.ndarray], _: Engine, fit: Fit) -> np.ndarray:
     return columns[id(fit)]
 
 
-def _next_step(
-    engine: Engine, selection: Selection, alpha: float, hints: Sequence[System]
-) -> Step | None:
+def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) -> Step | None:
     """The best effect that passes all tests, with its rivals; None if no effect passes."""
     scores, screen = selection.scores, selection.screen
     assert screen is not None
     if not scores:
         return None
     scores = sorted(scores, key=lambda score: -score.gain)
-    significant = min(score.p_value for score in scores) <= alpha
+    significant = min(score.p_value for score in scores) <= rules().each
     if not significant and isinstance(engine, FollowersEngine):
         return None  # the variances were already fitted with the most likely extension
     hinted = {effect.name for hint in hints for effect in effects_of(hint)}
@@ -246,13 +241,13 @@ def _next_step(
         and c.strength_excludes_neutral(screen.label(c.name))
         and c.ordered
     ]
-    passing = [c for c in eligible if c.score.p_value <= alpha]
+    passing = [c for c in eligible if c.score.p_value <= rules().each]
     if not passing and not isinstance(engine, FollowersEngine):
         passing = [c for c in eligible if _significant_held_out(c, screen, len(scores))]
     if not passing:
         return None
     best = _simplest(passing, screen)
-    if best.score.p_value > alpha:
+    if best.score.p_value > rules().each:
         best.score = replace(best.score, p_value=best.presence_pvalue * len(scores))
     tests = [(rival, _j_test(rival, best, screen)) for rival in candidates if rival is not best]
     return Step(best, [(rival, test) for rival, test in tests if _is_rival(best, rival, test)])

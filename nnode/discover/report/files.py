@@ -143,7 +143,9 @@ def verdict(d: Diagnosis) -> str:
         gain += (
             ", in the last part of each sequence, each agent's number being taken from the first"
         )
-    unconfirmed = f" {_listed([e.name for e in d.leads])} was found too, but not confirmed."
+    unconfirmed = (
+        f" {_listed([e.name for e in d.leads])} remains a hypothesis: {d.confirmation.reason}."
+    )
     match d.verdict:
         case "named":
             pronoun = "it" if len(d.effects) == 1 else "them"
@@ -157,12 +159,6 @@ def verdict(d: Diagnosis) -> str:
             return (
                 f"The model {d.model} lacks something, and these data cannot tell whether it is "
                 f"{names} or rather {rivals}: with {names}, {gain}."
-            )
-        case "unconfirmed":
-            return (
-                f"Not confirmed: in the open data the model {d.model} seems to lack "
-                f"{_listed([e.name for e in d.leads])}, but {d.confirmation.reason}. It is not "
-                "added to the model."
             )
         case "not_testable":
             c = d.clusters
@@ -184,6 +180,8 @@ def verdict(d: Diagnosis) -> str:
             return (
                 f"Nothing is missing from the model {d.model} that these data could show: no "
                 "effect of the catalogue passes, and no structure is left."
+                + unconfirmed
+                * bool(d.leads)
             )
 
 

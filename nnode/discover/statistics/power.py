@@ -15,6 +15,7 @@ from scipy import stats
 
 from nnode.data.clusters import every_sign
 from nnode.discover.rules import rules
+from nnode.discover.statistics.combination import combined, least_confirmation
 from nnode.discover.statistics.score import Evidence, Score, Screen
 
 #: Number of simulations; the standard error is 2 % at a power of 80 %.
@@ -29,7 +30,7 @@ class PowerSimulation:
 
     Attributes:
         screen: of the score tests.
-        alpha: familywise level of the screen.
+        alpha: level of exploration and confirmation clusters together.
         confirmation_clusters: number of confirmation clusters.
     """
 
@@ -48,7 +49,8 @@ class PowerSimulation:
         null_parts = null_parts * np.sqrt(number / (number - 1))
         parts = rng.choice([-1.0, 1.0], (number, RUNS)) * null_parts[:, None] - size * grams
         name = score.effect.name
-        passed = self.screen.statistic(evidence, parts) > self.screen.critical(name, self.alpha)
+        exploration = self.screen.p_values(name, self.screen.statistic(evidence, parts))
+        passed = exploration <= rules().each
         costs = _with_effect(self.screen.costs(name)[:, None], parts, grams, size)
         left_out_amounts = -(parts.sum(0) - parts) / np.maximum(information - grams, 1e-300)
         gain = _gain(left_out_amounts, parts, grams, costs)
@@ -62,11 +64,12 @@ class PowerSimulation:
         )
         passed &= np.abs(amount) > stats.t.ppf(0.975, number - 1) * error
         costs = self.screen.costs(name)
-        return float(
-            (passed & self._confirmed(rng, null_parts, evidence.grams, costs, size, amount)).mean()
-        )
+        confirmation = self._confirmation(rng, null_parts, evidence.grams, costs, size, amount)
+        passed &= confirmation <= rules().each
+        p_value = combined(exploration, confirmation, number, self.confirmation_clusters)
+        return float((passed & (p_value <= self.alpha)).mean())
 
-    def _confirmed(
+    def _confirmation(
         self,
         rng: np.random.Generator,
         null_parts: np.ndarray,
@@ -75,23 +78,21 @@ class PowerSimulation:
         size: float,
         amount: np.ndarray,
     ) -> np.ndarray:
-        """``(R,)`` whether the effect passes the tests on confirmation clusters."""
-        if rules().level * 2**self.confirmation_clusters < 1:
-            return np.zeros(RUNS, dtype=bool)
+        """``(R,)`` p-values of the confirmation clusters; 1 where they are not predicted better."""
+        if self.confirmation_clusters < least_confirmation():
+            return np.ones(RUNS)
         chosen = rng.integers(0, len(grams), (self.confirmation_clusters, RUNS))
         drawn = grams[chosen]
         parts = rng.choice([-1.0, 1.0], chosen.shape) * null_parts[chosen] - size * drawn
         costs = _with_effect(costs[chosen], parts, drawn, size)
         gain = _gain(amount, parts, drawn, costs)
         score_toward = _score_toward(amount, parts, drawn, costs)
-        likelier: np.ndarray = gain.mean(0) > 0
         if self.confirmation_clusters > 12:
-            return likelier & (
-                _t(score_toward) > stats.t.ppf(1 - rules().level, self.confirmation_clusters - 1)
-            )
-        totals = every_sign(self.confirmation_clusters) @ score_toward
-        passed: np.ndarray = (totals >= totals[0] - 1e-12).mean(0) <= rules().level
-        return likelier & passed
+            p_values = stats.t.sf(_t(score_toward), self.confirmation_clusters - 1)
+        else:
+            totals = every_sign(self.confirmation_clusters) @ score_toward
+            p_values = (totals >= totals[0] - 1e-12).mean(0)
+        return np.where(gain.mean(0) > 0, p_values, 1.0)
 
     def detectable(self, score: Score, evidence: Evidence, expected: float) -> float:
         """The smallest size with a power of 80 %; infinite if there is none."""

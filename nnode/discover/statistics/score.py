@@ -218,10 +218,14 @@ class Screen:
         for score, p_value in zip(best.values(), share[:, 0], strict=True):
             score.p_value = float((self._least <= p_value + 1e-12).mean())
 
-    def critical(self, name: str, alpha: float = 0.05) -> float:
-        """The critical value of an effect's statistic at familywise level ``alpha``."""
-        share = float(np.quantile(self._least, alpha))
-        return float(np.quantile(self._null_statistics[name], 1 - share))
+    def p_values(self, name: str, statistics: np.ndarray) -> np.ndarray:
+        """``(R,)`` p-values, corrected for all effects, that an effect would have with these
+        statistics."""
+        null = np.sort(self._null_statistics[name])
+        share = 1 - np.searchsorted(null, statistics, side="left") / len(null)
+        least = np.sort(self._least)
+        corrected = np.searchsorted(least, share + 1e-12, side="right") / len(least)
+        return np.asarray(np.maximum(corrected, 1 / len(least)))
 
     def statistic(self, evidence: Evidence, parts: np.ndarray) -> np.ndarray:
         """``(R,)`` the statistic of a direction if its scores were ``parts`` ``(G, R)``."""

@@ -153,6 +153,7 @@ def null_rows(number: int, rejected: int, **more: Any) -> pd.DataFrame:
             "screen_p": [0.01] * rejected + [0.6] * (number - rejected),
             "screen_false": [True] * rejected + [False] * (number - rejected),
             "false_names": "",
+            "leads": "",
             **more,
         },
         index=range(number),
@@ -170,8 +171,8 @@ def test_a_gate_is_held_to_5_percent_by_a_one_sided_test():
     assert "final names" in row["measure"]
     assert level.level(untested)["not testable"].tolist() == [8]
     # a lead is shown and is no name
-    leads = level.level(null_rows(8, 8, verdict="unconfirmed"))
-    assert leads[["first screen", "final names", "unconfirmed"]].to_numpy().tolist() == [[8, 0, 8]]
+    leads = level.level(null_rows(8, 8, verdict="none", leads="inertia"))
+    assert leads[["first screen", "final names", "hypotheses"]].to_numpy().tolist() == [[8, 0, 8]]
 
 
 def test_other_sizes_have_lines_but_no_criteria_of_their_own():

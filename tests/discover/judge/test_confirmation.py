@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def table(sequences: list[Sequence]) -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def unconfirmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a diagnosis whose sealed clusters contradict the open ones."""
+    """The folder of a diagnosis whose confirmation clusters contradict the exploration clusters."""
     folder = tmp_path_factory.mktemp("unconfirmed")
     report = diagnose_table(
         table(turned()), "traffic", model="lin", folder=folder / "run", options=OPTIONS
@@ -57,7 +58,7 @@ def unconfirmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_what_is_worse_on_sealed_clusters_is_not_confirmed(unconfirmed: Path) -> None:
     report = pd.read_pickle(unconfirmed / "report.pkl")
-    assert (report["verdict"], report["effects"]) == ("unconfirmed", [])
+    assert (report["verdict"], report["effects"]) == ("none", [])
     (lead,) = report["leads"]
     assert lead["name"] == "relative_speed"
     # the open clusters do say so: the least p that eleven of them allow
@@ -80,22 +81,30 @@ def test_what_is_not_confirmed_is_not_in_the_model_that_is_written(unconfirmed: 
 
 def test_the_page_says_first_that_nothing_is_confirmed(unconfirmed: Path) -> None:
     page = html.unescape((unconfirmed / "run" / "report.html").read_text())
-    first = page.index(
-        "Not confirmed: in the open data the model lin seems to lack relative_speed,"
-    )
-    assert first < page.index("It is not added to the model.") < page.index("What is missing</h2>")
-    assert "Found, not confirmed</h3>" in page
+    first = page.index("relative_speed remains a hypothesis: ")
+    assert first < page.index("What is missing</h2>")
 
 
-def test_four_sealed_clusters_confirm_nothing_however_much_better_they_are() -> None:
-    found = diagnose(law(), platoons(relative_speed(KAPPA), **{**MANY, "number": 12}), OPTIONS)
+@pytest.mark.parametrize(("number", "confirmation"), [(7, 2), (7, 1)])
+def test_two_confirmation_clusters_are_enough_and_one_is_not(
+    number: int, confirmation: int
+) -> None:
+    options = replace(OPTIONS, sealed=confirmation / (number + confirmation))
+    made = platoons(relative_speed(KAPPA), **{**MANY, "number": number + confirmation})
+    found = diagnose(law(), made, options)
     d = found.diagnosis
-    assert (d.verdict, d.effects, d.clusters.sealed) == ("unconfirmed", [], 4)
-    assert [one.name for one in d.leads] == ["relative_speed"]
-    why = "4 sealed clusters are independent of the open ones, and it takes 5 to confirm anything"
-    assert d.confirmation.reason == why
-    assert f"but {why}. It is not added to the model." in sentence(d)
-    assert effects_of(found.extended) == []
+    assert d.clusters.sealed == confirmation
+    if confirmation == 2:
+        assert (d.verdict, d.leads) == ("named", [])
+        (effect,) = d.effects
+        # 2^-2 is the least p-value of two clusters, and the exploration clusters are sure
+        assert effect.confirmed == 0.25
+        assert effect.combined < 0.05
+    else:
+        assert (d.verdict, d.effects) == ("none", [])
+        assert [one.name for one in d.leads] == ["relative_speed"]
+        assert "it takes 2 to confirm anything" in d.confirmation.reason
+        assert effects_of(found.extended) == []
 
 
 def test_with_too_few_clusters_nothing_is_named_and_it_says_how_many_would_do() -> None:

@@ -106,10 +106,6 @@ def test_an_estimate_has_the_digits_that_its_interval_leaves(
         ("none", "Nothing is missing from the model stand-in that these data could show"),
         ("unknown", "Beyond speed_zone the model stand-in lacks something that is not in the"),
         ("indistinguishable", "cannot tell whether it is speed_zone or rather inertia"),
-        (
-            "unconfirmed",
-            "Not confirmed: in the open data the model stand-in seems to lack inertia, ",
-        ),
         ("not_testable", "Not testable with these data: "),
     ],
 )
@@ -120,7 +116,6 @@ def test_every_verdict_is_a_sentence(traffic: Case, verdict: Verdict, words: str
         d,
         verdict=verdict,
         effects=[replace(effect, alternatives=[Alternative("inertia", 1.0, 0.5)])],
-        leads=[replace(effect, name="inertia")] if verdict == "unconfirmed" else [],
         confirmation=Confirmation(0.4, 5, False, "the sealed clusters are no better"),
         gap=Gap(5.0, 1.0, 0.5, 8 / 9),
     )
@@ -128,8 +123,6 @@ def test_every_verdict_is_a_sentence(traffic: Case, verdict: Verdict, words: str
     assert sentence(d).endswith(".")
     if verdict == "named":
         assert "(89 % of what can be closed above the noise floor of 0.5 m²)" in sentence(d)
-    if verdict == "unconfirmed":
-        assert sentence(d).endswith("clusters are no better. It is not added to the model.")
     if verdict == "not_testable":
         assert "there are 3 open " in sentence(d)
         assert " 2 sealed " in sentence(d)
@@ -150,9 +143,12 @@ def test_faults_of_the_measurement_stand_beside_the_verdict(traffic: Case) -> No
 def test_what_was_not_confirmed_is_said_beside_what_was(traffic: Case) -> None:
     d = traffic.found.diagnosis
     (effect,) = d.effects
-    d = replace(d, leads=[replace(effect, name="inertia")])
+    no = Confirmation(0.4, 5, False, "the confirmation clusters are no better")
+    d = replace(d, leads=[replace(effect, name="inertia")], confirmation=no)
+    said = " inertia remains a hypothesis: the confirmation clusters are no better."
     assert "lacks speed_zone" in sentence(d)
-    assert sentence(d).endswith(" inertia was found too, but not confirmed.")
+    assert sentence(d).endswith(said)
+    assert sentence(replace(d, verdict="none", effects=[])).endswith(said)
 
 
 def test_numbers_of_agents_come_from_the_first_part_of_their_time(traffic: Case) -> None:

@@ -169,7 +169,7 @@ def test_a_page_of_nothing_found(traffic: Case) -> None:
 def test_what_was_not_confirmed_is_a_lead(traffic: Case) -> None:
     d = traffic.found.diagnosis
     no = Confirmation(0.4, 5, False, "the sealed clusters are not predicted better with it")
-    words = plain(traffic, effects=[], verdict="unconfirmed", leads=d.effects, confirmation=no)
+    words = plain(traffic, effects=[], verdict="none", leads=d.effects, confirmation=no)
     assert "No effect of the catalogue was added to the model." in words
     lead = "A lead to follow, not a finding: the sealed clusters are not predicted better with it."
     assert words[words.index("Found, not confirmed") + 1] == lead
