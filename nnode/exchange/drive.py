@@ -167,7 +167,7 @@ class _Job:
             self._names = [name for name in self._names if name in subscribed]
         if self._names:
             views = sumo.seen(self._names, subscribed, twice=drivers.looks_twice)
-            if drivers.names_places:
+            if drivers.depends_on_position:
                 views.x[:] = self._zero + sumo.places(self._names, subscribed)[1]
             sumo.set_speeds(self._names, drivers.speeds(sumo.time, views))
             self._speeds += float(views.v.sum())

@@ -108,7 +108,7 @@ class Drivers:
         return len(self._begun)
 
     @property
-    def names_places(self) -> bool:
+    def depends_on_position(self) -> bool:
         """Whether places matter, not only distances."""
         outputs = [*self._rates.after.outputs, *self.lane.starts.values()]
         named = {part.value for part in topological(outputs, set(_GAPS))}
