@@ -41,7 +41,7 @@ from nnode.simulation import Solver
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from nnode.calibrate.pooling import Own
+    from nnode.calibrate.pooling import SequenceParameters
 
 log = logging.getLogger(__name__)
 
@@ -666,7 +666,7 @@ def _status(trainer: Trainer, model: System, store: Source) -> str:
 
 def _by_tangents(
     trainer: Trainer, model: System, store: Source
-) -> tuple[dict[str, Any], Own | None, dict[str, Any]]:
+) -> tuple[dict[str, Any], SequenceParameters | None, dict[str, Any]]:
     """Intervals of the best parameters, each sequence's own and first speeds where they are asked
     for, of models that have exact tangents; otherwise none."""
     config, options = trainer.provenance.config, trainer.options
@@ -678,7 +678,7 @@ def _by_tangents(
         return {}, None, speeds
     # compiled code takes a second to import
     from nnode.calibrate.intervals import intervals
-    from nnode.calibrate.pooling import own_parameters
+    from nnode.calibrate.pooling import sequence_parameters
     from nnode.calibrate.problem import ResidualProblem
     from nnode.simulation.fused import FusedSolver
 
@@ -704,7 +704,7 @@ def _by_tangents(
         speeds |= {"kind": options.start_speeds.value, "change": change, "sequences": by_name}
     if options.pooling is not Pooling.pooled:
         chosen = [store[i] for i in indices]
-        own = own_parameters(options.pooling, double, chosen, make, int(config["seed"]))
+        own = sequence_parameters(options.pooling, double, chosen, make, int(config["seed"]))
     return found, own, speeds
 
 

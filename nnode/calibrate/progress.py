@@ -1,4 +1,4 @@
-"""Steps of a training, with rate and time left."""
+"""Progress of a training: steps, rate and remaining time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nnode.progress import OnTerminal
 
 
 class Reporter(OnTerminal):
-    """Shows how far a run is; use as a context manager.
+    """Shows the progress of a run; use as a context manager.
 
     Args:
         total: number of steps at the end.
@@ -37,7 +37,7 @@ class Reporter(OnTerminal):
             self._task = self._bar.add_task(what, total=total, completed=done, rate=0.0, note="")
 
     def advance(self, note: str = "") -> None:
-        """One step more is done."""
+        """Count a finished step."""
         self.done += 1
         if self.done == self._begun + 1:  # the first step includes compilation
             self._first, self._start = self.done, time.monotonic()
@@ -48,7 +48,7 @@ class Reporter(OnTerminal):
             self.log_if_due()
 
     def line(self) -> str:
-        """Steps, their rate, and the time left."""
+        """The steps, their rate and the remaining time as text."""
         text = f"{self.what}: step {self.done} of {self.total}"
         if self.done == self._first:
             return text

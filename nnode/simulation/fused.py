@@ -190,9 +190,10 @@ def _stack(system: System, parameters: Mapping[str, Tensor]) -> dict[str, Tensor
         )
     runs = {len(value) if value.ndim else 0 for value in parameters.values()}
     for name, value in parameters.items():
-        if len(runs) > 1 or value.shape[1:] != defaults[name].shape or 0 in runs:
+        shape = defaults[name].shape
+        if len(runs) > 1 or value.shape[1:] != shape or 0 in runs:
             raise ConfigError(
-                f"{name} of an ensemble must have shape (R, {', '.join(map(str, defaults[name].shape))})"
+                f"{name} of an ensemble must have shape (R, {', '.join(map(str, shape))})"
                 f" with the same R >= 1 for all parameters, found {tuple(value.shape)}"
             )
     number = runs.pop()

@@ -102,7 +102,7 @@ def run(
             command(_task(job, name))()
         except (HydraException, OmegaConfBaseException) as error:
             end(in_words(error, name, given, flags))
-    World().part()
+    World().leave()
     if failures():
         sys.exit(1)
 

@@ -73,7 +73,7 @@ def end(error: NNodeError) -> NoReturn:
     if world.first or not world.agreed:
         say(str(error) if stopped else f"error: {error}")
     if world.agreed:
-        world.part()
+        world.leave()
     if isinstance(error, Interrupted):
         sys.exit(128 + error.signal)
     sys.exit(2 if isinstance(error, ConfigError) else 1)
