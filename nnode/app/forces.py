@@ -1,4 +1,4 @@
-"""What calibrated models have learned, as pictures: ``nnode plot_forces``."""
+"""Plots of calibrated forces and speed curves: ``nnode plot_forces``."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def plot_forces(config: DictConfig, folder: Path) -> None:
     """Draw the checkpoints' forces into ``folder``.
 
     Raises:
-        NNodeError: a missing or damaged checkpoint, or traffic and crowd models together.
+        NNodeError: a checkpoint is missing or damaged, or traffic and crowd models are mixed.
     """
     given = config.checkpoint
     paths = [given] if isinstance(given, str) else list(given)
@@ -87,9 +87,9 @@ def _traffic(
 def _crowd(models: dict[str, System], extent: float | None, folder: Path) -> list[Path]:
     written: list[Path] = []
     for label, model in models.items():
-        # the label is of the checkpoint, whoever made it
+        # the label comes from the checkpoint and may have any characters
         stem = file_name(label.replace(", ", "_").replace(" ", ""))
-        while folder / f"{stem}_settings.png" in written:  # labels may differ in such signs alone
+        while folder / f"{stem}_settings.png" in written:  # replaced characters may cause clashes
             stem += "_"
         for component, axis in enumerate("xy"):
             path = folder / f"{stem}_force_{axis}.png"

@@ -1,4 +1,4 @@
-"""Raw recordings to sequences: ``nnode prepare_data``."""
+"""Preparation of raw recordings as sequences: ``nnode prepare_data``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nnode.plots.quality import plot_faults
 
 
 def prepare_data(config: DictConfig, folder: Path) -> None:
-    """Prepare a data set into ``folder`` and say what came of it.
+    """Prepare a data set in ``folder``, and print a summary.
 
     Raises:
         NNodeError: see :func:`nnode.data.prepare.prepare`.

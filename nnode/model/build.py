@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any, cast
 
 import torch
 
 from nnode.data.sequence import Domain
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, suggestion
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.base import Effect
 from nnode.model.effects.own import VARIABLE, load_own
@@ -72,9 +71,10 @@ def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.floa
     term, generator = str(options["term"]), torch.Generator().manual_seed(seed)
     terms = [name for name, entry in entries().items() if entry.get("model")] + ["formula"]
     if term not in terms:
-        near = get_close_matches(term, terms, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(terms)}{hint}")
+        raise ConfigError(
+            f"model.term={term} is unknown, expected one of {', '.join(terms)}"
+            f"{suggestion(term, terms)}"
+        )
     try:
         laws = _laws(options, generator)
         model: System
@@ -112,11 +112,10 @@ def add_effects(model: System, chosen: Sequence[str | Options]) -> None:
         name, values = _entry(entry)
         names = [effect.name for effect in CATALOGUE.of(cast(Domain, model.domain), every=True)]
         if name not in names:
-            near = get_close_matches(name, names, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
             raise ConfigError(
                 f"model.effects: there is no {model.domain} effect {name}, expected one of "
-                f"{', '.join(names)}{hint}; files with effects of your own are named in {VARIABLE}"
+                f"{', '.join(names)}{suggestion(name, names)}; files with effects of your own are "
+                f"named in {VARIABLE}"
             )
         try:
             added.append(CATALOGUE.effects[name](**values))
