@@ -107,11 +107,11 @@ class ClusterInfluence:
         correlation: np.ndarray = self.covariance() / np.outer(spread, spread)
         return correlation
 
-    def half_widths(self, level: float = LEVEL) -> np.ndarray:
-        """``(P,)`` half the width of confidence intervals by Student's quantiles; infinite for
-        flat parameters."""
+    def half_widths(self) -> np.ndarray:
+        """``(P,)`` half the width of confidence intervals of :data:`LEVEL` by Student's quantiles;
+        infinite for flat parameters."""
         widths: np.ndarray = (
-            students_t.ppf(0.5 + level / 2, self.degrees()) * self.standard_errors()
+            students_t.ppf(0.5 + LEVEL / 2, self.degrees()) * self.standard_errors()
         )
         return widths
 

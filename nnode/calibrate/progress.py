@@ -22,7 +22,7 @@ class Reporter(OnTerminal):
         done: steps done before this start.
     """
 
-    def __init__(self, total: int, done: int = 0, what: str = "training") -> None:
+    def __init__(self, total: int, done: int = 0) -> None:
         super().__init__(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -31,10 +31,12 @@ class Reporter(OnTerminal):
             TimeRemainingColumn(),
             TextColumn("{task.fields[note]}"),
         )
-        self.total, self.done, self.what = total, done, what
+        self.total, self.done = total, done
         self._begun, self._first, self._note = done, done, ""
         if self._bar:
-            self._task = self._bar.add_task(what, total=total, completed=done, rate=0.0, note="")
+            self._task = self._bar.add_task(
+                "training", total=total, completed=done, rate=0.0, note=""
+            )
 
     def advance(self, note: str = "") -> None:
         """Count a finished step."""
@@ -49,7 +51,7 @@ class Reporter(OnTerminal):
 
     def line(self) -> str:
         """The steps, their rate and the remaining time as text."""
-        text = f"{self.what}: step {self.done} of {self.total}"
+        text = f"training: step {self.done} of {self.total}"
         if self.done == self._first:
             return text
         left = (self.total - self.done) / self._rate()

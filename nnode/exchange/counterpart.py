@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 from nnode.model import System
 from nnode.model.laws import law_from
@@ -35,7 +35,7 @@ def effects_without(system: System, first: int, counted: set[str]) -> list[str]:
     """A line for each effect that is not ``counted``, among the terms from index ``first``."""
     return [
         f"effect {term.name}: {term.formula_for(system.order)}"
-        for term in cast(list[Term], list(system.terms))[first:]
+        for term in system.term_list[first:]
         if term.name not in counted
     ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +15,10 @@ from nnode.model.arrays import numpy_function
 from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.lane import VehicleClass
 from nnode.model.expression import symbol, symbols, topological
-from nnode.model.formula import own_values, values_of
 from nnode.model.lane_rates import Rates
 from nnode.model.steps import stepped
 from nnode.model.term import Term
-from nnode.model.terms import LaneDynamics
+from nnode.model.terms import LaneDynamics, parameter_values
 
 #: Gaps of an empty road, m. The law of a model must have the same values at both.
 EMPTY = (1e6, 1e9)
@@ -91,12 +90,12 @@ class Drivers:
             raise ConfigError(f"far={far} must be a distance in m, below {EMPTY[0]:g}, or null")
         lane = drivable(system)
         self._system = copy.deepcopy(system).double()
-        self._terms = cast(list[Term], list(self._system.terms))
+        self._terms = self._system.term_list
         self.lane, self.dt = stepped(lane, method), dt
         self._far, self._lengths = EMPTY[1] if far is None else far, lengths
         self._rng = np.random.default_rng(seed)
-        values = values_of(lane, own_values(self._terms, lane))
-        self._fixed = {s: float(v.detach()) for s, v in zip(lane.owned, values, strict=True)}
+        values = parameter_values(self._terms, lane)
+        self._fixed = {name: float(value.detach()) for name, value in values.items()}
         self._added = list(lane.rates)[lane.order :]
         self._states = {state: np.empty(0) for state in self._added}
         self._inputs = {name: np.empty(0) for name in lane.inputs}

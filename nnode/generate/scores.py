@@ -57,7 +57,7 @@ class Mean:
     high: float | None
 
 
-def mean_of(total: np.ndarray, number: np.ndarray, label: np.ndarray, seed: int = 0) -> Mean:
+def mean_of(total: np.ndarray, number: np.ndarray, label: np.ndarray) -> Mean:
     """The mean over all samples of several sequences.
 
     Args:
@@ -68,7 +68,7 @@ def mean_of(total: np.ndarray, number: np.ndarray, label: np.ndarray, seed: int 
     _, label = np.unique(label, return_inverse=True)
     if label.max() < 1:
         return Mean(mean, None, None)
-    weights = group_weights(label, DRAWS, np.random.default_rng(seed))
+    weights = group_weights(label, DRAWS, np.random.default_rng(0))
     low, high = np.quantile((weights @ total) / (weights @ number), [0.025, 0.975])
     return Mean(mean, float(low), float(high))
 
@@ -143,9 +143,9 @@ class Scores:
                     self._at_horizons(f"coverage_{what}_{100 * level:g}", inside)
         self._at_horizons("crps_position_m", scored)
 
-    def sequence_means(self, what: str = "crps_position_m") -> np.ndarray:
-        """``(S,)`` means of a score by sequence, in the order of :meth:`add`."""
-        return np.array([total / number for total, number in self._parts[what]])
+    def sequence_means(self) -> np.ndarray:
+        """``(S,)`` CRPS of positions (m) by sequence, in the order of :meth:`add`."""
+        return np.array([total / number for total, number in self._parts["crps_position_m"]])
 
     def means(self, label: np.ndarray) -> dict[str, Mean]:
         """Score to its mean over all samples; ``score@T`` is the score T s after the start.

@@ -20,8 +20,7 @@ from nnode.model.terms import (
     SMALLEST,
     WALLS,
     CrowdDynamics,
-    own_values,
-    values_of,
+    parameter_values,
 )
 
 
@@ -35,6 +34,7 @@ def people_of(terms: Sequence[Any], law: CrowdDynamics, scene: Scene) -> dict[st
     values = {name: terms[i].inputs(scene)[part] for name, (i, part) in law.inputs.items()}
     values["people"], values["points"] = scene.count[:, 0], scene.wall_count[:, 0]
     values["start"], values["pace"] = scene.start[:, None], scene.pace
+    values["goal_x"], values["goal_y"] = scene.destination.unbind(-1)
     return {name: value.to(scene.destination.dtype) for name, value in values.items()}
 
 
@@ -64,13 +64,11 @@ class CrowdRates:
         numpy: bool = False,
     ) -> None:
         self.law, self._code, self._numpy = law, code, numpy
-        values = values_of(law, {**own_values(terms, law), **(parameters or {})})
-        symbol_values = dict(zip(law.owned, values, strict=True))
+        symbol_values = parameter_values(terms, law, parameters)
         like = scene.destination
         symbol_values |= {
             name: like.new_tensor(value) for name, value in settings_of(terms, law).items()
         }
-        symbol_values |= dict(zip(("goal_x", "goal_y"), like.unbind(-1), strict=True))
         symbol_values |= people_of(terms, law, scene)
         self._known = self._arrays(symbol_values)
         self._places: dict[str, dict[str, Any]] = {}

@@ -19,7 +19,7 @@ from nnode.model.names import check_names
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
 from nnode.model.term import State, Term, numbered
-from nnode.model.terms import CrowdDynamics, LaneDynamics, add_term, own_values, values_of
+from nnode.model.terms import CrowdDynamics, LaneDynamics, add_term, parameter_values
 
 #: The terms' shapes to the composed formula.
 _FORMULAS: dict[tuple[Any, ...], Any] = {}
@@ -111,9 +111,7 @@ def symbols_of(
     Args:
         parameters: symbol to value; None takes the terms' parameters.
     """
-    values = dict(parameters or {})
-    if parameters is None:
-        values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
+    values = parameter_values(terms, lane) if parameters is None else dict(parameters)
     values |= {"start": scene.start, "dt": scene.start.new_tensor(scene.step)}
     return values, {name: value.T for name, value in inputs_of(terms, lane, scene).items()}
 

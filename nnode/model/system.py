@@ -90,7 +90,7 @@ class System(nn.Module):
     @property
     def memory(self) -> int:
         """Number M of the states that terms add."""
-        rules = (term.rule_for(self.order) for term in self._terms())
+        rules = (term.rule_for(self.order) for term in self.term_list)
         return sum(rule.memory for rule in rules if rule is not None)
 
     def _added(self, batch: Batch, step: float | None) -> list[Tensor]:
@@ -116,12 +116,14 @@ class System(nn.Module):
         """Whether the first vehicle of every sequence follows its measured path."""
         return False
 
-    def _terms(self) -> list[Term]:
+    @property
+    def term_list(self) -> list[Term]:
+        """The terms as a list with their type."""
         return cast(list[Term], list(self.terms))
 
     def _rates(self, state: State, memory: Tensor | None = None) -> Tensor:
         """``(B, N, D + M)``: the sum of the terms, then the rates of the states that they add."""
-        terms, total, first = self._terms(), torch.zeros_like(state.x), 0
+        terms, total, first = self.term_list, torch.zeros_like(state.x), 0
         added: list[Tensor] = []
         for term in terms:
             rule = term.rule_for(self.order)
@@ -162,13 +164,13 @@ class System(nn.Module):
         """Admissible values by the names of ``named_parameters()``; others are free."""
         return {
             f"terms.{i}.{name}": interval
-            for i, term in enumerate(self._terms())
+            for i, term in enumerate(self.term_list)
             for name, interval in term.bounds.items()
         }
 
     def project_(self) -> None:
         """Move every parameter into its admissible set."""
-        for term in self._terms():
+        for term in self.term_list:
             term.project_()
 
 
@@ -202,12 +204,12 @@ class Traffic(System):
 
     @property
     def formula(self) -> LaneDynamics | None:
-        return lane_of(self._terms())
+        return lane_of(self.term_list)
 
     def _added(self, batch: Batch, step: float | None) -> list[Tensor]:
         if not self.memory:
             return []
-        terms, lane, scene = self._terms(), self.formula, self.scene(batch)
+        terms, lane, scene = self.term_list, self.formula, self.scene(batch)
         scene = scene if step is None else replace(scene, step=step)
         if lane is None:  # terms without states do not affect the start values
             rules = [term.rule_for(self.order) for term in terms]
@@ -251,7 +253,7 @@ class Traffic(System):
         alone = len(self.terms) == 1 and isinstance(law, Law) and law.of_gap
         lane = None if alone else self.formula
         if lane is not None:
-            rate = rates_of(self._terms(), lane, y, t, scene, place is not None)
+            rate = rates_of(self.term_list, lane, y, t, scene, place is not None)
             return rate if place is None else rate.masked_fill(lead, 0.0)
         rates = self._rates(State(t, y[..., :1], None, scene), y[..., 1:])
         if place is None:
@@ -319,7 +321,7 @@ class Crowd(System):
 
     @property
     def formula(self) -> CrowdDynamics | None:
-        return crowd_of(self._terms())
+        return crowd_of(self.term_list)
 
     def scene(self, batch: Batch) -> Scene:
         return with_destinations(super().scene(batch), batch, self.desired)

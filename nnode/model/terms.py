@@ -109,7 +109,7 @@ SEEN = {
     WALLS: _units(metre="dx dy along_x along_y"),
     SMALLEST: _units(metre="dx dy", speed="dvx dvy"),
 }
-_SEEN = frozenset(name for found in SEEN.values() for name in found)
+_SEEN = frozenset(name for names in SEEN.values() for name in names)
 #: Names of a lane, and their units.
 UNITS = _units(
     metre="x x_1 x_2 gap gap_1 length_1",
@@ -695,3 +695,16 @@ def own_values(terms: Sequence[Any], model: Dynamics) -> dict[str, Tensor]:
             value = getattr(value, part)  # may be a tensor in place of a parameter
         values[name] = value
     return values
+
+
+def parameter_values(
+    terms: Sequence[Any], model: Dynamics, parameters: Mapping[str, Tensor] | None = None
+) -> dict[str, Tensor]:
+    """Symbol to value of a model's parameters.
+
+    Args:
+        terms: the terms of the model, which have the default values.
+        parameters: name in the model to value; additional leading axes are kept.
+    """
+    values = values_of(model, {**own_values(terms, model), **(parameters or {})})
+    return dict(zip(model.owned, values, strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 from nnode.model.expression import Expr, topological
@@ -48,15 +47,15 @@ def number(value: float) -> str:
 
 def plain(node: Expr) -> str:
     """The text that :func:`nnode.model.parse.parse` reads; longer parts are written ``(...)``."""
-    return _written(node, _PLAIN, {})
+    return _written(node, _PLAIN)
 
 
-def latex(node: Expr, names: Mapping[str, str] | None = None) -> str:
-    """LaTeX for a page; ``names`` maps symbols to their notation."""
-    return _written(node, _LATEX, names or {})
+def latex(node: Expr) -> str:
+    """The LaTeX text for a page; longer parts are written ``(...)``."""
+    return _written(node, _LATEX)
 
 
-def _written(node: Expr, language: _Language, names: Mapping[str, str]) -> str:
+def _written(node: Expr, language: _Language) -> str:
     written: dict[Expr, _Part] = {}
     for part in topological([node]):
         args: tuple[Expr, ...] = part.args
@@ -65,8 +64,7 @@ def _written(node: Expr, language: _Language, names: Mapping[str, str]) -> str:
             text, level = number(part.value), 5 if part.value >= 0 else 3
         elif part.op == "symbol":
             # plain text shows a parameter's address
-            name = part.value.replace("__", ".") if language is _PLAIN else _subscript(part.value)
-            text = names.get(part.value, name)
+            text = part.value.replace("__", ".") if language is _PLAIN else _subscript(part.value)
         elif part.op == "mul" and args[0] is args[1]:
             text, level = language.square
         elif part.op == "mul" and "recip" in (args[0].op, args[1].op):

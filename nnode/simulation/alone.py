@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import takewhile
-from typing import cast
 
 import numpy as np
 import torch
@@ -85,7 +84,6 @@ class Surroundings:
         edges, solid = (part.numpy()[which] for part in walls_of(scene))
         is_near = np.broadcast_to(real, shape)[which, persons]
         people = people_of([], CrowdDynamics(), scene)
-        people |= dict(zip(("goal_x", "goal_y"), scene.destination.unbind(-1), strict=True))
         properties = [
             people[name].expand(scene.agent.shape).numpy()[which, persons] for name in FIELDS
         ]
@@ -116,7 +114,7 @@ class PersonAlone:
     def __init__(self, around: Surroundings, system: System, parameters: dict[str, Tensor]) -> None:
         self.around = around
         self.number = len(next(iter(parameters.values()))) if parameters else 1
-        terms = cast(list[Term], list(system.terms))
+        terms = system.term_list
         laws = list(takewhile(lambda term: isinstance(term, Law), terms))
         force, law = system.find(InteractionForce), crowd_of(laws)
         self.compiled = law is not None and not (force is not None and force.self_interaction)
@@ -149,7 +147,7 @@ class PersonAlone:
     def _systems(self) -> list[System]:
         """One model with the parameters of all runs, or one model per run."""
         parameters = self._parameters
-        code = cast(list[Term], [self._system.terms[i] for i in self._code])
+        code = [self._system.term_list[i] for i in self._code]
         scalar = all(value.ndim == 1 for value in parameters.values())
         if self.number > 1 and scalar and all(term.side_by_side for term in code):
             windows = len(self.around.scene.agent)
@@ -243,7 +241,7 @@ class PersonAlone:
         t = (at.to(rate.dtype) * around.step / 2).repeat_interleave(rate.shape[1])
         others = around.x[at].flatten(0, 1), around.v[at].flatten(0, 1)
         (x, v), scene = states.flatten(0, 1).split(2, -1), around.repeated(len(states))
-        terms = cast(list[Term], list(system.terms))
+        terms = system.term_list
         return State(t, x, v, scene, terms, rate=rate.flatten(0, 1), measured_others=others)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -13,7 +12,6 @@ from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.model.steps import METHODS
 from nnode.model.system import System, with_parameters
-from nnode.model.term import Term
 from nnode.simulation.base import (
     Trajectory,
     check_finite,
@@ -171,7 +169,7 @@ class FusedSolver:
 
 def _reason(system: System) -> str:
     """Why compiled code is not used: the names of terms that it does not cover."""
-    terms = cast(list[Term], list(system.terms))
+    terms = system.term_list
     names = ", ".join(t.name for t in terms if t.rule_for(system.order) is None)
     if names:
         return f"it does not cover {names}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,14 +23,14 @@ from nnode.model.scene import Scene
 from nnode.model.steps import stepped
 from nnode.model.system import System, Traffic, initial_with, with_parameters
 from nnode.model.term import State, Term
-from nnode.model.terms import LaneDynamics, own_values, values_of
+from nnode.model.terms import LaneDynamics, parameter_values
 
 
 def formula_of(system: System, terms: int | None = None) -> LaneDynamics | None:
     """The formula of a model's first terms, with speeds of at least 0; None if one is code."""
     if type(system) is not Traffic:
         return None
-    lane = lane_of(cast(list[Term], list(system.terms)[:terms]))
+    lane = lane_of(system.term_list[:terms])
     return stepped(lane, "euler") if lane is not None and lane.is_formula else None
 
 
@@ -60,7 +60,7 @@ class RightHandSide:
         self.system, self.scene, self.parameters = system, scene, parameters
         self.lane, self.code_prefix, self.coded = formula_of(system), "", slice(None)
         self.added: Term | None = None
-        terms = cast(list[Term], list(system.terms))
+        terms = system.term_list
         if self.lane is None and terms and terms[-1].side_by_side:
             self.lane = formula_of(system, -1)
             if self.lane is not None:
@@ -85,11 +85,8 @@ class RightHandSide:
         ]
         if self.lane is None:
             return
-        own_parameters = {
-            name: value.detach() for name, value in own_values(terms, self.lane).items()
-        }
-        parameter_values = values_of(self.lane, {**own_parameters, **(parameters or {})})
-        given = dict(zip(self.lane.owned, parameter_values, strict=True))
+        symbol_values = parameter_values(terms, self.lane, parameters)
+        given = {name: value.detach() for name, value in symbol_values.items()}
         values, inputs = symbols_of(terms, self.lane, scene, given)
         # the axis of runs is before that of sequences
         arrays = {

@@ -36,8 +36,7 @@ from nnode.model.terms import (
     LaneDynamics,
     Rule,
     add_term,
-    own_values,
-    values_of,
+    parameter_values,
 )
 from nnode.model.units import in_si
 
@@ -378,7 +377,7 @@ class Law(Term):
     def computed(self, formulas: Sequence[Expr], values: Mapping[str, Tensor]) -> list[Tensor]:
         """The values of formulas of its parameters, settings, networks and other quantities."""
         law = self.dynamics(called=True)
-        law_values = dict(zip(law.owned, values_of(law, own_values([self], law)), strict=True))
+        law_values = parameter_values([self], law)
         like = next(iter(values.values()))
         law_values |= {k: like.new_tensor(value) for k, value in settings_of([self], law).items()}
         return computed(formulas, {**law_values, **values}, code=self.code())

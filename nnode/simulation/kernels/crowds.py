@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -34,13 +34,20 @@ from nnode.model.expression import (
     symbols,
     topological,
 )
-from nnode.model.formula import own_values, values_of
 from nnode.model.laws import InteractionForce
 from nnode.model.names import check_symbols
 from nnode.model.operations import FUNCTIONS
 from nnode.model.system import Crowd, System
-from nnode.model.term import Term
-from nnode.model.terms import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdDynamics
+from nnode.model.terms import (
+    NOBODY,
+    OTHERS,
+    POINTS,
+    SEEN,
+    SMALLEST,
+    WALLS,
+    CrowdDynamics,
+    parameter_values,
+)
 from nnode.model.text import plain
 from nnode.simulation.kernels.loops import Loop
 from nnode.simulation.kernels.runs import (
@@ -558,7 +565,7 @@ def simulate(
         ConfigError: a cutoff that is not positive or omits contacts, a cutoff for a law with
             minima over others, or an error outside [0, 1).
     """
-    terms, scene = cast(list[Term], list(system.terms)), system.scene(batch)
+    terms, scene = system.term_list, system.scene(batch)
     y0 = system.initial(batch)
     if law.order == 1:
         y0 = torch.cat([y0, torch.zeros_like(y0)], -1)  # the rows of velocities are unused
@@ -587,7 +594,6 @@ def simulate(
     force = system.find(InteractionForce)
     alone = force is None or not force.self_interaction
     inputs = people_of(terms, law, scene)
-    inputs |= dict(zip(("goal_x", "goal_y"), scene.destination.unbind(-1), strict=True))
     # the last row is dropped; it gives the shape if there are no fields
     fields = [inputs[name].to(kind).expand(scene.agent.shape) for name in source.fields]
     present = scene.agent.to(kind)
@@ -612,7 +618,7 @@ def simulate(
         padding=~scene.agent.numpy(),
     )
     fixed = [y0.new_tensor(value) for value in settings_of(terms, law).values()]
-    q = torch.stack([*values_of(law, own_values(terms, law)), *fixed]).to(kind)
+    q = torch.stack([*parameter_values(terms, law).values(), *fixed]).to(kind)
     y: Tensor = Simulate.apply(plan, y0.permute(2, 0, 1), q[None]).permute(1, 2, 3, 0).contiguous()
     return y[..., : 2 * law.order]
 

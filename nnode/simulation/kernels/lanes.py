@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, cast
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -33,7 +33,6 @@ from nnode.model.names import check_symbols
 from nnode.model.steps import STAGES, stepped
 from nnode.model.system import System, Traffic, initial_with
 from nnode.model.tangent import with_tangents
-from nnode.model.term import Term
 from nnode.model.terms import LaneDynamics
 from nnode.model.text import plain
 from nnode.simulation.kernels.loops import Loop
@@ -425,7 +424,7 @@ def tangents(
         ``(K, B, N, M)`` states and their derivatives ``(P, K, B, N, M)``, which are 0 for a
         measured leader.
     """
-    x, terms = batch.x, cast(list[Term], list(system.terms))
+    x, terms = batch.x, system.term_list
     q = _row(lane, {name: p.detach()[None] for name, p in system.named_parameters()}).to(x.dtype)
     every = with_tangents(stepped(lane, method or system.step), tuple(names))
     if each is not None:
@@ -499,7 +498,7 @@ def _planned(
 
     inputs: dict[str, Tensor] = {}
     if source.fields:
-        inputs = inputs_of(cast(list[Term], list(system.terms)), lane, system.scene(batch))
+        inputs = inputs_of(system.term_list, lane, system.scene(batch))
         inputs["start"] = batch.start[:, None].expand(-1, agents)
     fields = [tiled(inputs[name].to(x.dtype)) for name in source.fields]
     path = x.new_empty(2, 0, 0)
