@@ -11,7 +11,7 @@ from nnode.errors import NNodeError
 
 
 class Interrupted(NNodeError):
-    """A run was asked to stop and has saved its state.
+    """A signal stopped a run, which has saved its state.
 
     Attributes:
         signal: number of the signal.

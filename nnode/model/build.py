@@ -126,7 +126,7 @@ def add_effects(model: System, chosen: Sequence[str | Options]) -> None:
         model.terms.append(effect)
         if model.domain == "traffic" and model.order > 1:
             try:
-                model.formula  # noqa: B018 - says what the law does not have
+                model.formula  # noqa: B018 - raises the error
             except ConfigError as error:
                 raise ConfigError(f"model.effects: {effect.name} cannot act: {error}") from error
 

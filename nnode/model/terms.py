@@ -320,7 +320,7 @@ class LaneDynamics(Dynamics):
         names = {name: symbol(name) for name in UNITS if name not in hidden}
         if self.top in self.rates:
             return {**names, "W": self.rates[self.top]}
-        del names["second"]  # a law looks one vehicle ahead
+        del names["second"]  # laws depend on one vehicle ahead
         return names
 
     @cached_property

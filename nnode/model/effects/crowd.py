@@ -201,7 +201,7 @@ class Anticipation(ForceEffect):
 
 @CATALOGUE.add
 class EvasiveRotation(ForceEffect):
-    """The force of those who come towards a person pushes him aside, not back.
+    """The force of oncoming people pushes a person sideways instead of back.
 
     The force is turned by theta (1 - cos gamma)/2, gamma the angle between the two walking
     directions: by theta for people who meet head on, not at all for people who walk the same
@@ -295,8 +295,8 @@ class GaitSway(CrowdEffect, IndividualEffect):
 class SidePreference(PairEffect):
     """People step to one side, to the right for c > 0, when somebody comes towards them.
 
-    The weight of an encounter is how far the other is ahead, how straight he comes, and how near
-    he is.
+    The weight of an encounter increases with the alignment of the other person with the walking
+    direction, with the opposition of both walking directions, and with proximity.
     """
 
     name = "side_preference"

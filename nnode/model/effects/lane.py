@@ -123,7 +123,7 @@ def _sizes(batch: Batch, system: System) -> list[float]:
 
 @CATALOGUE.add
 class SpeedZone(_Cells):
-    """A section of the road where everyone drives slower or faster than the law says."""
+    """A section of the road where all vehicles drive slower or faster than by the law."""
 
     name = "speed_zone"
     rules, settings = _inside("x", "m", "alpha/(alpha + (1 - alpha)*share)", 100.0)
@@ -139,7 +139,7 @@ class SpeedZone(_Cells):
 
 @CATALOGUE.add
 class SpeedPeriod(_Cells):
-    """A time of the clock when everyone drives slower or faster than the law says."""
+    """A period of the day in which all vehicles drive slower or faster than by the law."""
 
     name = "speed_period"
     rules, settings = _inside("clock", "s", "1 + (alpha - 1)*share", 60.0)
@@ -174,7 +174,7 @@ class Slope(LaneEffect):
 
 @CATALOGUE.add
 class VehicleClass(LaneEffect):
-    """Vehicles of one class drive slower or faster than the law says.
+    """Vehicles of one class drive slower or faster than by the law.
 
     Args:
         kind: the class.
@@ -219,7 +219,7 @@ class VehicleClass(LaneEffect):
 
 @CATALOGUE.add
 class DriverHeterogeneity(LaneEffect, IndividualEffect):
-    """Every driver has a pace of his own, with mean zero over the drivers.
+    """Drivers differ in their pace, with mean zero over the drivers.
 
     ``people`` holds their eta_i.
     """
@@ -268,7 +268,7 @@ class LeaderLength(LawEffect):
 
 @CATALOGUE.add
 class FreeFlowSpeed(LaneEffect):
-    """Nobody drives faster than a desired speed, however long the gap."""
+    """No vehicle drives faster than a desired speed, even for long gaps."""
 
     name = "free_flow_speed"
     rules = {1: Rule(rate="W - max(W - v_max, 0)")}
@@ -434,7 +434,7 @@ class ReactionDelay(LawEffect):
 
 @CATALOGUE.add
 class Inertia(LawEffect):
-    """A vehicle needs time to reach the speed, or acceleration, that the law says."""
+    """A vehicle reaches the speed, or acceleration, of the law with a time lag."""
 
     name = "inertia"
     rules = {
@@ -499,7 +499,7 @@ class Memory(LaneEffect):
 
 @CATALOGUE.add
 class LastingTimeGap(LaneEffect):
-    """Every driver keeps a time gap of his own.
+    """Drivers differ permanently in their time gaps.
 
     It is estimated from the time gap of the first state, as ``memory`` defines it. The first state
     depends on temporary deviations as well, so a share of the difference is kept.

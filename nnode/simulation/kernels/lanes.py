@@ -3,8 +3,8 @@
 The simulation of a lane and its exact gradient are generated as source text. A block of ``width``
 simulations is one row of numbers: vehicle i of simulation b has the index ``i * w + b``, with
 w >= width. The values of the vehicles ahead are the same row shifted by w, so that every loop runs
-over contiguous numbers. Numba cannot tell the compiler that two arrays do not overlap. Therefore
-all rows of a block are in one buffer, at distances that are compile-time constants.
+over contiguous numbers. With separate arrays, the compiler could not exclude that they overlap.
+Therefore all rows of a block are in one buffer, at distances that are compile-time constants.
 
 An increment of a state is
 
