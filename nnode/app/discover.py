@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import plain_config
+from nnode.app.cli.saved import options_of, plain_config
 from nnode.app.cli.typed import changes, group_defaults, plain_options, shell_override
 from nnode.app.nearest_law import Job, candidates, diagnosed, unwatched
 from nnode.app.python.inputs import (
@@ -80,8 +80,8 @@ def discover(config: DictConfig, folder: Path) -> None:
         try:
             config = with_prepared(config)
             plain = plain_config(config)
-            options = cast(DiscoverOptions, OmegaConf.to_object(config.discover))
-            data = cast(DataOptions, OmegaConf.to_object(config.data))
+            options: DiscoverOptions = options_of(config.discover)
+            data: DataOptions = options_of(config.data)
             read = partial(read_inputs, data, folder / "data")
             job = _job(plain["model"], data, plain["data"], plain["groups"], options, read)
             diagnoses = diagnosed(job, Stages)

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
 from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved
+from nnode.app.cli.saved import merge_saved, options_of
 from nnode.app.training import (
     build_solver,
     set_threads,
@@ -99,8 +99,8 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     """
     checkpoint = load_checkpoint(config.checkpoint)
     config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
-    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
-    solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
+    data: DataOptions = options_of(config.data)
+    solver_options: SolverOptions = options_of(config.solver)
     set_threads(checkpoint.config["trainer"]["threads"], data.domain)
     store = open_data(data, folder / "data")
     part, indices, trained = choose(store, checkpoint, config.part)

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.runs import RESULT
-from nnode.app.cli.saved import merge_saved, path_given, saved_groups
+from nnode.app.cli.saved import merge_saved, options_of, path_given, saved_groups
 from nnode.app.evaluate import choose
 from nnode.app.training import build_solver, set_threads, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
@@ -121,8 +121,8 @@ def export(config: DictConfig, folder: Path) -> None:
         raise ConfigError(
             f"trajectories={config.trajectories} is unknown, expected {', '.join(SOURCES)}"
         )
-    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
-    solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
+    data: DataOptions = options_of(config.data)
+    solver_options: SolverOptions = options_of(config.solver)
     set_threads(checkpoint.config["trainer"]["threads"], data.domain)
     store = open_data(data, folder / "data")
     part, indices, _ = choose(store, checkpoint, config.part)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved
+from nnode.app.cli.saved import merge_saved, options_of
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
@@ -72,7 +72,7 @@ def _traffic(
     models: dict[str, System], config: DictConfig, first: Checkpoint, folder: Path
 ) -> list[Path]:
     merged = with_prepared(merge_saved(config, first.config, ("data",)))
-    data: DataOptions = OmegaConf.to_object(merged.data)  # type: ignore[assignment]
+    data: DataOptions = options_of(merged.data)
     try:
         store = open_data(data, folder / "data")
         gaps = measured_gaps(store[i] for i in range(len(store)))

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.calibration import Calibration
 from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved
+from nnode.app.cli.saved import merge_saved, options_of
 from nnode.app.evaluate import choose
 from nnode.app.export import checkpoint_of
 from nnode.app.python.inputs import Table, data_used
@@ -91,7 +91,7 @@ def simulate(config: DictConfig, folder: Path) -> None:
     if config.format is not None:  # checked before the long computation
         check_format("format", config.format, checkpoint.build().domain)
     config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
-    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
+    data: DataOptions = options_of(config.data)
     result = _simulated(
         checkpoint,
         open_data(data, folder / "data"),

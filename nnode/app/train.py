@@ -7,12 +7,12 @@ import signal
 import time
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.calibration import Calibration, calibrated
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.runs import RESULT
-from nnode.app.cli.saved import merge_saved, plain_config, refuse_changes
+from nnode.app.cli.saved import merge_saved, options_of, plain_config, refuse_changes
 from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver, check, model_of, trainer_of
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -62,13 +62,13 @@ def train(config: DictConfig, folder: Path) -> None:
     folder = world.from_first(folder)
     with world.together():
         config, checkpoint = _composed(config)
-    options: TrainerOptions = OmegaConf.to_object(config.trainer)  # type: ignore[assignment]
+    options: TrainerOptions = options_of(config.trainer)
     device = world.use(options.device, "trainer.device")
     with world.together():
         model, store = model_of(config), None
-        solver = build_solver(OmegaConf.to_object(config.solver), device)  # type: ignore[arg-type]
+        solver = build_solver(options_of(config.solver), device)
         if world.first:
-            data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
+            data: DataOptions = options_of(config.data)
             store = open_data(data, folder / "data")
     place = world.from_first(Path() if store is None else store.folder)
     with world.together():

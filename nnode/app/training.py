@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch.utils.data import DataLoader
 
+from nnode.app.cli.saved import options_of
 from nnode.app.drivers import NONE, planned
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.distributed import World
@@ -173,9 +174,9 @@ def trainer_of(
         NNodeError: the data are not those of the checkpoint, or options are incompatible.
     """
     world = world or World()
-    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
-    options: TrainerOptions = OmegaConf.to_object(config.trainer)  # type: ignore[assignment]
-    optimizer_options: Any = OmegaConf.to_object(config.optimizer)
+    data: DataOptions = options_of(config.data)
+    options: TrainerOptions = options_of(config.trainer)
+    optimizer_options: Any = options_of(config.optimizer)
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
     _check_pooling(options.pooling, model, optimizer_options.name)

@@ -40,6 +40,15 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, enum_to_str=True))
 
 
+def options_of(section: DictConfig) -> Any:
+    """A section of a configuration as its dataclass of options.
+
+    Raises:
+        MissingMandatoryValue: a mandatory option has no value.
+    """
+    return OmegaConf.to_object(section)
+
+
 def plain_config(config: DictConfig) -> dict[str, Any]:
     """The composed configuration in plain types, with the chosen groups.
 

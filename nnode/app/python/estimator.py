@@ -16,6 +16,7 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.calibration import Calibration, calibrated
+from nnode.app.cli.saved import options_of
 from nnode.app.python.inputs import choice, data_of, model_options, sequences
 from nnode.app.python.words import python_words
 from nnode.app.training import (
@@ -119,7 +120,7 @@ class Calibrator:
         check(config)
         with threads_given_back():
             model = self._built(config, given)
-            solver = build_solver(OmegaConf.to_object(config.solver))  # type: ignore[arg-type]
+            solver = build_solver(options_of(config.solver))
             plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
             assert isinstance(plain, dict)
             plain_values = {str(key): value for key, value in plain.items()}

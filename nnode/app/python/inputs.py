@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException, ValidationError
 
 from nnode.app.cli.mistakes import unknown_option, wrong_value
+from nnode.app.cli.saved import options_of
 from nnode.app.cli.typed import plain_options, written
 from nnode.app.python.words import python_words
 from nnode.calibrate.checkpoint import Checkpoint
@@ -250,7 +251,7 @@ def data_options(data: str, given: Mapping[str, Any], *, in_memory: bool = False
     if in_memory and OmegaConf.is_missing(options, "path"):
         options.path = ""
     try:
-        return cast(DataOptions, OmegaConf.to_object(options))
+        return cast(DataOptions, options_of(options))
     except MissingMandatoryValue as error:
         raise ConfigError(f"data.{error.full_key} is not set; give it a value") from None
 
@@ -268,9 +269,7 @@ def _saved_options(
     schema = next((kind for kind in FORMATS if kind.__name__ == manifest.get("reader")), None)
     if schema is None or values is None:
         return None
-    return cast(
-        DataOptions, OmegaConf.to_object(merged("data", schema, with_present_names(values)))
-    )
+    return cast(DataOptions, options_of(merged("data", schema, with_present_names(values))))
 
 
 def data_used(checkpoint: Checkpoint) -> Source:
