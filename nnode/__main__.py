@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 import textwrap
-from difflib import get_close_matches
 from importlib import import_module
 
+from nnode.errors import suggestion
 from nnode.program import COMMANDS, words
 from nnode.version import VERSION
 
@@ -24,10 +24,11 @@ def main() -> None:
         del sys.argv[1]
         import_module(f"nnode.app.commands.{name}").main()
     else:
-        near = get_close_matches(name, names, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        said = f"error: there is no command {name}, expected one of {', '.join(names)}{hint}"
-        print(said, file=sys.stderr)
+        print(
+            f"error: there is no command {name}, expected one of {', '.join(names)}"
+            f"{suggestion(name, names)}",
+            file=sys.stderr,
+        )
         sys.exit(2)
 
 

@@ -6,6 +6,8 @@ Every message says what was expected, what was found, where (file, row, option) 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 #: Characters of a message, at most.
@@ -31,6 +33,16 @@ def printable(text: str, limit: int = LONGEST) -> str:
     note = f" [... {len(shown)} characters in all ...] "
     left = limit - len(note)
     return shown[: left - left // 3] + note + shown[len(shown) - left // 3 :]
+
+
+def suggestion(word: str, words: Iterable[str], cutoff: float = 0.6) -> str:
+    """The end of a message that suggests the most similar of some words; empty for none.
+
+    Args:
+        cutoff: smallest similarity, see :func:`difflib.get_close_matches`.
+    """
+    near = get_close_matches(word, list(words), n=1, cutoff=cutoff)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 class NNodeError(Exception):

@@ -177,7 +177,7 @@ def _best(problem: ResidualProblem, start: np.ndarray) -> Minimum:
     Paths of people have jumps in the parameters, where someone else comes nearest: derivatives lead
     close to a minimum, and a search without them ends in it.
     """
-    first = pooled(problem, problem.begin(start), steps=60, tolerance=1e-9)
+    first = pooled(problem, problem.initial_fit(start), steps=60, tolerance=1e-9)
     by_simplex = minimize(
         lambda share: float(problem.costs(first.row * share).mean()),
         np.ones(len(start)),

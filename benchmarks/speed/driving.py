@@ -84,7 +84,7 @@ def alone(program: str, scenario: Path, folder: Path) -> dict[str, Any]:
     sumo = RunningSumo(program, scenario, folder / "fcd.xml.gz")
     steps, started = 0, time.perf_counter()
     try:
-        while sumo.going_on(None):
+        while sumo.continues(None):
             sumo.step()
             steps += 1
     finally:

@@ -1,4 +1,4 @@
-"""What a calibration found, as an object: the command writes it, Python hands it over."""
+"""The result of a calibration, which the command writes and Python returns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from scipy.stats import t as students_t
 
 from nnode.app.drivers import AUTO, EXACT, NONE, Drivers, calibrated_drivers
-from nnode.app.training import straight_loader, stream
+from nnode.app.training import positions, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, copied, save_checkpoint
 from nnode.calibrate.evaluate import Metrics, evaluate, sensitivity
 from nnode.calibrate.optimizers.gauss_newton import GaussNewton
@@ -41,23 +41,24 @@ from nnode.simulation import Solver
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from nnode.calibrate.pooling import Own
+    from nnode.calibrate.pooling import SequenceParameters
 
 log = logging.getLogger(__name__)
 
 _BOUND = {"low": "lower", "high": "upper"}
-#: Relative change of a cost by relative change of a parameter below which a minimum is reached.
-#: Of ``sf`` on Jülich data it is 5e-6 at most at minima, and 0.11 and 0.24 where L-BFGS stalls
-#: from two starts. Of ``lin`` on a noisy platoon it is 1.2e-3 at a minimum as deep as Gauss and
-#: Newton's: the cost is so curved that rounding leaves a slope. The level is the geometric mean.
+#: Relative change of the cost by the relative change of a parameter below which a minimum is
+#: reached. For ``sf`` on Jülich data it is at most 5e-6 at minima, and 0.11 and 0.24 where L-BFGS
+#: stalls from two starts. For ``lin`` on a noisy platoon it is 1.2e-3 at a minimum with the cost of
+#: Gauss-Newton's: the curvature is so large that rounding leaves a slope. The level is the
+#: geometric mean.
 _LEVEL = 1e-2
-#: An epoch moved nothing where it lowered the cost by less than moving one parameter by this share
-#: does at first order.
+#: An epoch is stalled if it lowered the cost by less than the first-order change by this relative
+#: change of one parameter.
 _MOVED = 1e-4
-#: Share of the first cost below which the data are fitted without any error, as those of a model's
-#: own simulation are: relative changes of such a cost say nothing.
+#: Share of the first cost below which the data are fitted exactly, as a model's own simulation.
+#: Relative changes of such a cost are rounding errors.
 _EXACT = 1e-6
-#: Sequences that are simulated at once.
+#: Number of sequences that are simulated at once.
 _TOGETHER = 32
 STALLED = (
     "the line search stalled: the last epoch found no lower cost, although the gradient is not 0; "
@@ -72,21 +73,21 @@ _CORRELATED = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """How well a calibrated model fits its training sequences.
+    """The goodness of fit of a calibrated model on its training sequences.
 
-    Agents that the model is given as they were measured, such as a measured leader, do not count,
-    and neither does the first sample of a sequence, where the simulation starts.
+    It excludes agents that follow their measured paths, such as a measured leader, and the first
+    sample of a sequence, where the simulation starts.
 
     Attributes:
         sequences, agents: their numbers; an agent counts once per sequence.
         observations: number of measured coordinates.
         clusters: number of independent clusters.
-        parameters: number of calibrated parameters, with those of the variances.
+        parameters: number of calibrated parameters, including those of the variances.
         rmse: root mean square distance of simulated from measured positions, m.
-        autocorrelation: of the residuals of an agent, at one sample.
+        autocorrelation: autocorrelation of an agent's residuals at a lag of one sample.
         log_likelihood: logarithm of the likelihood of the positions (m) at the estimates.
-        likelihood: ``independent normal errors`` of one variance; or ``mixed-effects model`` where
-            drivers differ: the marginal likelihood, with the covariance of disturbances.
+        likelihood: ``independent normal errors`` of one variance; or ``mixed-effects model`` if
+            drivers differ, which is the marginal likelihood with the covariance of disturbances.
     """
 
     sequences: int
@@ -112,48 +113,49 @@ class Fit:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """A calibrated model, and what the data say of it.
+    """A calibrated model with estimates, intervals and fit statistics.
 
     Attributes:
         model: a torch module, with the parameters of the best evaluation.
         parameters: a row per physical parameter, by its address such as ``idm.T``: ``estimate``,
-            ``lower`` and ``upper`` ends of its interval of 95 % by clusters (NaN where there is
-            none: models without exact tangents, or at a bound), ``unit``, ``at_bound`` (``low``,
-            ``high`` or empty) and ``identified`` (None where there are no intervals); then
-            ``std_error``, the degrees of freedom ``df`` of Student's quantile, and ``scale``, in
-            which the interval is symmetric: ``linear`` or ``log``.
-        correlation: of the estimates, by address; None without intervals.
-        clusters: number of independent clusters behind the intervals; None without.
-        cost: mean cost of a training sequence, at the best evaluation; ``cost_start`` at the first.
-        cost_heldout: that of a held-out sequence; NaN where none is held out. ``heldout_start``.
-        cost_unit: of all costs.
-        epoch: of the best evaluation.
-        n_iter: epochs that were done.
+            ``lower`` and ``upper`` ends of its 95 % interval by clusters (NaN without an interval:
+            for models without exact tangents, or at a bound), ``unit``, ``at_bound`` (``low``,
+            ``high`` or empty) and ``identified`` (None without intervals); then ``std_error``, the
+            degrees of freedom ``df`` of Student's quantile, and ``scale``, in which the interval
+            is symmetric: ``linear`` or ``log``.
+        correlation: correlation of the estimates, by address; None without intervals.
+        clusters: number of independent clusters for the intervals; None without intervals.
+        cost: mean cost of a training sequence at the best evaluation; ``cost_start`` at the first.
+        cost_heldout: the same for a held-out sequence; NaN if none is held out. ``heldout_start``
+            is its value at the first evaluation.
+        cost_unit: unit of all costs.
+        epoch: epoch of the best evaluation.
+        n_iter: number of epochs.
         history: one row per evaluation: epoch, costs, parameters.
-        own: parameters of each training sequence's own, where ``trainer.pooling`` asks for them: a
-            row per sequence with ``cost_pool`` (with those of all) and ``cost``; None: there are
-            none. ``parameters`` and ``cost_heldout`` are the pool's, which another sequence gets.
-        pooling: how they came about, and costs of second halves, which they were not calibrated on.
-        drivers: what was found of drivers who differ, with ``drivers.variability``: standard
-            deviations of parameters between drivers (%, of logarithms), of the pushes that disturb
-            them (m/s or m/s²) and of the errors of measurement (m), and the time that pushes last
-            (s), with intervals of 95 %; and ``drivers.table``: a row per driver with the own
-            parameters, their standard errors, and ``shrinkage``, the share of the variance between
-            drivers that the driver's data leave. ``parameters`` are then the medians over drivers.
-            None: all drivers share their parameters.
-        start_speeds: ``kind``, measured, smoothed or fitted; of fitted ones ``sequences``, first
-            speeds (m/s) by vehicle, and their root mean square ``change`` from those that
-            simulations start with otherwise.
-        noise: of the measurement, see :class:`nnode.data.smooth.Noise`.
-        filled: number of missing samples of the data that were interpolated.
+        own: separate parameters of each training sequence for ``trainer.pooling``: a row per
+            sequence with ``cost_pool`` (with pooled parameters) and ``cost``; None for pooled
+            parameters only. ``parameters`` and ``cost_heldout`` are the pooled ones.
+        pooling: the kind of separate parameters, and costs of second halves, which were not used
+            for their calibration.
+        drivers: results for drivers who differ. ``drivers.variability`` has standard deviations of
+            parameters between drivers (%, of logarithms), of disturbances (m/s or m/s²) and of
+            measurement errors (m), and the correlation time of disturbances (s), with intervals of
+            95 %. ``drivers.table`` has a row per driver with the driver's parameters, their
+            standard errors, and ``shrinkage``, the posterior variance relative to the variance
+            between drivers. ``parameters`` are then the medians over drivers. None if all drivers
+            share their parameters.
+        start_speeds: ``kind``, measured, smoothed or fitted; for fitted speeds ``sequences``, first
+            speeds (m/s) by vehicle, and ``change``, their root mean square difference from the
+            speeds with which simulations start otherwise.
+        noise: noise of the measurement, see :class:`nnode.data.smooth.Noise`.
+        filled: number of interpolated missing samples of the data.
         status: ``converged``; ``stalled``: the line search of L-BFGS found no lower cost although
-            the gradient says that there is one; ``stopped``: at the last epoch, or of a method that
-            does not say.
-        uncompiled: why compiled code was not taken; empty where it was, or was not asked for.
-        seconds: that the training took.
-        checkpoint: enough to build the model again, with options, division of the data, versions.
-        solver: that simulates the model.
-        measured: the sequences of the training and the held-out ones, as the model starts on them.
+            the gradient is not 0; ``stopped``: at the last epoch, or unknown for the optimiser.
+        uncompiled: why compiled code was not used; empty if it was used or not requested.
+        seconds: time of the training, s.
+        checkpoint: all that rebuilds the model, with options, division of the data and versions.
+        solver: the solver that simulates the model.
+        measured: the training and held-out sequences, with the speeds of the simulations' starts.
     """
 
     model: System
@@ -183,12 +185,12 @@ class Calibration:
 
     @property
     def name(self) -> str:
-        """Of the model."""
+        """Name of the model."""
         return str(self.checkpoint.config["model"]["name"])
 
     @cached_property
     def fit(self) -> Fit:
-        """How well the model fits the training sequences, which are simulated for it once."""
+        """The goodness of fit on the training sequences, which are simulated once."""
         items = self._sequences("train")
         square, before, after, lagged, agents, samples, dims = 0.0, 0.0, 0.0, 0.0, 0, 0, 1
         for s, path in zip(items, self._simulated(items), strict=True):
@@ -203,7 +205,7 @@ class Calibration:
         variance = max(square / number, np.finfo(float).tiny)
         trained = sum(p.numel() for p in self.model.parameters() if p.requires_grad)
         label = clusters(self.measured.index)[self._indices("train")]
-        found = Fit(
+        fit = Fit(
             sequences=len(items),
             agents=agents,
             observations=number,
@@ -214,9 +216,9 @@ class Calibration:
             log_likelihood=float(-0.5 * number * (np.log(2 * np.pi * variance) + 1)),
         )
         if self.drivers is None:
-            return found
+            return fit
         return replace(
-            found,
+            fit,
             observations=self.drivers.observations,
             parameters=trained + self.drivers.variances,
             log_likelihood=self.drivers.log_likelihood,
@@ -242,7 +244,7 @@ class Calibration:
         return "\n".join(line.rstrip() for line in lines)
 
     def _table(self) -> list[str]:
-        """The parameters, a line each, with what is wrong with an estimate."""
+        """The table of parameters, with remarks on estimates, line by line."""
         short = short_names(map(str, self.parameters.index))
         width = max([*map(len, short.values()), 10])
         heads = ("estimate", "std err", "[0.025", "0.975]")
@@ -267,7 +269,7 @@ class Calibration:
         return lines
 
     def _remarks(self) -> list[str]:
-        """What a reader of the table should know about the data and the method."""
+        """Remarks on the data and the method."""
         unit, fit, lines = self.cost_unit, self.fit, []
         if self.status == "stalled":
             lines.append(STALLED)
@@ -307,7 +309,7 @@ class Calibration:
         """Confidence intervals of the parameters, ``lower`` and ``upper`` by address.
 
         They are robust to dependence within clusters (CR2 with Satterthwaite's degrees of freedom)
-        and end at the bounds of what is admissible. Those without an interval are NaN.
+        and are clipped to the admissible set. Parameters without an interval have NaN.
 
         Args:
             alpha: one minus the level.
@@ -339,14 +341,14 @@ class Calibration:
         """Measured minus simulated positions, m.
 
         Args:
-            part: ``train`` or ``heldout``: which sequences.
+            part: ``train`` or ``heldout``, the set of sequences.
 
         Returns:
             A row per sequence, time (s) and agent, with ``x``, ``x_simulated`` and ``residual``
-            (for people ``y``, ``y_simulated``, ``residual_x`` and ``residual_y`` too), in the order
-            of the table and with its keys. The first sample of a sequence is left out, since the
-            simulation starts there, and so are agents that the model is given as they were
-            measured. Where drivers differ, all are simulated with the typical driver's parameters.
+            (for people also ``y``, ``y_simulated``, ``residual_x`` and ``residual_y``), in the
+            order of the table and with its keys. The first sample of a sequence, where the
+            simulation starts, and agents that follow their measured paths are excluded. If drivers
+            differ, all are simulated with the typical driver's parameters.
 
         Raises:
             ConfigError: no such part.
@@ -356,22 +358,23 @@ class Calibration:
         if not items:
             raise DataError("no sequence is held out; fit with heldout=0.2, for example")
         paths = list(self._simulated(items))
-        table, told = (Sequences(them).to_dataframe() for them in (items, paths))
-        kept = np.concatenate([_counted(self.model, s).ravel() for s in items])
-        found = table[["sequence", "time", "agent"]].copy()
+        table, simulated_table = (
+            Sequences(part_sequences).to_dataframe() for part_sequences in (items, paths)
+        )
+        counted = np.concatenate([_counted(self.model, s).ravel() for s in items])
+        residuals = table[["sequence", "time", "agent"]].copy()
         axes = "xy"[: items[0].x.shape[2]]
         for axis in axes:
-            found[axis], found[f"{axis}_simulated"] = table[axis], told[axis]
+            residuals[axis], residuals[f"{axis}_simulated"] = table[axis], simulated_table[axis]
             name = "residual" if len(axes) == 1 else f"residual_{axis}"
-            found[name] = table[axis] - told[axis]
-        return found[kept].reset_index(drop=True)
+            residuals[name] = table[axis] - simulated_table[axis]
+        return residuals[counted].reset_index(drop=True)
 
     def _indices(self, part: str) -> list[int]:
-        """Where the measured sequences of a part are."""
+        """Positions of a part's sequences among the measured ones."""
         if part not in ("train", "heldout"):
             raise ConfigError(f"part={part}: expected train or heldout")
-        places = {entry["name"]: i for i, entry in enumerate(self.measured.index)}
-        return [places[name] for name in self.checkpoint.split.get(part, [])]
+        return positions(self.measured, self.checkpoint.split.get(part, []))
 
     def _sequences(self, part: str) -> list[Sequence]:
         return [self.measured[i] for i in self._indices(part)]
@@ -381,7 +384,7 @@ class Calibration:
         return simulated(lambda b: self.solver(self.model, b), items, size=_TOGETHER, dtype=dtype)
 
     def _started(self) -> str:
-        """What was done about first speeds that noise makes wrong."""
+        """The remark on noisy first speeds; empty if the noise is small."""
         bad = self.noise.beyond and self.model.domain == "traffic" and self.model.order > 1
         if not bad:
             return ""
@@ -416,28 +419,33 @@ class Calibration:
         Needs xarray: ``pip install 'nnode[xarray]'``.
         """
         names = [str(name) for name in self.parameters.index]
-        found = {
+        variables = {
             key: ("parameter", self.parameters[key].to_numpy(dtype=float))
             for key in ("estimate", "lower", "upper")
         }
         if self.correlation is not None:
             table = self.correlation.loc[names, names].to_numpy(dtype=float)
-            found["correlation"] = (("parameter", "other"), table)  # type: ignore[assignment]
+            variables["correlation"] = (("parameter", "other"), table)  # type: ignore[assignment]
         for key in (key for key in self.history if str(key).startswith("cost/")):
-            found[str(key).replace("/", "_")] = ("epoch", self.history[key].to_numpy(dtype=float))
+            variables[str(key).replace("/", "_")] = (
+                "epoch",
+                self.history[key].to_numpy(dtype=float),
+            )
         coords = {
             "parameter": names,
             "unit": ("parameter", self.parameters["unit"].to_list()),
             "epoch": self.history["epoch"].to_numpy(dtype=int),
         } | ({} if self.correlation is None else {"other": names})
-        return xarray().Dataset(found, coords, {"model": self.name, "cost_unit": self.cost_unit})
+        return xarray().Dataset(
+            variables, coords, {"model": self.name, "cost_unit": self.cost_unit}
+        )
 
     def save(self, path: str | Path) -> Path:
         """Write a checkpoint that :func:`nnode.load` and the commands read.
 
         Raises:
-            ConfigError: the model was built by hand, so that no options describe it.
-            WriteError: no room, or not allowed.
+            ConfigError: the model was built by hand, so no options describe it.
+            WriteError: the disk is full or the folder is not writable.
         """
         if not self.checkpoint.config["model"].get("term"):
             raise ConfigError(
@@ -452,7 +460,7 @@ class Calibration:
         config = self.checkpoint.config
         rows = _rows(self.parameters)
         heldout = self.cost_heldout if np.isfinite(self.cost_heldout) else None
-        found: dict[str, Any] = {
+        content: dict[str, Any] = {
             "summary": {
                 "model": config["model"]["name"],
                 "data": config["data"]["name"],
@@ -469,22 +477,25 @@ class Calibration:
             "parameters": {name: _as_json(row) for name, row in rows.items()},
         }
         if self.correlation is not None:
-            found["correlation"] = {
+            content["correlation"] = {
                 name: {other: _number(value) for other, value in row.items()}
                 for name, row in _rows(self.correlation).items()
             }
-            found["clusters"] = self.clusters
+            content["clusters"] = self.clusters
         if self.own is not None:
-            found["pooling"] = {**self.pooling, "sequences": self.own.to_dict("records")}
+            content["pooling"] = {**self.pooling, "sequences": self.own.to_dict("records")}
         if self.drivers is not None:
-            found["drivers"] = self.drivers.plain()
-        found["start_speeds"] = self.start_speeds
-        found["noise"], found["filled"] = self.noise.plain(), self.filled
-        found["solver"] = {"name": config["solver"]["name"], "uncompiled": self.uncompiled or None}
+            content["drivers"] = self.drivers.plain()
+        content["start_speeds"] = self.start_speeds
+        content["noise"], content["filled"] = self.noise.plain(), self.filled
+        content["solver"] = {
+            "name": config["solver"]["name"],
+            "uncompiled": self.uncompiled or None,
+        }
         rows_of = self.history.to_dict("records")
-        # what was not measured at an evaluation is not there
+        # NaN stands for values that an evaluation does not have
         history = [{key: v for key, v in row.items() if v == v} for row in rows_of]
-        return {**found, "paths": paths, "history": history}
+        return {**content, "paths": paths, "history": history}
 
     def __repr__(self) -> str:
         lines = [*self._costs(), *self._table(), *self._remarks()]
@@ -503,26 +514,26 @@ class Calibration:
 
 
 def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
-    """What a training came to, when it has ended.
+    """The result of a finished training.
 
     Args:
-        trainer: its loader's sequences are those of ``store``.
-        seconds: that it took.
+        trainer: the trainer, whose sequences are those of ``store``.
+        seconds: time of the training.
     """
     history, checkpoint = trainer.history, trainer.best_checkpoint()
     first = history[0]
     best = min(history, key=lambda row: abs(row["epoch"] - trainer.best_epoch))
     model = copy.deepcopy(trainer.model).cpu()
     model.load_state_dict(checkpoint.model)
-    found, own, speeds = _by_tangents(trainer, model, store)
-    # an epoch of an older checkpoint that was resumed may know its parameters by other names
-    known = {name: best.get(f"parameters/{name}") for name in model.physical()}
-    values = {name: value for name, value in known.items() if value is not None}
+    estimated, separate, speeds = _by_tangents(trainer, model, store)
+    values = _logged_parameters(model, best)
     costs = {part: best.get(f"cost/{part}", float("nan")) for part in ("train", "heldout")}
     drivers = _drivers(trainer, store)
     if drivers is not None:
         model = drivers.model
-        found = {key: getattr(drivers, key) for key in ("parameters", "correlation", "clusters")}
+        estimated = {
+            key: getattr(drivers, key) for key in ("parameters", "correlation", "clusters")
+        }
         checkpoint = replace(checkpoint, model=copied(dict(model.state_dict())))
         values = {name: float(value) for name, (value, _) in model.physical().items()}
         costs = {part: _cost(trainer, model, part) for part in costs}
@@ -533,20 +544,20 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         status = _status(trainer, model, store)
     if status == "stalled":
         log.warning("%s", STALLED)
-    told = found.get("parameters", {})
+    interval_of = estimated.get("parameters", {})
     rows = {
-        name: _row(values[name], unit, told.get(name))
+        name: _row(values[name], unit, interval_of.get(name))
         for name, (_, unit) in model.physical().items()
         if name in values
     }
     columns = ["estimate", "lower", "upper", "unit", "at_bound", "identified"]
     columns += ["std_error", "df", "scale"]
-    correlation = found.get("correlation")
+    correlation = estimated.get("correlation")
     return Calibration(
         model=model,
         parameters=pd.DataFrame.from_dict(rows, orient="index", columns=columns),
         correlation=None if correlation is None else pd.DataFrame.from_dict(correlation, "index"),
-        clusters=found.get("clusters"),
+        clusters=estimated.get("clusters"),
         cost=costs["train"],
         cost_start=first["cost/train"],
         cost_heldout=costs["heldout"],
@@ -555,12 +566,12 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         epoch=trainer.best_epoch,
         n_iter=trainer.epoch,
         history=pd.DataFrame(history),
-        own=None if own is None else own.table,
-        pooling=own.facts if own else {},
+        own=None if separate is None else separate.table,
+        pooling=separate.facts if separate else {},
         drivers=drivers,
         start_speeds=speeds,
         noise=noise_of(store),
-        filled=sum(one["samples"] for one in store.manifest.get("filled", [])),
+        filled=sum(entry["samples"] for entry in store.manifest.get("filled", [])),
         status=status,
         uncompiled=getattr(trainer.solver, "uncompiled", "") or "",
         seconds=seconds,
@@ -570,9 +581,18 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
     )
 
 
+def _logged_parameters(model: System, row: dict[str, float]) -> dict[str, float]:
+    """The physical parameters in a row of the history, by address.
+
+    Rows of older checkpoints may have other addresses, which are ignored.
+    """
+    logged = {name: row.get(f"parameters/{name}") for name in model.physical()}
+    return {name: value for name, value in logged.items() if value is not None}
+
+
 def _counted(model: System, s: Sequence) -> np.ndarray:
-    """``(K, N)`` True for the samples whose errors count: not the first one, and not those of a
-    leader that is given as it was measured."""
+    """``(K, N)`` True for the samples whose errors count, which excludes the first one and those of
+    a measured leader."""
     counted = np.ones(s.x.shape[:2], dtype=bool)
     counted[0] = False
     if model.leader_measured:
@@ -581,15 +601,13 @@ def _counted(model: System, s: Sequence) -> np.ndarray:
 
 
 def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
-    """What the data tell of drivers who differ, where that is asked for.
+    """The calibration to drivers who differ; None if all share their parameters.
 
-    Searches start at the last state of the training and at its first, which a run that is resumed
-    has as well.
+    Searches start at the last and at the first state of the training.
     """
     drivers = trainer.options.drivers
     if drivers == NONE:
         return None
-    names = trainer.provenance.split["train"]
     if drivers in (None, AUTO):
         rmse = _metrics(trainer, trainer.model, "train").rmse
         if rmse <= EXACT:
@@ -599,14 +617,12 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
                 rmse,
             )
             return None
-    places = {entry["name"]: i for i, entry in enumerate(store.index)}
-    indices = [places[name] for name in names]
+    indices = positions(store, trainer.provenance.split["train"])
     log.info("calibrating to %d sequences with drivers who differ", len(indices))
-    seed, row = int(trainer.provenance.config["seed"]), trainer.history[0]
-    known = {name: row.get(f"parameters/{name}") for name in trainer.model.physical()}
-    first = {name: value for name, value in known.items() if value is not None}
+    seed = int(trainer.provenance.config["seed"])
+    first = _logged_parameters(trainer.model, trainer.history[0])
     try:
-        found = calibrated_drivers(
+        drivers_fit = calibrated_drivers(
             copy.deepcopy(trainer.model).cpu(),
             first,
             [store[i] for i in indices],
@@ -617,14 +633,14 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     except ConfigError:
         if drivers is not None:
             raise
-        found = None
-    if drivers is None and (found is None or not found.converged):
+        drivers_fit = None
+    if drivers is None and (drivers_fit is None or not drivers_fit.converged):
         log.warning(
             "how drivers differ could not be estimated: all share their parameters, whose "
             "intervals do not contain that they differ"
         )
         return None
-    return found
+    return drivers_fit
 
 
 def _metrics(trainer: Trainer, model: System, part: str) -> Metrics:
@@ -637,14 +653,14 @@ def _metrics(trainer: Trainer, model: System, part: str) -> Metrics:
 
 
 def _cost(trainer: Trainer, model: System, part: str) -> float:
-    """Mean cost of a sequence; NaN where none is held out."""
+    """Mean cost of a sequence; NaN if none is held out."""
     if part == "heldout" and trainer.heldout is None:
         return float("nan")
     return _metrics(trainer, model, part).J
 
 
 def _status(trainer: Trainer, model: System, store: Source) -> str:
-    """How a training ended, see :class:`Calibration`."""
+    """The status of a training, see :class:`Calibration`."""
     if isinstance(trainer.optimizer, GaussNewton):
         return "converged" if trainer.optimizer.converged else "stopped"
     costs = [row["cost/train"] for row in trainer.history]
@@ -666,9 +682,9 @@ def _status(trainer: Trainer, model: System, store: Source) -> str:
 
 def _by_tangents(
     trainer: Trainer, model: System, store: Source
-) -> tuple[dict[str, Any], Own | None, dict[str, Any]]:
-    """Intervals of the best parameters, each sequence's own and first speeds where they are asked
-    for, of models that have exact tangents; otherwise none."""
+) -> tuple[dict[str, Any], SequenceParameters | None, dict[str, Any]]:
+    """Intervals of the best parameters, separate parameters of sequences and first speeds, as far
+    as they are requested. They need the Gauss-Newton optimiser."""
     config, options = trainer.provenance.config, trainer.options
     speeds: dict[str, Any] = {"kind": config["data"].get("start_speeds", "measured")}
     data = trainer.train.dataset
@@ -678,7 +694,7 @@ def _by_tangents(
         return {}, None, speeds
     # compiled code takes a second to import
     from nnode.calibrate.intervals import intervals
-    from nnode.calibrate.pooling import own_parameters
+    from nnode.calibrate.pooling import sequence_parameters
     from nnode.calibrate.problem import ResidualProblem
     from nnode.simulation.fused import FusedSolver
 
@@ -689,37 +705,48 @@ def _by_tangents(
         convention=options.cost,
         start_speeds=options.start_speeds,
     )
-    places = {entry["name"]: i for i, entry in enumerate(store.index)}
-    indices = [places[name] for name in trainer.provenance.split["train"]]
+    indices = positions(store, trainer.provenance.split["train"])
     (batch,) = stream(straight_loader(store, indices, 0))
     double = copy.deepcopy(model).double()
     problem = make(double, batch)
     row = problem.vector.row.numpy()
-    found, own = intervals(problem, row, clusters(store.index)[indices]), None
+    estimated, separate = intervals(problem, row, clusters(store.index)[indices]), None
     if options.start_speeds is StartSpeeds.fitted:
         by_name = problem.start_speeds(row)
         first = {s.name: s.velocity()[0, :, 0] for s in (store[i] for i in indices)}
-        away = np.concatenate([(np.array(v) - first[n])[:-1] for n, v in by_name.items()])
-        change = float(np.sqrt(np.mean(away**2)))
+        change_of_speeds = np.concatenate(
+            [(np.array(v) - first[n])[:-1] for n, v in by_name.items()]
+        )
+        change = float(np.sqrt(np.mean(change_of_speeds**2)))
         speeds |= {"kind": options.start_speeds.value, "change": change, "sequences": by_name}
     if options.pooling is not Pooling.pooled:
         chosen = [store[i] for i in indices]
-        own = own_parameters(options.pooling, double, chosen, make, int(config["seed"]))
-    return found, own, speeds
+        separate = sequence_parameters(options.pooling, double, chosen, make, int(config["seed"]))
+    return estimated, separate, speeds
 
 
-def _row(value: float, unit: str, known: dict[str, Any] | None) -> tuple[Any, ...]:
-    """A line of the table of parameters."""
-    own = {"at_bound": None, "identified": None, "scale": "linear", **(known or {})}
+def _row(value: float, unit: str, interval: dict[str, Any] | None) -> tuple[Any, ...]:
+    """A row of the table of parameters."""
+    entry = {"at_bound": None, "identified": None, "scale": "linear", **(interval or {})}
     low, high, error, df = (
-        float("nan") if own.get(key) is None else own[key]
+        float("nan") if entry.get(key) is None else entry[key]
         for key in ("low", "high", "std_error", "df")
     )
-    return value, low, high, unit, own["at_bound"] or "", own["identified"], error, df, own["scale"]
+    return (
+        value,
+        low,
+        high,
+        unit,
+        entry["at_bound"] or "",
+        entry["identified"],
+        error,
+        df,
+        entry["scale"],
+    )
 
 
 def _rows(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """A table's rows by name."""
+    """The rows of a table by name."""
     columns = [str(name) for name in table]
     values = zip(*(table[name].to_list() for name in table), strict=True)
     return {
@@ -729,18 +756,18 @@ def _rows(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def _remark(row: dict[str, Any]) -> str:
-    """What is wrong with an estimate."""
+    """The remark on an estimate; empty for none."""
     if row["at_bound"]:
         return f"at the {_BOUND[row['at_bound']]} bound of what is admissible"
     return "" if row["identified"] in (None, True) else "not identified by these data"
 
 
 def _as_json(row: dict[str, Any]) -> dict[str, Any]:
-    found = {"low": _number(row["lower"]), "high": _number(row["upper"])}
-    found |= {"value": row["estimate"], "unit": row["unit"]}
+    content = {"low": _number(row["lower"]), "high": _number(row["upper"])}
+    content |= {"value": row["estimate"], "unit": row["unit"]}
     if row["identified"] is not None:
-        found |= {"at_bound": row["at_bound"] or None, "identified": row["identified"]}
-    return found
+        content |= {"at_bound": row["at_bound"] or None, "identified": row["identified"]}
+    return content
 
 
 def _number(value: float | None) -> float | None:

@@ -1,4 +1,4 @@
-"""What a file of trajectories holds and what is wrong with it: ``nnode check``."""
+"""Content and problems of a file of trajectories: ``nnode check``."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ from nnode.errors import ConfigError, NNodeError, printable
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page
 
-#: Stands before what is printed of each level.
+#: Level of a finding to its printed label.
 _SIGNS = {"error": "ERROR", "warning": "look", "note": "note"}
 
 
 @dataclass(frozen=True, repr=False)
 class Check:
-    """What a file of trajectories holds; printed, it is the summary, a notebook shows the findings.
+    """Content and problems of a file of trajectories.
+
+    Its text is the summary, and a notebook shows the findings.
 
     Attributes:
-        examination: all that was found, in SI units.
+        examination: all results, in SI units.
         options: overrides with which the commands read the file.
     """
 
@@ -44,12 +46,12 @@ class Check:
 
     @property
     def findings(self) -> list[Finding]:
-        """What is wrong, the worst first: ``level``, ``kind``, ``text``."""
+        """Problems, the worst first: ``level``, ``kind``, ``text``."""
         return self.examination.findings
 
     @property
     def probability(self) -> float:
-        """Of the units, whatever the rate of frames."""
+        """Probability of the units, summed over frame rates."""
         return share(self.examination.scales)
 
     def __repr__(self) -> str:
@@ -60,9 +62,9 @@ class Check:
         return f"<p>{escape(sentence(self.examination))}</p>{table}"
 
     def write(self, folder: str | Path) -> Path:
-        """Write the page ``check.html`` with its tables; returns its path."""
+        """Write the page ``check.html`` with its tables, and return its path."""
         return write_page(
-            [*blocks(self.examination, self.options), _made()],
+            [*blocks(self.examination, self.options), _provenance()],
             Path(folder),
             title=f"Check of {self.examination.path.name}",
             subtitle=sentence(self.examination),
@@ -73,150 +75,170 @@ class Check:
 def check_file(
     file: str | Path, domain: Domain | None = None, frame_rate: float | None = None
 ) -> Check:
-    """Examine a file before anything is made of it.
+    """Examine a file before it is used.
 
     Args:
         file: a table, or trajectories in a format that nnode reads.
         domain: ``traffic`` or ``crowd``; None guesses.
-        frame_rate: 1/s, where time is counted in frames; None guesses.
+        frame_rate: 1/s, if time is counted in frames; None guesses.
 
     Raises:
-        ConfigError: no such file, or an option out of its range.
-        DataError: a file that is no table of trajectories.
+        ConfigError: the file does not exist, or an option is out of its range.
+        DataError: the file is not a table of trajectories.
     """
     if domain not in (None, "traffic", "crowd"):
         raise ConfigError(f"domain={domain}: expected traffic, crowd, or null to guess")
     if frame_rate is not None and not 0 < frame_rate < float("inf"):
         raise ConfigError(f"frame_rate={frame_rate}: expected a positive number, 1/s")
-    found = examine(Path(file).expanduser(), domain, frame_rate)
-    return Check(found, command(found))
+    examination = examine(Path(file).expanduser(), domain, frame_rate)
+    return Check(examination, command(examination))
 
 
 def check(config: DictConfig, folder: Path) -> None:
-    """Examine a file, print what was found, and write ``check.html`` into ``folder``.
+    """Examine a file, print the summary, and write ``check.html`` into ``folder``.
 
     Raises:
         NNodeError: see :func:`check_file`.
     """
-    found = check_file(config.file, cast(Domain | None, config.domain), config.frame_rate)
-    print(found)
-    print(f"page: {found.write(folder)}")
+    result = check_file(config.file, cast(Domain | None, config.domain), config.frame_rate)
+    print(result)
+    print(f"page: {result.write(folder)}")
 
 
-def command(found: Examination) -> list[str]:
-    """The overrides, as they can be typed, with which the commands read the file."""
-    source = found.source
+def command(examination: Examination) -> list[str]:
+    """The overrides, quoted for the shell, with which the commands read the file."""
+    source = examination.source
     values = plain_options(source.options)
     defaults = group_defaults("data", source.group, "prepare_data")
-    own = plain_options(type(source.options)())
-    # what was not found here stays as the group has it
-    kept = {k: v for k, v in values.items() if v != own[k] and k != "name"}
-    return [f"data={source.group}", *changes("data", kept, defaults)]
+    field_defaults = plain_options(type(source.options)())
+    # options that were not recognised keep the group's values
+    changed_values = {k: v for k, v in values.items() if v != field_defaults[k] and k != "name"}
+    return [f"data={source.group}", *changes("data", changed_values, defaults)]
 
 
-def sentence(found: Examination) -> str:
-    """What there is, in a sentence."""
-    levels = [one.level for one in found.findings]
-    errors, looks = levels.count("error"), levels.count("warning")
-    wrong = f"{errors} error{'s' * (errors != 1)}, {looks} thing{'s' * (looks != 1)} to look at"
-    who = "people" if found.scale.domain == "crowd" else "vehicles"
+def sentence(examination: Examination) -> str:
+    """The content of the file and the number of findings in a sentence."""
+    levels = [finding.level for finding in examination.findings]
+    errors, warnings = levels.count("error"), levels.count("warning")
+    wrong = (
+        f"{errors} error{'s' * (errors != 1)}, {warnings} thing{'s' * (warnings != 1)} to look at"
+    )
+    who = "people" if examination.scale.domain == "crowd" else "vehicles"
     return (
-        f"{len(set(found.rows.agent.tolist()))} {who}, {len(found.rows)} positions, sampled "
-        f"every {found.rows.dt:.4g} s: {wrong}."
+        f"{len(set(examination.rows.agent.tolist()))} {who}, {len(examination.rows)} positions, "
+        f"sampled every {examination.rows.dt:.4g} s: {wrong}."
     )
 
 
-def summary(found: Examination, lines: list[str]) -> str:
-    """The whole in plain text."""
-    text = [f"{found.path}: {sentence(found)}"]
-    if found.meanings:
-        known = ", ".join(f"{m} = {one.column}" for m, one in found.meanings.items())
-        text.append(f"columns: {known}")
-        text.append(f"units: {_units(found)} ({certainty(share(found.scales))})")
+def summary(examination: Examination, lines: list[str]) -> str:
+    """The summary in plain text."""
+    text = [f"{examination.path}: {sentence(examination)}"]
+    if examination.meanings:
+        columns = ", ".join(
+            f"{m} = {finding.column}" for m, finding in examination.meanings.items()
+        )
+        text.append(f"columns: {columns}")
+        text.append(f"units: {_units(examination)} ({certainty(share(examination.scales))})")
     else:
-        text.append(f"format: {found.raw.native}, whose reader knows its units")
-    text += [f"{_SIGNS[one.level]:>5}  {one.kind}: {one.text}" for one in found.findings]
+        text.append(f"format: {examination.raw.native}, whose reader knows its units")
+    text += [
+        f"{_SIGNS[finding.level]:>5}  {finding.kind}: {finding.text}"
+        for finding in examination.findings
+    ]
     words = " ".join(lines)
     text += ["", "to read it:", f"  nnode prepare_data {words}"]
     text += ["to calibrate a model, and to diagnose it:"]
-    text += [f"  {line}" for line in _next(found, words)]
-    text += ["in Python:", *(f"  {line}" for line in python_lines(found))]
+    text += [f"  {line}" for line in _next_commands(examination, words)]
+    text += ["in Python:", *(f"  {line}" for line in python_lines(examination))]
     return "\n".join(printable(line) for line in text)
 
 
-def _next(found: Examination, words: str) -> list[str]:
-    """Commands that go on with the data, as far as these suffice for them."""
-    kept = _kept(found)
-    held = [] if _heldout(found, kept) else ["data.split.heldout=0"]
-    lines = [" ".join([f"nnode train {_model(found)} {words}", *held])]
-    if len(kept) >= LEAST:
-        lines.append(f"nnode discover {_model(found)} {words}")
+def _next_commands(examination: Examination, words: str) -> list[str]:
+    """Further commands for the data, if there are enough sequences for them."""
+    usable = _sound_sequences(examination)
+    holdout = [] if _heldout(examination, usable) else ["data.split.heldout=0"]
+    lines = [" ".join([f"nnode train {_model(examination)} {words}", *holdout])]
+    if len(usable) >= LEAST:
+        lines.append(f"nnode discover {_model(examination)} {words}")
     else:
-        lines.append(f"# a diagnosis needs at least {LEAST} sequences, there are {len(kept)}")
+        lines.append(f"# a diagnosis needs at least {LEAST} sequences, there are {len(usable)}")
     return lines
 
 
-def _kept(found: Examination) -> list[Sequence]:
-    """The sequences that are left when faulty ones are sorted out."""
-    domain, kept = found.scale.domain, found.sequences
-    agents, _ = identify(kept, domain, found.source.options.agents) if kept else ([], [])
-    unique = [replace(s, agents=own) for s, own in zip(kept, agents, strict=True)]
-    return [s for s in unique if s.name not in found.faults]
+def _sound_sequences(examination: Examination) -> list[Sequence]:
+    """The sequences without faults."""
+    domain, sequences = examination.scale.domain, examination.sequences
+    agents, _ = (
+        identify(sequences, domain, examination.source.options.agents) if sequences else ([], [])
+    )
+    unique = [replace(s, agents=names) for s, names in zip(sequences, agents, strict=True)]
+    return [s for s in unique if s.name not in examination.faults]
 
 
-def _heldout(found: Examination, kept: list[Sequence]) -> bool:
+def _heldout(examination: Examination, sequences: list[Sequence]) -> bool:
     """Whether some of the sequences can be held out."""
     try:
-        return bool(split(index_of(kept), found.source.options.split).heldout) if kept else True
+        return (
+            bool(split(index_of(sequences), examination.source.options.split).heldout)
+            if sequences
+            else True
+        )
     except NNodeError:
         return False
 
 
-def _model(found: Examination) -> str:
+def _model(examination: Examination) -> str:
     """The domain's simplest model of an acceleration or a force."""
-    return "model=sf" if found.scale.domain == "crowd" else "model=idm"
+    return "model=sf" if examination.scale.domain == "crowd" else "model=idm"
 
 
-def python_lines(found: Examination) -> list[str]:
-    """Lines of Python that read the file and calibrate a model, with all that is told."""
-    group, *_ = command(found)
-    held = "" if _heldout(found, _kept(found)) else ", heldout=0"
-    own = plain_options(type(found.source.options)())
-    values = plain_options(found.source.options)
-    kept = {k: v for k, v in values.items() if v != own[k] and k not in ("name", "path")}
+def python_lines(examination: Examination) -> list[str]:
+    """Lines of Python that read the file with all recognised options and calibrate a model."""
+    group, *_ = command(examination)
+    holdout = "" if _heldout(examination, _sound_sequences(examination)) else ", heldout=0"
+    field_defaults = plain_options(type(examination.source.options)())
+    values = plain_options(examination.source.options)
+    changed_values = {
+        k: v for k, v in values.items() if v != field_defaults[k] and k not in ("name", "path")
+    }
     path = values.get("path") or ""
-    told = [repr(path)] if path else []
-    told += [f"data={group.partition('=')[2]!r}", *(f"{k}={v!r}" for k, v in kept.items())]
+    arguments = [repr(path)] if path else []
+    arguments += [
+        f"data={group.partition('=')[2]!r}",
+        *(f"{k}={v!r}" for k, v in changed_values.items()),
+    ]
     return [
         "import nnode",
-        f"data = nnode.sequences({', '.join(told)})",
-        f"nnode.fit(data, model={_model(found).partition('=')[2]!r}{held})",
+        f"data = nnode.sequences({', '.join(arguments)})",
+        f"nnode.fit(data, model={_model(examination).partition('=')[2]!r}{holdout})",
     ]
 
 
-def _units(found: Examination) -> str:
-    scale = found.scale
+def _units(examination: Examination) -> str:
+    scale = examination.scale
     clock = f"frames of 1/{scale.rate:g} s" if scale.rate else scale.time
-    speeds = f", speeds in {scale.speed}" if found.rows.v is not None else ""
+    speeds = f", speeds in {scale.speed}" if examination.rows.v is not None else ""
     return f"{scale.domain}, positions in {scale.position}, times in {clock}{speeds}"
 
 
-def blocks(found: Examination, lines: list[str]) -> list[Block]:
-    """The page: what is wrong, how to read it, what it holds."""
+def blocks(examination: Examination, lines: list[str]) -> list[Block]:
+    """The blocks of the page: findings, commands, columns, units and figures."""
     return [
         Heading("What was found"),
-        *_findings(found.findings),
+        *_findings(examination.findings),
         Heading("To read it"),
-        Text(_usage(found, lines)),
-        *_columns(found),
-        *_units_blocks(found),
+        Text(_usage(examination, lines)),
+        *_columns(examination),
+        *_units_blocks(examination),
         Heading("What it holds"),
-        *_figures(found),
+        *_figures(examination),
     ]
 
 
 def _rows(findings: list[Finding]) -> pd.DataFrame:
-    rows = [{"": one.level, "what": one.kind, "in words": one.text} for one in findings]
+    rows = [
+        {"": finding.level, "what": finding.kind, "in words": finding.text} for finding in findings
+    ]
     return pd.DataFrame(rows).set_index("")
 
 
@@ -229,33 +251,33 @@ def _findings(findings: list[Finding]) -> list[Block]:
     return [TableBlock("findings", _rows(findings), caption)]
 
 
-def _usage(found: Examination, lines: list[str]) -> str:
+def _usage(examination: Examination, lines: list[str]) -> str:
     words = " \\\n    ".join(lines)
     commands = [f"nnode prepare_data {words}"]
-    commands += _next(found, words)
-    shell, python = "\n".join(commands), "\n".join(python_lines(found))
+    commands += _next_commands(examination, words)
+    shell, python = "\n".join(commands), "\n".join(python_lines(examination))
     return f"```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```"
 
 
-def _columns(found: Examination) -> list[Block]:
-    if not found.meanings or found.raw.table is None:
+def _columns(examination: Examination) -> list[Block]:
+    if not examination.meanings or examination.raw.table is None:
         return []
-    frame = found.raw.table.frame
-    how = {
+    frame = examination.raw.table.frame
+    reasons = {
         "named": "has the name of its meaning",
         "like": "by its name",
         "holds": "by what it holds",
     }
-    by = {one.column: (meaning, one) for meaning, one in found.meanings.items()}
+    by = {guess.column: (meaning, guess) for meaning, guess in examination.meanings.items()}
     rows = {}
     for column in map(str, frame.columns):
-        meaning, one = by.get(column, ("not used", None))
+        meaning, guess = by.get(column, ("not used", None))
         cells = frame[column]
         values = pd.Series(floats(cells)).dropna()
         numeric = len(values) > 0
         rows[column] = {
             "meaning": meaning,
-            "because": "" if one is None else how[one.sure],
+            "because": "" if guess is None else reasons[guess.sure],
             "least": f"{values.min():.6g}" if numeric else "",
             "greatest": f"{values.max():.6g}" if numeric else "",
             "different": cells.dropna().map(quoted).nunique(),
@@ -265,23 +287,23 @@ def _columns(found: Examination) -> list[Block]:
     return [Heading("Columns"), TableBlock("columns", table, "What each column is taken for.")]
 
 
-def _units_blocks(found: Examination) -> list[Block]:
-    scale, known = found.scale, found.known
-    usual = USUAL[scale.domain]
+def _units_blocks(examination: Examination) -> list[Block]:
+    scale, measured = examination.scale, examination.known
+    ranges = USUAL[scale.domain]
     values = {
-        "speed of those that move (m/s)": (known.speed * scale.metres / scale.seconds, "speed"),
-        "distance to the nearest (m)": (known.nearest * scale.metres, "nearest"),
-        "length (m)": (known.length * scale.metres, "length"),
-        "sway (1/s)": (known.sway / scale.seconds, "sway"),
-        "sampling interval (s)": (known.dt * scale.seconds, INTERVAL),
+        "speed of those that move (m/s)": (measured.speed * scale.metres / scale.seconds, "speed"),
+        "distance to the nearest (m)": (measured.nearest * scale.metres, "nearest"),
+        "length (m)": (measured.length * scale.metres, "length"),
+        "sway (1/s)": (measured.sway / scale.seconds, "sway"),
+        "sampling interval (s)": (measured.dt * scale.seconds, INTERVAL),
         "speed by positions over speed in the file": (
-            known.ratio * scale.metres / (scale.per_second * scale.seconds),
+            measured.ratio * scale.metres / (scale.per_second * scale.seconds),
             AGREE,
         ),
     }
     rows = {}
     for name, (value, where) in values.items():
-        range_ = usual.get(where) if isinstance(where, str) else where
+        range_ = ranges.get(where) if isinstance(where, str) else where
         if np.isfinite(value) and isinstance(range_, Range):
             rows[name] = {
                 "here": value,
@@ -290,10 +312,10 @@ def _units_blocks(found: Examination) -> list[Block]:
             }
     blocks: list[Block] = [
         Heading("Units and time scale"),
-        Text(f"Taken: {_units(found)}: {certainty(share(found.scales))}."),
+        Text(f"Taken: {_units(examination)}: {certainty(share(examination.scales))}."),
         TableBlock("medians", pd.DataFrame(rows).T, "Medians in SI units, and what is usual."),
     ]
-    if len(found.scales) > 1:
+    if len(examination.scales) > 1:
         table = pd.DataFrame(
             [
                 {
@@ -304,7 +326,7 @@ def _units_blocks(found: Examination) -> list[Block]:
                     "speeds": s.speed,
                     "probability": s.probability,
                 }
-                for s in found.scales
+                for s in examination.scales
             ]
         )
         blocks.append(
@@ -320,11 +342,11 @@ def _units_blocks(found: Examination) -> list[Block]:
     return blocks
 
 
-def _figures(found: Examination) -> list[Block]:
+def _figures(examination: Examination) -> list[Block]:
     from nnode.plots import check as plots  # loads Matplotlib, which takes a second
     from nnode.plots.quality import faults_figure
 
-    rows, domain = found.rows, found.scale.domain
+    rows, domain = examination.rows, examination.scale.domain
     shown: list[Block] = [
         FigureBlock(
             "speeds",
@@ -339,18 +361,18 @@ def _figures(found: Examination) -> list[Block]:
             "Paths over time, and the number of agents over time.",
         ),
     ]
-    if found.faults:
+    if examination.faults:
         shown.append(
             FigureBlock(
                 "faults",
-                faults_figure(found.sequences, found.faults, domain, 10),
-                f"Sequences that data={found.source.group} makes, with faults marked; the first 10 "
-                f"of {len(found.faults)}.",
+                faults_figure(examination.sequences, examination.faults, domain, 10),
+                f"Sequences that data={examination.source.group} makes, with faults marked; the "
+                f"first 10 of {len(examination.faults)}.",
                 "Positions over time of faulty sequences, faults marked.",
             )
         )
     return shown
 
 
-def _made() -> Provenance:
+def _provenance() -> Provenance:
     return Provenance(how_made(("numpy", "pandas", "scipy", "matplotlib")))

@@ -1,8 +1,8 @@
 """The demonstration: ``python -m nnode.app.demo FOLDER``, which ``make demo`` runs.
 
-A table of platoons is checked, a law is calibrated, and a diagnosis finds what the law lacks; a
-second diagnosis shows what is said where nothing is hidden, and networks learn the forces in a
-crowd. Everything that is printed or shown comes from the results of this run.
+It checks a table of platoons, calibrates a law, and diagnoses it for a table with a hidden effect
+and for a table without one. Then networks learn the forces in a crowd. All printed and displayed
+values are results of this run.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ from nnode.simulation.base import DEFAULT_STEP
 
 #: Steps of Euler's scheme of the compared calibrations, s: the paper's, and ten times that.
 STEPS = (DEFAULT_STEP["traffic", 1], 10 * DEFAULT_STEP["traffic", 1])
-#: A force that is taken for none, N.
+#: Force that counts as zero, N.
 _WEAK = 0.1
-#: What the page is called, in the demonstration's folder.
+#: Name of the page in the demonstration's folder.
 PAGE = "demo"
 
 
@@ -58,16 +58,16 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
     """Run the demonstration, and write its page.
 
     Args:
-        folder: receives data, runs and the page.
-        seed: of the data.
+        folder: folder for data, runs and the page.
+        seed: seed of the data.
         platoons: number of platoons in each table.
-        epochs: of the crowd's networks.
+        epochs: number of epochs for the crowd's networks.
 
     Returns:
-        The page.
+        Path of the page.
 
     Raises:
-        NNodeError: a folder that cannot be written to.
+        NNodeError: the folder cannot be written to.
     """
     start = time.monotonic()
     truth = SlowZone()
@@ -194,7 +194,10 @@ def _checked(path: Path, folder: Path) -> list[Block]:
     check = nnode.check(path)
     check.write(folder / "check")
     print(check)
-    rows = [{"level": one.level, "what": one.kind, "finding": one.text} for one in check.findings]
+    rows = [
+        {"level": finding.level, "what": finding.kind, "finding": finding.text}
+        for finding in check.findings
+    ]
     return [
         Heading("What does the table hold?"),
         Text(f"```sh\nnnode check {path}\n```"),
@@ -222,7 +225,7 @@ def _calibration(path: Path, truth: SlowZone, folder: Path) -> list[Block]:
     if "v0" in variability.index:
         rows["v0 between drivers (%)"] = (100 * truth.drivers, *_row(variability, "v0"))
     rows["error of positions (m)"] = (truth.noise, *_row(variability, "measurement"))
-    estimates = _beside_truth(rows)
+    estimates = _with_truth(rows)
     print(estimates.to_string())
     compared = _compared(path)
     print(compared.to_string())
@@ -276,19 +279,19 @@ def _row(table: pd.DataFrame, name: str) -> tuple[float, float, float]:
     return estimate, lower, upper
 
 
-def _beside_truth(rows: dict[str, tuple[float, float, float, float]]) -> pd.DataFrame:
-    """Truth, estimate and interval by name; ``covered`` is a dash where there is no interval."""
+def _with_truth(rows: dict[str, tuple[float, float, float, float]]) -> pd.DataFrame:
+    """Truth, estimate and interval by name; ``covered`` is a dash without an interval."""
     table = pd.DataFrame(rows, index=["truth", "estimate", "lower", "upper"]).T
     inside = (table["lower"] <= table["truth"]) & (table["truth"] <= table["upper"])
-    known = table["lower"].notna() & table["upper"].notna()
+    has_interval = table["lower"].notna() & table["upper"].notna()
     table["covered"] = [
-        ("yes" if a else "no") if b else "–" for a, b in zip(inside, known, strict=True)
+        ("yes" if a else "no") if b else "–" for a, b in zip(inside, has_interval, strict=True)
     ]
     return table
 
 
 def _compared(path: Path) -> pd.DataFrame:
-    """Both programs on the pooled problem, with each step."""
+    """Results of both programs for the pooled problem, with each step."""
     sequences = nnode.sequences(path, domain="traffic")
     x, dt = np.stack([s.x[..., 0] for s in sequences], 1), sequences[0].dt
     start = np.array([30.0, 5.0])
@@ -303,9 +306,9 @@ def _compared(path: Path) -> pd.DataFrame:
         value = result.parameters["estimate"]
         rows.append((step, "nnode", *value, result.fit.rmse, seconds, first))
         residuals = partial(_residuals, x=x, dt=dt, step=step)
-        seconds, found = _timed(partial(least_squares, residuals, start, x_scale=start))
-        rmse = float(np.sqrt(np.mean(found.fun**2)))
-        rows.append((step, "SciPy", *found.x, rmse, seconds, np.nan))
+        seconds, solution = _timed(partial(least_squares, residuals, start, x_scale=start))
+        rmse = float(np.sqrt(np.mean(solution.fun**2)))
+        rows.append((step, "SciPy", *solution.x, rmse, seconds, np.nan))
     heads = ["v0 (m/s)", "L (m)", "RMSE (m)", "wall time (s)", "first call (s)"]
     table = pd.DataFrame(rows, columns=["step (s)", "program", *heads])
     return table.set_index(["step (s)", "program"])
@@ -313,8 +316,8 @@ def _compared(path: Path) -> pd.DataFrame:
 
 def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
     start = time.perf_counter()
-    found = work()
-    return time.perf_counter() - start, found
+    result = work()
+    return time.perf_counter() - start, result
 
 
 def _residuals(row: np.ndarray, x: np.ndarray, dt: float, step: float) -> np.ndarray:
@@ -325,7 +328,7 @@ def _residuals(row: np.ndarray, x: np.ndarray, dt: float, step: float) -> np.nda
         x: ``(K, B, N)`` measured positions, m; the last car leads, along straight lines between
             its samples.
         dt: sampling interval, s.
-        step: of Euler's scheme, s.
+        step: time step of Euler's scheme, s.
     """
     v0, length = row
     number = round(dt / step)
@@ -344,7 +347,7 @@ def _residuals(row: np.ndarray, x: np.ndarray, dt: float, step: float) -> np.nda
 
 
 def _diagnosed(path: Path, folder: Path | None) -> Report:
-    options = DiscoverOptions(compare=[], replay=False)  # one law is faster than all that are known
+    options = DiscoverOptions(compare=[], replay=False)  # without comparing laws, to be faster
     report = nnode.diagnose(path, "traffic", model="lin", folder=folder, options=options)
     print(report.sentence)
     return report
@@ -353,17 +356,18 @@ def _diagnosed(path: Path, folder: Path | None) -> Report:
 def _lacking(report: Report, truth: SlowZone) -> list[Block]:
     d, gap = report.diagnosis, report.gap
     hidden = {"alpha": truth.alpha, "a": truth.a, "b": truth.b}
-    zone = next((one for one in report.effects if one.name == "speed_zone"), None)
-    known = {} if zone is None else zone.coefficients
+    zone = next((estimate for estimate in report.effects if estimate.name == "speed_zone"), None)
+    coefficients = {} if zone is None else zone.coefficients
     rows = {
-        f"speed_zone.{name}" + ("" if known[name].unit == "1" else f" ({known[name].unit})"): (
+        f"speed_zone.{name}"
+        + ("" if coefficients[name].unit == "1" else f" ({coefficients[name].unit})"): (
             value,
-            known[name].value,
-            known[name].low,
-            known[name].high,
+            coefficients[name].value,
+            coefficients[name].low,
+            coefficients[name].high,
         )
         for name, value in hidden.items()
-        if name in known
+        if name in coefficients
     }
     nan = float("nan")
     rows |= {
@@ -375,11 +379,11 @@ def _lacking(report: Report, truth: SlowZone) -> list[Block]:
         )
         for name, value in (("v0", truth.v0), ("L", truth.L))
     }
-    for one in d.drivers:
-        if one.name == "v0":
-            values = one.estimate, one.lower, one.upper
+    for estimate in d.drivers:
+        if estimate.name == "v0":
+            values = estimate.estimate, estimate.lower, estimate.upper
             rows["v0 between drivers (%)"] = (100 * truth.drivers, *values)
-    table = _beside_truth(rows)
+    table = _with_truth(rows)
     print(table.to_string())
     words = (
         "Estimates with the effects, beside what was put into the data; intervals of 95 % by "
@@ -427,13 +431,13 @@ def _absent(report: Report) -> list[Block]:
     print(missed)
     rows = [
         {
-            "effect": one.name,
-            "coefficient": one.coefficient,
-            "found from": amount(one.detectable if one.testable else None),
-            "unit": "" if one.unit == "1" else one.unit,
-            "remark": one.reason,
+            "effect": absence.name,
+            "coefficient": absence.coefficient,
+            "found from": amount(absence.detectable if absence.testable else None),
+            "unit": "" if absence.unit == "1" else absence.unit,
+            "remark": absence.reason,
         }
-        for one in report.diagnosis.absences
+        for absence in report.diagnosis.absences
     ]
     return [
         Heading("The same table with nothing hidden"),
@@ -451,7 +455,7 @@ def _absent(report: Report) -> list[Block]:
 
 
 def _missed(report: Report) -> str:
-    """How strong a zone would have to be to be found."""
+    """The sentence on the smallest detectable zone; empty if one was found."""
     zone = next((a for a in report.diagnosis.absences if a.name == "speed_zone"), None)
     if zone is None:
         return ""

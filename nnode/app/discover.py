@@ -1,4 +1,4 @@
-"""What a model lacks: the command ``discover``."""
+"""Diagnosis of a model: the command ``discover``."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import plain_config
+from nnode.app.cli.saved import options_of, plain_config
 from nnode.app.cli.typed import changes, group_defaults, plain_options, shell_override
 from nnode.app.nearest_law import Job, candidates, diagnosed, unwatched
 from nnode.app.python.inputs import (
@@ -27,7 +27,7 @@ from nnode.app.python.inputs import (
 )
 from nnode.app.python.report import Report
 from nnode.app.python.words import python_words
-from nnode.app.training import brief
+from nnode.app.training import brief, check_domain
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
@@ -63,31 +63,34 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Folder of the diagnosis of the law that comes nearest, where another one was asked for.
+#: Folder of the diagnosis of the nearest law, if it is not the requested one.
 NEAREST = "nearest_law"
 
 
 def discover(config: DictConfig, folder: Path) -> None:
-    """Diagnose a model on data, write the report, and print what was found.
+    """Diagnose a model on data, write the report, and print the result.
 
     Raises:
-        ConfigError: options that do not go together.
-        DataError: data on which nothing can be diagnosed.
-        Interrupted: a signal asked to stop.
+        ConfigError: incompatible options.
+        DataError: the data are insufficient for a diagnosis.
+        Interrupted: a signal stopped the diagnosis.
     """
     start = time.monotonic()
     with BreakingGuard() as guard:
         try:
             config = with_prepared(config)
             plain = plain_config(config)
-            options = cast(DiscoverOptions, OmegaConf.to_object(config.discover))
-            data = cast(DataOptions, OmegaConf.to_object(config.data))
+            options: DiscoverOptions = options_of(config.discover)
+            data: DataOptions = options_of(config.data)
             read = partial(read_inputs, data, folder / "data")
             job = _job(plain["model"], data, plain["data"], plain["groups"], options, read)
-            done = diagnosed(job, Stages)
+            diagnoses = diagnosed(job, Stages)
             with Stages("drawing", {"drawing": 5.0}) as stages:
                 stages.begin("drawing")
-                written = [_drawn(one, found, place) for one, found, place in _places(done, folder)]
+                written = [
+                    _drawn(diagnosed_job, outcome, place)
+                    for diagnosed_job, outcome, place in _places(diagnoses, folder)
+                ]
         except KeyboardInterrupt:
             number = guard.requested or signal.SIGINT
             raise Interrupted(
@@ -97,10 +100,10 @@ def discover(config: DictConfig, folder: Path) -> None:
             ) from None
     with InterruptGuard() as guard:
         paths = [write() for write in reversed(written)][::-1]
-    _print(done[0][1], paths[0], time.monotonic() - start)
-    if len(done) > 1:
-        print(f"\nthe law that comes nearest, {done[1][0].name}:")
-        _print(done[1][1], paths[1], time.monotonic() - start)
+    _print(diagnoses[0][1], paths[0], time.monotonic() - start)
+    if len(diagnoses) > 1:
+        print(f"\nthe law that comes nearest, {diagnoses[1][0].name}:")
+        _print(diagnoses[1][1], paths[1], time.monotonic() - start)
     if guard.requested:
         name = signal.Signals(guard.requested).name
         raise Interrupted(f"stopped by {name} when all was written", guard.requested)
@@ -122,17 +125,17 @@ def diagnose_table(
 
     Args:
         data: CSV or Parquet, or a data frame, whose columns and units are recognised, see
-            :func:`nnode.sequences`; or those sequences.
-        domain: ``traffic`` or ``crowd``; None: as the columns show.
-        model: a name as in ``conf/model``, or options of the model; ``term`` says which, what is
-            left out has its default.
+            :func:`nnode.sequences`; or the sequences that it returns.
+        domain: ``traffic`` or ``crowd``; None recognises it from the columns.
+        model: a name as in ``conf/model``, or options of the model with its ``term``; other
+            options have defaults.
         walls: CSV with x1, y1, x2, y2, m.
-        leader: of a traffic model.
-        folder: receives what the command writes, and a data frame as a table; None writes and
-            draws nothing.
-        seed: of the diagnosis; wins over that of ``options``.
+        leader: ``constant`` or ``measured``, for a traffic model.
+        folder: folder for the files of the command, and for a data frame as a table; None writes
+            and draws nothing.
+        seed: seed of the diagnosis; it replaces that of ``options``.
         options: further options of the diagnosis.
-        reading: how the table is read, as :func:`nnode.sequences` takes it: ``columns={...}``,
+        reading: options for reading the table, as for :func:`nnode.sequences`: ``columns={...}``,
             ``position_unit="ft"``, ``faults="error"``, ...
 
     Raises:
@@ -163,36 +166,40 @@ def _diagnosed_table(
     options: DiscoverOptions | None,
     reading: Mapping[str, Any],
 ) -> Report:
-    own = model_options(model, leader)
+    plain_model = model_options(model, leader)
     chosen = DiscoverOptions(**{**vars(options or DiscoverOptions()), "seed": seed})
     source: Any = data
     if isinstance(data, Sequences):
         refuse_reading(None, {"walls": walls, **reading})
-        told = data_of(data)
+        data_options = data_of(data)
     else:
-        source, told = table_options(data, domain, walls, place, reading)
-    groups = {"model": str(own["name"]), "data": str(told.name)}
+        source, data_options = table_options(data, domain, walls, place, reading)
+    groups = {"model": str(plain_model["name"]), "data": str(data_options.name)}
 
     def read() -> Inputs:
-        return inputs_of(Sequences.of(source, with_faulty(told)), told)
+        return inputs_of(Sequences.of(source, with_faulty(data_options)), data_options)
 
-    job = _job(own, told, plain_options(told), groups, chosen, read)
-    done = diagnosed(job, unwatched)
+    job = _job(plain_model, data_options, plain_options(data_options), groups, chosen, read)
+    diagnoses = diagnosed(job, unwatched)
     if place is not None:
-        for one, found, where in reversed(_places(done, place)):
-            _drawn(one, found, where)()
+        for diagnosed_job, outcome, folder in reversed(_places(diagnoses, place)):
+            _drawn(diagnosed_job, outcome, folder)()
     first, *others = [
-        Report(diagnosis=found.diagnosis, model=found.extended, draw=partial(_figure, one, found))
-        for one, found in done
+        Report(
+            diagnosis=outcome.diagnosis,
+            model=outcome.extended,
+            draw=partial(_figure, diagnosed_job, outcome),
+        )
+        for diagnosed_job, outcome in diagnoses
     ]
     return replace(first, nearest=others[0]) if others else first
 
 
-def _figure(job: Job, found: DiagnosisOutcome, which: str) -> Figure:
-    """A figure of a diagnosis, drawn when it is asked for."""
+def _figure(job: Job, outcome: DiagnosisOutcome, which: str) -> Figure:
+    """A figure of a diagnosis, drawn on request."""
     from nnode.discover.report.captions import figure  # loads Matplotlib, which takes a second
 
-    return figure(which, job.inputs, found, job.options)
+    return figure(which, job.inputs, outcome, job.options)
 
 
 def _job(
@@ -206,36 +213,32 @@ def _job(
     start = time.monotonic()
     load_own()
     system = build_model(model, options.seed)
-    if data.domain in ("traffic", "crowd") and data.domain != system.domain:
-        raise ConfigError(
-            f"model={model['name']} is a {system.domain} model, data={data.name} are "
-            f"{data.domain} data; choose both of one domain"
-        )
+    check_domain(system, str(model["name"]), str(data.domain), str(data.name))
     check_options(options, system.domain, system.order)  # type: ignore[arg-type]
     check_model(system)
     laws = candidates(model, system, options)
     inputs = read()
-    if data.prepared is None:  # a folder is taken as it is
-        # what the extended model is trained and tested on are the sequences without a fault
+    if data.prepared is None:  # options of a prepared folder are fixed
+        # the extended model is trained and tested on the sequences without faults
         plain_data = {**plain_data, "faults": Faults.drop.value}
     seconds = time.monotonic() - start
     return Job(model, plain_data, groups, system, inputs, options, laws, seconds)
 
 
 def _places(
-    done: list[tuple[Job, DiagnosisOutcome]], folder: Path
+    diagnoses: list[tuple[Job, DiagnosisOutcome]], folder: Path
 ) -> list[tuple[Job, DiagnosisOutcome, Path]]:
-    """Where each diagnosis is written."""
+    """The diagnoses with their folders."""
     return [
-        (job, found, place)
-        for (job, found), place in zip(done, (folder, folder / NEAREST), strict=False)
+        (job, outcome, place)
+        for (job, outcome), place in zip(diagnoses, (folder, folder / NEAREST), strict=False)
     ]
 
 
-def training_config(job: Job, found: DiagnosisOutcome) -> dict[str, Any]:
-    """The configuration of a training that would go on with the extended model."""
+def training_config(job: Job, outcome: DiagnosisOutcome) -> dict[str, Any]:
+    """The configuration of a training that would continue with the extended model."""
     return {
-        "model": extended_options(job.model, found.extended),
+        "model": extended_options(job.model, outcome.extended),
         "data": job.data,
         "solver": plain_options(TorchdiffeqOptions()),
         "optimizer": plain_options(AdadeltaOptions()),
@@ -245,24 +248,27 @@ def training_config(job: Job, found: DiagnosisOutcome) -> dict[str, Any]:
     }
 
 
-def _drawn(job: Job, found: DiagnosisOutcome, folder: Path) -> Callable[[], dict[str, Path]]:
-    """Draw the figures, where they are asked for; returns what writes all results, the report
-    last, and gives their paths."""
-    config = training_config(job, found)
+def _drawn(job: Job, outcome: DiagnosisOutcome, folder: Path) -> Callable[[], dict[str, Path]]:
+    """Draw the requested figures, and return a function that writes all results.
+
+    The function writes the report last and returns the paths.
+    """
+    config = training_config(job, outcome)
     pages = None
     if job.options.page:
         from nnode.discover.report.page import draw  # loads Matplotlib, which takes a second
 
-        pages = draw(job.inputs, found, job.options, config, _commands(config, folder), folder)
+        pages = draw(job.inputs, outcome, job.options, config, _commands(config, folder), folder)
     checkpoint = checkpoint_of(
-        found, job.inputs.sequences, config, brief(job.inputs.manifest), AdadeltaOptions()
+        outcome, job.inputs.sequences, config, brief(job.inputs.manifest), AdadeltaOptions()
     )
-    path, text = folder / CHECKPOINT, model_yaml(config["model"], has_network(found.base))
-    report = plain_report(found.diagnosis)
+    path, text = folder / CHECKPOINT, model_yaml(config["model"], has_network(outcome.base))
+    report = plain_report(outcome.diagnosis)
 
     def write() -> dict[str, Path]:
         try:
-            (folder / REPORT).unlink(missing_ok=True)  # of an earlier run: it is there when all is
+            # the report exists only if all other results do
+            (folder / REPORT).unlink(missing_ok=True)
             save_checkpoint(checkpoint, path)
             model = write_text(folder / MODEL, text)
             drawn = {} if pages is None else pages()
@@ -281,7 +287,7 @@ def _drawn(job: Job, found: DiagnosisOutcome, folder: Path) -> Callable[[], dict
 
 
 def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
-    """What can be done with the extended model, as it can be typed."""
+    """Commands for the extended model, quoted for the shell."""
     checkpoint = shell_override("checkpoint", folder / CHECKPOINT)
     name, group = config["model"]["name"], config["groups"]["data"]
     place = shlex.quote(str(folder / MODEL))
@@ -296,13 +302,13 @@ def _commands(config: Mapping[str, Any], folder: Path) -> list[str]:
     ]
 
 
-def _print(found: DiagnosisOutcome, paths: Mapping[str, Path], seconds: float) -> None:
-    d = found.diagnosis
+def _print(outcome: DiagnosisOutcome, paths: Mapping[str, Path], seconds: float) -> None:
+    d = outcome.diagnosis
     print(f"verdict: {d.verdict}")
     for laws in (d.laws, d.laws_again):
         if laws is not None and laws.ranking:
-            beside = f", with {', '.join(laws.effects)}" if laws.effects else ""
-            print(f"laws{beside}, by held-out cost: {ranked(laws)}")
+            effects = f", with {', '.join(laws.effects)}" if laws.effects else ""
+            print(f"laws{effects}, by held-out cost: {ranked(laws)}")
     for note in d.notes:
         print(note)
     print(sentence(d))

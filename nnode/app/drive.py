@@ -1,4 +1,4 @@
-"""A run's model drives vehicles in SUMO: ``nnode drive``."""
+"""Control of vehicles in SUMO by a run's model: ``nnode drive``."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from nnode.files import write_json
 from nnode.model import System
 from nnode.simulation.base import substeps
 
-#: What ``steps=`` asks for.
+#: Values of ``steps=``.
 STEPS = ("match", "run", "scenario")
-#: Of methods, those that SUMO has for speeds and for accelerations.
+#: Order of a law to the methods of stepping that SUMO has for it.
 _PLACED = {1: ("euler",), 2: ("semi_implicit", "ballistic")}
 
 
@@ -42,53 +42,54 @@ def drive_run(
     lane_changes: bool = False,
     seed: int = 0,
 ) -> Drive:
-    """Let a run's calibrated law, with its effects, drive vehicles in SUMO.
+    """Control vehicles in SUMO by a run's calibrated law with its effects.
 
-    Every step SUMO says who is ahead and how far, the law says a speed, and SUMO places the
-    vehicle with it; its own rules for speeds and, if so, lanes are off. See ``docs/exchange.md``.
+    In every step SUMO gives the gap and the vehicle ahead, the law computes a speed, and SUMO
+    moves the vehicle with it. SUMO's rules for speeds, and unless ``lane_changes`` for lanes, are
+    disabled. See ``docs/exchange.md``.
 
     Args:
-        run: folder of a training or of a diagnosis, or a checkpoint; its model is of vehicles.
+        run: folder of a training or of a diagnosis, or a checkpoint, with a traffic model.
         sumo: SUMO's configuration, ``.sumocfg``.
-        vehicles: type, or types, of the vehicles to drive.
-        folder: receives ``fcd.xml.gz`` (``data=sumo`` reads it) and ``drive.json``; by default a
+        vehicles: type, or types, of the vehicles to control.
+        folder: folder for ``fcd.xml.gz`` (``data=sumo`` reads it) and ``drive.json``; by default a
             new temporary one.
         program: ``libsumo``, in this process, or ``traci``.
-        steps: ``match`` refuses a scenario whose steps are not the run's; ``run`` lets SUMO make
-            the run's; ``scenario`` takes those of the scenario. The steps of a law that is stepped
-            by Runge and Kutta's method by default are ballistic ones of the same length here.
-        end: s of SUMO's clock; None: the scenario's, or when all have arrived.
-        far: m at which a vehicle ahead counts as none; None: as far as SUMO looks.
-        lengths: whether the law's gaps are bumper to bumper; None: as the run's data had lengths.
-        lane_changes: whether SUMO may change lanes of driven vehicles.
-        seed: of what drivers who differ are drawn with.
+        steps: ``match`` refuses a scenario with other steps than the run's; ``run`` sets SUMO's
+            steps to the run's; ``scenario`` takes the scenario's. For a law whose default method
+            is Runge-Kutta, the run's steps are ballistic ones of the same length.
+        end: end on SUMO's clock, s; None takes the scenario's, or the arrival of all vehicles.
+        far: distance (m) beyond which a vehicle ahead is ignored; None takes SUMO's limit.
+        lengths: whether the law's gaps are bumper to bumper; None for gaps as in the run's data.
+        lane_changes: whether SUMO may change lanes of controlled vehicles.
+        seed: seed of random drivers.
 
     Raises:
-        CheckpointError: no such run.
-        ConfigError: people, a model that needs what SUMO cannot say, no such scenario or type of
-            vehicles, other steps.
-        SimulationError: the law says no finite number.
+        CheckpointError: the run does not exist.
+        ConfigError: a pedestrian model, a model that needs quantities that SUMO does not have, an
+            unknown scenario or vehicle type, or other steps.
+        SimulationError: the law's speed is not finite.
     """
     checkpoint = load_checkpoint(checkpoint_of(str(run)))
     model = checkpoint.build()
     order = drivable(model).order
     place = Path(mkdtemp(prefix="nnode-drive-")) if folder is None else Path(folder)
-    own = steps_of(checkpoint, model)
+    run_steps = steps_of(checkpoint, model)
     if steps not in STEPS:
         raise ConfigError(f"steps={steps} is unknown, expected {', '.join(STEPS)}")
-    if steps == "run" and own.method not in _PLACED[order]:
+    if steps == "run" and run_steps.method not in _PLACED[order]:
         raise ConfigError(
-            f"steps=run: the run was calibrated with {own}, SUMO can make "
+            f"steps=run: the run was calibrated with {run_steps}, SUMO can make "
             f"{' or '.join(_PLACED[order])} steps; take steps=scenario"
         )
-    found = drive(
+    result = drive(
         model,
         Path(sumo).expanduser(),
         [vehicles] if isinstance(vehicles, str) else list(vehicles),
         place,
         program=program,
-        expected=own if steps == "match" else None,
-        told=own if steps == "run" else None,
+        expected=run_steps if steps == "match" else None,
+        forced_steps=run_steps if steps == "run" else None,
         end=end,
         far=far,
         lengths=_has_lengths(checkpoint, str(run), model) if lengths is None else lengths,
@@ -96,65 +97,66 @@ def drive_run(
         seed=seed,
     )
     account = {
-        **asdict(found),
-        "trajectories": str(found.trajectories),
+        **asdict(result),
+        "trajectories": str(result.trajectories),
         "run": str(run),
         "sumo": str(sumo),
         "vehicles": vehicles,
         "program": program,
     }
     write_json(place / "drive.json", account)
-    return found
+    return result
 
 
 def drive_scenario(config: DictConfig, folder: Path) -> None:
-    """What the command does: :func:`drive_run`, and a few lines on what came of it."""
+    """The command: run :func:`drive_run`, and print the result."""
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
     asked: dict[str, Any] = {str(key): value for key, value in plain.items()}
-    found = drive_run(asked.pop("run"), folder=folder, **asked)
-    speed = "nobody drove" if found.mean_speed is None else f"mean {found.mean_speed:.2f} m/s"
+    result = drive_run(asked.pop("run"), folder=folder, **asked)
+    speed = "nobody drove" if result.mean_speed is None else f"mean {result.mean_speed:.2f} m/s"
     print(
-        f"driven: {found.driven} vehicles, {speed}; {found.seconds:g} s in {found.steps} "
-        f"{found.method} steps of {found.step:g} s"
+        f"driven: {result.driven} vehicles, {speed}; {result.seconds:g} s in {result.steps} "
+        f"{result.method} steps of {result.step:g} s"
     )
     print(
-        f"collisions: {found.collisions}, {found.driven_collisions} of them with driven vehicles; "
-        f"teleports: {found.teleports}"
+        f"collisions: {result.collisions}, {result.driven_collisions} of them with driven "
+        f"vehicles; teleports: {result.teleports}"
     )
-    if found.stranded:
+    if result.stranded:
         hint = "" if config.lane_changes else "; lane_changes=true lets SUMO choose their lanes"
-        print(f"stopped where a lane did not lead on: {found.stranded} driven vehicles{hint}")
-    print(f"took {found.wall:.2f} s, {found.in_sumo:.2f} s of them in SUMO's steps")
-    print(f"trajectories: {found.trajectories}")
+        print(f"stopped where a lane did not lead on: {result.stranded} driven vehicles{hint}")
+    print(f"took {result.wall:.2f} s, {result.in_sumo:.2f} s of them in SUMO's steps")
+    print(f"trajectories: {result.trajectories}")
     print(f"account: {folder / 'drive.json'}")
 
 
 def steps_of(checkpoint: Checkpoint, model: System) -> Steps:
-    """The steps that a run was calibrated with; ballistic ones for a law whose own steps have
-    stages, which SUMO does not have."""
+    """The steps of a run's calibration. Ballistic steps replace Runge-Kutta steps, which SUMO does
+    not have."""
     solver, sampling = checkpoint.config["solver"], float(checkpoint.manifest["dt"])
     seconds = sampling / substeps(sampling, solver.get("dt"), model)
-    own = "ballistic" if model.step == "rk4" else model.step
-    return Steps(seconds, str(solver.get("method") or own))
+    default = "ballistic" if model.step == "rk4" else model.step
+    return Steps(seconds, str(solver.get("method") or default))
 
 
 def _has_lengths(checkpoint: Checkpoint, run: str, model: System) -> bool:
     """Whether a run's data had vehicles' lengths.
 
     Raises:
-        ConfigError: the law asks for them, and the data are not there.
+        ConfigError: the law needs lengths, and the data are missing.
     """
     if "length_1" not in drivable(model).symbols:
         return True
     prepared = checkpoint.config["data"].get("prepared")
-    beside = checkpoint_of(run).parent.parent / "data"
-    for folder in filter(None, (prepared, beside)):
+    prepared_folder = checkpoint_of(run).parent.parent / "data"
+    for folder in filter(None, (prepared, prepared_folder)):
         if (Path(folder) / MANIFEST).is_file():
             length = Store(Path(folder))[0].length
             return length is not None and bool(np.isfinite(length).any())
     raise ConfigError(
-        f"the law asks for the length of the vehicle ahead, and the run's data, {beside}, are not "
+        f"the law asks for the length of the vehicle ahead, and the run's data, {prepared_folder}, "
+        "are not "
         "there to tell whether they had lengths; say lengths=true, gaps are bumper to bumper, or "
         "lengths=false, the law's gap at rest contains a length"
     )

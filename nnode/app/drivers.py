@@ -1,4 +1,4 @@
-"""Calibration to drivers who differ: where it has a place, and what it found, as tables."""
+"""Calibration with differences between drivers: when it applies, and its results as tables."""
 
 from __future__ import annotations
 
@@ -27,30 +27,31 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 AUTO, NONE = "auto", "none"
-#: m, root mean square error of pooled parameters below which paths are explained exactly, as those
-#: of a model's own simulation are.
+#: Root mean square error (m) of pooled parameters below which paths are explained exactly, as by a
+#: model's own simulation.
 EXACT = 0.01
-#: m, errors of measurement of positions that were smoothed before. Smoothing leaves errors that
-#: last over samples, and models take them for pushes if errors are assumed to be small.
+#: Assumed measurement error (m) of smoothed positions. Smoothing leaves autocorrelated errors,
+#: which the model would attribute to disturbances if the assumed error were small.
 SMOOTHED = 0.1
-#: Share of the admissible interval that searches start away from its ends.
+#: Distance of start values from the bounds, as a share of the admissible interval.
 INSIDE = 0.01
 
 
 def planned(
     options: TrainerOptions, model: System, sequences: Callable[[], list[Sequence]], exact: bool
 ) -> str | list[str] | None:
-    """What is done about drivers who differ: ``auto``, ``none``, or names of parameters; None: as
-    ``auto``, but all share their parameters if that cannot be estimated.
+    """The treatment of differences between drivers: ``auto``, ``none``, or names of parameters.
+
+    None is ``auto`` with a fallback: all drivers share their parameters if the estimation fails.
 
     Args:
-        options: of the trainer, as they were given.
-        sequences: reads those of the training.
-        exact: whether the optimizer takes exact derivatives.
+        options: the given options of the trainer.
+        sequences: function that reads the training sequences.
+        exact: whether the optimizer uses exact derivatives.
 
     Raises:
-        ConfigError: a value that is none of these, an unknown parameter, or drivers who differ
-            where they have no place.
+        ConfigError: another value, an unknown parameter, or a model or data that do not allow
+            differences between drivers.
     """
     given = options.drivers
     if given == NONE:
@@ -62,8 +63,8 @@ def planned(
         if not exact or model.order == 1 or options.pooling is not Pooling.pooled:
             return NONE
         training = sequences()
-        able = obstacle(model, training) is None and drivers_differ(model, training)
-        return None if able else NONE
+        possible = obstacle(model, training) is None and drivers_differ(model, training)
+        return None if possible else NONE
     if given != AUTO and not _names(given):
         raise ConfigError(
             f"trainer.drivers={given} is unknown, expected auto, none, or a list of parameters of "
@@ -100,17 +101,16 @@ class Drivers:
     """A law calibrated to drivers who differ.
 
     Attributes:
-        model: the law with the parameters of the typical driver, the medians.
+        model: the law with the medians of the drivers' parameters.
         parameters: address to ``low``, ``high``, ``at_bound``, ``identified``, ``std_error``,
             ``df`` and ``scale``; see :func:`nnode.calibrate.intervals.intervals`.
-        correlation: of the estimates, by address, of logarithms where parameters are positive.
-        clusters: their number.
+        correlation: correlation of the estimates by address, for logarithms of positive
+            parameters.
+        clusters: number of clusters.
         differ: short names of the parameters that differ between drivers.
-        variability: see :class:`nnode.app.calibration.Calibration`.
-        table: the same.
-        converged: whether the estimation did.
-        bias: of the parameters by short name, by how much they were corrected, as a share where
-            they are positive.
+        variability, table: see :class:`nnode.app.calibration.Calibration`.
+        converged: whether the estimation converged.
+        bias: short name of a parameter to the bias correction, relative for positive parameters.
         observations: number of measured positions of followers.
         variances: number of estimated standard deviations and times.
         log_likelihood: logarithm of the marginal likelihood of the positions (m).
@@ -137,26 +137,26 @@ class Drivers:
 
     @property
     def units(self) -> dict[str, str]:
-        """Of the parameters, by short name."""
+        """Short name of a parameter to its unit."""
         units = {name: unit for name, (_, unit) in self.model.physical().items()}
         return {short: units[name] for name, short in short_names(units).items()}
 
     def summary(self) -> list[str]:
-        """What differs between drivers, and what disturbs them."""
+        """Lines on differences between drivers and on disturbances."""
         rows = self.variability.iterrows()
-        found = {str(name): row for name, row in rows}
-        said = {name: _estimate(row) for name, row in found.items()}
-        differ = [f"{name} by {said[name]}" for name in self.differ]
-        every = ", ".join(differ) if differ else "none that the data tell"
+        estimates = {str(name): row for name, row in rows}
+        texts = {name: _estimate(row) for name, row in estimates.items()}
+        differ = [f"{name} by {texts[name]}" for name in self.differ]
+        listed = ", ".join(differ) if differ else "none that the data tell"
         return [
             f"{len(self.table)} drivers; parameters that differ between them (standard deviation): "
-            f"{every}; the parameters of the table are the medians",
-            f"pushes of {said['push']} that last {said['push_time']}; errors of measurement of "
-            f"{said['measurement']}",
+            f"{listed}; the parameters of the table are the medians",
+            f"pushes of {texts['push']} that last {texts['push_time']}; errors of measurement of "
+            f"{texts['measurement']}",
         ]
 
     def plain(self) -> dict[str, Any]:
-        """For ``result.json``."""
+        """The content of ``result.json`` on drivers."""
         rows = self.variability.replace({np.nan: None}).to_dict("index")
         return {
             "differ": self.differ,
@@ -183,11 +183,11 @@ def calibrated_drivers(
     """Calibrate to drivers who differ.
 
     Args:
-        model: where one search starts.
-        first: parameters by address, where another search starts.
+        model: start of one search.
+        first: address to parameter, start of another search.
         drivers: see :func:`planned`.
-        cluster: ``(S,)`` of each sequence, see :func:`nnode.data.clusters.clusters`.
-        seed: of the simulations that tell the bias.
+        cluster: ``(S,)`` cluster of each sequence, see :func:`nnode.data.clusters.clusters`.
+        seed: seed of the simulations for the bias correction.
 
     Raises:
         ConfigError: see :func:`nnode.population.drivers.fit_drivers`.
@@ -209,57 +209,61 @@ def calibrated_drivers(
             SMOOTHED,
         )
         paths = replace(paths, error=SMOOTHED)
-    found = fit_drivers(double, paths, drivers, first, seed=seed)
-    if not found.estimate.converged:
+    population = fit_drivers(double, paths, drivers, first, seed=seed)
+    if not population.estimate.converged:
         log.warning(
             "the estimation of drivers who differ did not converge: take another law, fewer "
             "parameters that differ (trainer.drivers=[T]), or trainer.drivers=none"
         )
-    followers, theta = found.model, found.estimate.theta
+    followers, theta = population.model, population.estimate.theta
     row = followers.natural(theta)
     vector.fill_(row)
-    whole = copy.deepcopy(model)
-    whole.load_state_dict({k: v.to(whole.state_dict()[k]) for k, v in double.state_dict().items()})
-    parameters, correlation, number = _intervals(found, cluster)
-    short, variances = short_names(followers.names), found.estimate.variances
+    calibrated = copy.deepcopy(model)
+    calibrated.load_state_dict(
+        {k: v.to(calibrated.state_dict()[k]) for k, v in double.state_dict().items()}
+    )
+    parameters, correlation, number = _intervals(population, cluster)
+    short, variances = short_names(followers.names), population.estimate.variances
     return Drivers(
-        model=whole,
+        model=calibrated,
         parameters=parameters,
         correlation=correlation,
         clusters=number,
-        differ=[short[name] for name in found.random],
-        variability=pd.DataFrame.from_dict(variations(found), orient="index"),
-        table=_table(found, sequences),
-        converged=found.estimate.converged,
+        differ=[short[name] for name in population.random],
+        variability=pd.DataFrame.from_dict(variations(population), orient="index"),
+        table=_table(population, sequences),
+        converged=population.estimate.converged,
         bias={
             short[name]: float(np.expm1(bias) if in_logs else bias)
-            for name, bias, in_logs in zip(followers.names, found.bias, followers.logs, strict=True)
+            for name, bias, in_logs in zip(
+                followers.names, population.bias, followers.logs, strict=True
+            )
         },
-        observations=int(found.estimate.data.observed.sum()),
+        observations=int(population.estimate.data.observed.sum()),
         variances=int((variances.low < variances.high).sum()),
-        # that of the restricted likelihood would not compare laws with other parameters
-        log_likelihood=float(found.marginal.each.sum()),
+        # the restricted likelihood is not comparable between laws with different parameters
+        log_likelihood=float(population.marginal.each.sum()),
     )
 
 
 def _intervals(
-    found: Population, cluster: np.ndarray
+    population: Population, cluster: np.ndarray
 ) -> tuple[dict[str, Any], dict[str, dict[str, float]], int]:
-    """Intervals, correlations and the number of clusters, as
-    :func:`nnode.calibrate.intervals.intervals` gives them."""
+    """Intervals, correlations and the number of clusters, in the form of
+    :func:`nnode.calibrate.intervals.intervals`."""
     from nnode.calibrate.intervals import VAGUE
     from nnode.population.intervals import at_bounds, influence
 
-    model, theta, paths = found.model, found.estimate.theta, found.model.paths
-    own = np.zeros(len(paths.names), dtype=int)
-    own[paths.agent] = cluster[paths.sequence]
-    number = len(np.unique(own))
-    known, free = influence(found, own)
-    low, high = at_bounds(found)
+    model, theta, paths = population.model, population.estimate.theta, population.model.paths
+    agent_cluster = np.zeros(len(paths.names), dtype=int)
+    agent_cluster[paths.agent] = cluster[paths.sequence]
+    number = len(np.unique(agent_cluster))
+    cluster_influence, free = influence(population, agent_cluster)
+    low, high = at_bounds(population)
     half = np.full(len(theta), np.inf)
     error, degrees = half.copy(), half.copy()
-    half[free], error[free] = known.half_widths(), known.standard_errors()
-    degrees[free] = known.degrees()
+    half[free], error[free] = cluster_influence.half_widths(), cluster_influence.standard_errors()
+    degrees[free] = cluster_influence.degrees()
     if number < 2:
         half[:] = np.inf
     ends = [model.natural(np.clip(theta + s * half, model.low, model.high)) for s in (-1.0, 1.0)]
@@ -268,19 +272,23 @@ def _intervals(
     scale = np.where(np.isfinite(widest), VAGUE * widest, value)
     parameters: dict[str, Any] = {}
     for i, name in enumerate(model.names):
-        sure = bool(np.isfinite(half[i]))
+        has_interval = bool(np.isfinite(half[i]))
         parameters[name] = {
-            "low": float(ends[0][i]) if sure else None,
-            "high": float(ends[1][i]) if sure else None,
-            "std_error": float(error[i] * (value[i] if model.logs[i] else 1.0)) if sure else None,
-            "df": float(degrees[i]) if sure else None,
+            "low": float(ends[0][i]) if has_interval else None,
+            "high": float(ends[1][i]) if has_interval else None,
+            "std_error": float(error[i] * (value[i] if model.logs[i] else 1.0))
+            if has_interval
+            else None,
+            "df": float(degrees[i]) if has_interval else None,
             "scale": "log" if model.logs[i] else "linear",
             "at_bound": "low" if low[i] else "high" if high[i] else None,
-            "identified": sure and bool(ends[1][i] - ends[0][i] < scale[i]) if number > 1 else None,
+            "identified": has_interval and bool(ends[1][i] - ends[0][i] < scale[i])
+            if number > 1
+            else None,
         }
     table = np.full((len(theta), len(theta)), np.nan)
     if number > 1:
-        table[np.ix_(free, free)] = known.correlation()
+        table[np.ix_(free, free)] = cluster_influence.correlation()
     correlation = {
         name: dict(zip(model.names, map(float, line), strict=True))
         for name, line in zip(model.names, table, strict=True)
@@ -288,19 +296,19 @@ def _intervals(
     return parameters, correlation, number
 
 
-def _table(found: Population, sequences: list[Sequence]) -> pd.DataFrame:
-    """A row per driver: the own parameters, their standard errors and shrinkage."""
-    model, paths, known = found.model, found.model.paths, found.estimate
+def _table(population: Population, sequences: list[Sequence]) -> pd.DataFrame:
+    """A row per driver: the driver's parameters, their standard errors and shrinkage."""
+    model, paths, estimate = population.model, population.model.paths, population.estimate
     first = np.unique(paths.agent, return_index=True)[1]
     short = short_names(model.names)
     table: dict[str, Any] = {
         "driver": list(paths.names),
         "sequence": [sequences[b].name for b in paths.sequence[first]],
     }
-    errors = np.sqrt(found.marginal.variances)
+    errors = np.sqrt(population.marginal.variances)
     for k, q in enumerate(model.random):
-        name, value = short[model.names[q]], np.exp(known.theta[q] + known.agents[:, k])
+        name, value = short[model.names[q]], np.exp(estimate.theta[q] + estimate.agents[:, k])
         table[name] = value
         table[f"{name}_error"] = value * errors[:, k]
-        table[f"{name}_shrinkage"] = found.marginal.shrinkage[:, k]
+        table[f"{name}_shrinkage"] = population.marginal.shrinkage[:, k]
     return pd.DataFrame(table)

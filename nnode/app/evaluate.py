@@ -1,4 +1,4 @@
-"""Errors of a checkpoint beside its baselines: ``nnode evaluate``."""
+"""Errors of a checkpoint and of baselines: ``nnode evaluate``."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
 from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved
+from nnode.app.cli.saved import merge_saved, options_of
 from nnode.app.training import (
     build_solver,
     set_threads,
@@ -36,69 +36,71 @@ PARTS = ("auto", "heldout", "train", "unseen", "all")
 
 
 def choose(store: Source, checkpoint: Checkpoint, part: str) -> tuple[str, list[int], int | None]:
-    """Which sequences of a store are evaluated.
+    """Select the sequences of a store for an evaluation.
 
-    ``heldout`` and ``train`` are the checkpoint's own parts; ``unseen`` is what it neither
-    trained on nor dropped beside it. ``auto`` takes the held-out sequences where these data have
-    some, else the unseen ones, else all.
+    ``heldout`` and ``train`` are the checkpoint's parts. ``unseen`` are sequences that it neither
+    trained on nor dropped. ``auto`` takes the held-out sequences if there are any, or else the
+    unseen ones, or else all.
 
     Returns:
-        The part, its positions in the store, and how many of them were trained on; None where
-        that cannot be told, because the same files were cut into sequences in another way.
+        The part, its positions in the store, and the number of trained sequences among them, which
+        is None if the same files were cut into sequences in another way.
 
     Raises:
-        ConfigError: an unknown part, or one that these data do not have.
+        ConfigError: an unknown part, or a part without sequences.
     """
     if part not in PARTS:
         raise ConfigError(f"part={part} is unknown, expected one of {', '.join(PARTS)}")
     before = set(source_hashes(checkpoint.manifest).values())
     shared = bool(before & set(source_hashes(store.manifest).values()))
-    known = not shared or _cut_alike(store.manifest, checkpoint.manifest)
-    own = {
-        name: set(checkpoint.split.get(name, [])) if shared and known else set()
+    comparable = not shared or _cut_alike(store.manifest, checkpoint.manifest)
+    parts = {
+        name: set(checkpoint.split.get(name, [])) if shared and comparable else set()
         for name in ("heldout", "train", "dropped")
     }
     names = [entry["name"] for entry in store.index]
-    found = {
-        "heldout": [i for i, name in enumerate(names) if name in own["heldout"]],
-        "train": [i for i, name in enumerate(names) if name in own["train"]],
+    indices = {
+        "heldout": [i for i, name in enumerate(names) if name in parts["heldout"]],
+        "train": [i for i, name in enumerate(names) if name in parts["train"]],
         "unseen": [
-            i for i, n in enumerate(names) if known and n not in own["train"] | own["dropped"]
+            i
+            for i, n in enumerate(names)
+            if comparable and n not in parts["train"] | parts["dropped"]
         ],
         "all": list(range(len(store))),
     }
     if part == "auto":
-        part = next(name for name in ("heldout", "unseen", "all") if found[name])
-    if not found[part]:
+        part = next(name for name in ("heldout", "unseen", "all") if indices[name])
+    if not indices[part]:
         raise ConfigError(
             f"part={part}: these data have no such sequences of the checkpoint; use part=all"
         )
-    trained = len(set(found[part]) & set(found["train"])) if known else None
-    return part, found[part], trained
+    trained = len(set(indices[part]) & set(indices["train"])) if comparable else None
+    return part, indices[part], trained
 
 
 def _cut_alike(*manifests: dict[str, Any]) -> bool:
-    """Whether files became sequences in the same way, whichever of them are kept.
+    """Whether files were cut into sequences in the same way.
 
-    An option that an earlier version did not have is not compared.
+    Options that an earlier version did not have are not compared.
     """
-    one, other = ({**m.get("options", {}), "reader": m.get("reader")} for m in manifests)
-    kept = ("recording", "faults", "agents", "path", "name", *NOT_PREPARATION)
-    return all(one[key] == other[key] for key in one.keys() & other.keys() - {*kept})
+    first, second = ({**m.get("options", {}), "reader": m.get("reader")} for m in manifests)
+    ignored = ("recording", "faults", "agents", "path", "name", *NOT_PREPARATION)
+    return all(first[key] == second[key] for key in first.keys() & second.keys() - {*ignored})
 
 
 def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
-    """Write ``metrics.json`` and ``replay.html``, and print the model beside its baselines.
+    """Write ``metrics.json`` and ``replay.html``, and print errors of the model and baselines.
 
-    Of lanes the errors of every follower are printed and written as well.
+    For lanes, the errors of every follower are printed and written as well.
 
     Raises:
-        NNodeError: no such checkpoint, no such data, or data of another domain.
+        NNodeError: the checkpoint or the data do not exist, or the data have another domain.
     """
     checkpoint = load_checkpoint(config.checkpoint)
     config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
-    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
-    solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
+    data: DataOptions = options_of(config.data)
+    solver_options: SolverOptions = options_of(config.solver)
     set_threads(checkpoint.config["trainer"]["threads"], data.domain)
     store = open_data(data, folder / "data")
     part, indices, trained = choose(store, checkpoint, config.part)
@@ -123,28 +125,32 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     shares = {name: 1.0, **{f"baseline {key}": 0.5 for key in baselines_of}}
     with Stages("evaluating", shares) as stages:
         stages.begin(name)
-        found = measure(lambda batch: solver(model, batch))
-        others = {}
+        metrics = measure(lambda batch: solver(model, batch))
+        baseline_metrics = {}
         for key, simulate in baselines_of.items():
             stages.begin(f"baseline {key}")
-            others[key] = measure(simulate)
+            baseline_metrics[key] = measure(simulate)
     write_json(
         folder / "metrics.json",
         {
-            **found.plain(),
+            **metrics.plain(),
             "model": name,
             "data": data.name,
             "part": part,
             "trained_on": trained,
             "unit": convention.unit,
-            # the field's name for it
-            **({"spacing_rmse": found.objectives["spacing"]} if found.objectives else {}),
+            # the usual name in car following
+            **({"spacing_rmse": metrics.objectives["spacing"]} if metrics.objectives else {}),
             "parameters": {k: float(v) for k, (v, _) in model.physical().items()},
             "free_speed": checkpoint.free_speed,
-            "baselines": {key: metrics.plain() for key, metrics in others.items()},
+            "baselines": {key: metrics.plain() for key, metrics in baseline_metrics.items()},
         },
     )
-    _print({name: found, **others}, f"{data.name}, {part}: {found.sequences} sequences", convention)
+    _print(
+        {name: metrics, **baseline_metrics},
+        f"{data.name}, {part}: {metrics.sequences} sequences",
+        convention,
+    )
     if data.domain == "traffic":
         from nnode.app.followers import follower_errors, write_followers  # loads Matplotlib
 

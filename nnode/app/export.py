@@ -1,4 +1,4 @@
-"""A run's results in the formats of other programs: ``nnode export``."""
+"""Export of a run's results to other programs: ``nnode export``."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.runs import RESULT
-from nnode.app.cli.saved import merge_saved, path_given, saved_groups
+from nnode.app.cli.saved import merge_saved, options_of, path_given, saved_groups
 from nnode.app.evaluate import choose
 from nnode.app.training import build_solver, set_threads, straight_loader, stream
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
@@ -42,46 +42,46 @@ from nnode.exchange.trajectories import (
 from nnode.files import write_json, write_text
 from nnode.model import System
 
-#: What can be written, in the order in which it is.
+#: Targets, in the order of writing.
 TARGETS = ("jupedsim", "sumo", "pedpy", "fcd", "parquet", "csv")
 
-#: Which trajectories ``trajectories=`` asks for.
+#: Value of ``trajectories=`` to the sets of trajectories.
 SOURCES = {
     "measured": ("measured",),
     "simulated": ("simulated",),
     "both": ("measured", "simulated"),
 }
 
-#: Where a training or a diagnosis leaves its calibrated model.
+#: Place of the calibrated model in the folder of a training or a diagnosis.
 BEST = Path("checkpoints") / "best.pt"
 
 
 def checkpoint_of(run: str) -> Path:
-    """The checkpoint of a run's folder; a path to a checkpoint is taken as it stands."""
+    """The checkpoint in a run's folder; a path to a checkpoint is returned unchanged."""
     place = Path(run).expanduser()
     return place if place.suffix == ".pt" else place / BEST
 
 
 def intervals_of(run: str) -> Intervals:
-    """What a run's ``result.json`` says of its parameters; nothing where it is not there."""
+    """The parameters in a run's ``result.json``; empty without the file."""
     path = checkpoint_of(run).parent.parent / RESULT
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))["parameters"]
+        parameters = json.loads(path.read_text(encoding="utf-8"))["parameters"]
     except (OSError, ValueError, KeyError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return parameters if isinstance(parameters, dict) else {}
 
 
 def groups_of_run(overrides: list[str]) -> list[str]:
-    """Overrides that choose the run's own data and solver where the user chooses none."""
+    """Overrides that choose the run's data and solver if the user chooses none."""
     run = path_given(overrides, "run")
-    told = [] if run is None else [f"checkpoint={checkpoint_of(run)}"]
-    return saved_groups([*overrides, *told], "checkpoint", ("data", "solver"))
+    checkpoint = [] if run is None else [f"checkpoint={checkpoint_of(run)}"]
+    return saved_groups([*overrides, *checkpoint], "checkpoint", ("data", "solver"))
 
 
 @dataclass
 class _Export:
-    """What all writers look at."""
+    """Arguments of all writers."""
 
     folder: Path
     checkpoint: Checkpoint
@@ -95,8 +95,8 @@ class _Export:
 
     @property
     def dtype(self) -> torch.dtype:
-        found: torch.dtype = getattr(torch, self.checkpoint.config["trainer"]["dtype"])
-        return found
+        dtype: torch.dtype = getattr(torch, self.checkpoint.config["trainer"]["dtype"])
+        return dtype
 
     def trajectories(self, source: str) -> Iterator[Sequence]:
         measured = (self.sequences[i] for i in range(len(self.sequences)))
@@ -107,10 +107,11 @@ class _Export:
 
 
 def export(config: DictConfig, folder: Path) -> None:
-    """Write what is asked for, say where it is and what had no counterpart.
+    """Write the targets, and print their places and what had no counterpart.
 
     Raises:
-        NNodeError: no such run or data, an unknown target, or one that the model does not have.
+        NNodeError: the run or the data do not exist, or a target is unknown or does not fit the
+            model.
     """
     checkpoint = load_checkpoint(checkpoint_of(config.run))
     config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
@@ -120,14 +121,14 @@ def export(config: DictConfig, folder: Path) -> None:
         raise ConfigError(
             f"trajectories={config.trajectories} is unknown, expected {', '.join(SOURCES)}"
         )
-    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
-    solver_options: SolverOptions = OmegaConf.to_object(config.solver)  # type: ignore[assignment]
+    data: DataOptions = options_of(config.data)
+    solver_options: SolverOptions = options_of(config.solver)
     set_threads(checkpoint.config["trainer"]["threads"], data.domain)
     store = open_data(data, folder / "data")
     part, indices, _ = choose(store, checkpoint, config.part)
     device = World().use(Device(config.device), "device")
     model, solver = model.to(device), build_solver(solver_options, device)
-    model.scene(next(stream(straight_loader(store, indices[:1], 1))))  # of the data's domain
+    model.scene(next(stream(straight_loader(store, indices[:1], 1))))  # checks the domain
     job = _Export(
         folder=folder,
         checkpoint=checkpoint,
@@ -140,10 +141,10 @@ def export(config: DictConfig, folder: Path) -> None:
         intervals=intervals_of(config.run),
     )
     print(f"{data.name}, {part}: {len(indices)} sequences, model {_label(checkpoint)}")
-    told: dict[str, Any] = {}
+    written: dict[str, Any] = {}
     for target in targets:
         files, counterpart = WRITERS[target](job)
-        told[target] = {
+        written[target] = {
             "files": [str(path.relative_to(folder)) for path in files],
             "notes": counterpart.notes,
             "no_counterpart": counterpart.missing,
@@ -155,16 +156,16 @@ def export(config: DictConfig, folder: Path) -> None:
             print(f"  {line}")
         for line in counterpart.missing:
             print(f"  no counterpart: {line}")
-    account = {"run": str(config.run), "part": part, "sequences": len(indices), "written": told}
+    account = {"run": str(config.run), "part": part, "sequences": len(indices), "written": written}
     write_json(folder / "export.json", account)
     print(f"account: {folder / 'export.json'}")
 
 
 def targets_of(asked: Any, model: System) -> list[str]:
-    """What is to be written, in the order of :data:`TARGETS`.
+    """The targets to write, in the order of :data:`TARGETS`.
 
     Raises:
-        ConfigError: nothing, or a target that there is not.
+        ConfigError: no target, or an unknown one.
     """
     if asked == "auto":
         fit = {"parquet", "csv"}
@@ -194,14 +195,14 @@ _Written = tuple[list[Path], Counterpart]
 
 def _jupedsim(job: _Export) -> _Written:
     scenes = scenes_of(job.trajectories("measured"), job.model.wall_spacing)
-    found = jupedsim_parameters(job.model, scenes, job.intervals)
-    return [write_text(job.folder / "jupedsim.json", found.text + "\n")], found
+    counterpart = jupedsim_parameters(job.model, scenes, job.intervals)
+    return [write_text(job.folder / "jupedsim.json", counterpart.text + "\n")], counterpart
 
 
 def _sumo(job: _Export) -> _Written:
     speed, length = traffic_of(job.trajectories("measured"))
-    found = sumo_type(job.model, _label(job.checkpoint), speed, length, job.intervals)
-    return [write_text(job.folder / "vtype.add.xml", found.text)], found
+    counterpart = sumo_type(job.model, _label(job.checkpoint), speed, length, job.intervals)
+    return [write_text(job.folder / "vtype.add.xml", counterpart.text)], counterpart
 
 
 def _paths(name: str, job: _Export) -> _Written:
@@ -213,12 +214,12 @@ def _paths(name: str, job: _Export) -> _Written:
 
 
 def _parquet(job: _Export) -> _Written:
-    files, found = _paths("parquet", job)
+    files, counterpart = _paths("parquet", job)
     path, sets = write_walls(job.folder / "walls.csv", job.trajectories("measured"))
     files += [] if path is None else [path]
     if sets > 1:
-        found.missing.append(f"walls: the sequences have {sets} sets, a table has one")
-    return files, found
+        counterpart.missing.append(f"walls: the sequences have {sets} sets, a table has one")
+    return files, counterpart
 
 
 def _csv(job: _Export) -> _Written:

@@ -1,4 +1,4 @@
-"""Errors of every follower of lanes, pair by pair and driver by driver."""
+"""Errors of every follower in lanes, by pair and by driver."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nnode.files import csv_text, write_text
 from nnode.plots import traffic
 from nnode.plots.style import save
 
-#: Rows of a table that are printed, those with the largest errors.
+#: Number of printed rows of a table, those with the largest errors.
 SHOWN = 10
 #: Columns of both tables, with their units.
 COLUMNS = {
@@ -36,34 +36,40 @@ COLUMNS = {
 def follower_errors(simulate: Simulate, batches: Iterable[Batch], index: Index) -> pd.DataFrame:
     """One row per sequence and follower, over all samples after the first.
 
-    A spacing error is that of the distance to the vehicle ahead, both simulated, or measured where
-    the model is given a measured leader. Biases are simulated minus measured. Speeds of models of
-    first order are forward differences, as those of data without speeds.
+    A spacing error is the error of the distance between simulated vehicles, or to a measured
+    leader. Biases are simulated minus measured. Speeds of models of first order are forward
+    differences, as for data without speeds.
 
     Args:
         simulate: the model.
-        batches: lanes.
-        index: what is known of the sequences, see :func:`nnode.data.clusters.index_of`.
+        batches: batches of lanes.
+        index: index of the sequences, see :func:`nnode.data.clusters.index_of`.
 
     Returns:
         Columns ``sequence``, ``recording`` (or the site of several), ``driver`` (the identifier,
-        or else the sequence and the place in it), ``samples`` and :data:`COLUMNS`.
+        or else the sequence and the index in it), ``samples`` and :data:`COLUMNS`.
     """
-    known = {entry["name"]: entry for entry in index}
+    entries = {entry["name"]: entry for entry in index}
     rows = []
     for batch in batches:
-        found = simulate(batch)
-        error = (found.x - batch.x)[..., 0]
-        speed = found.v[..., 0] if found.v is not None else _slopes(found.x[..., 0], batch.dt)
-        measured = batch.v[..., 0] if found.v is not None else _slopes(batch.x[..., 0], batch.dt)
-        late = speed - measured
+        trajectory = simulate(batch)
+        error = (trajectory.x - batch.x)[..., 0]
+        speed = (
+            trajectory.v[..., 0]
+            if trajectory.v is not None
+            else _slopes(trajectory.x[..., 0], batch.dt)
+        )
+        measured = (
+            batch.v[..., 0] if trajectory.v is not None else _slopes(batch.x[..., 0], batch.dt)
+        )
+        speed_error = speed - measured
         for b, name in enumerate(batch.names):
-            entry = known[name]
+            entry = entries[name]
             for n in range(int(batch.agent[b].sum()) - 1):
-                there = batch.valid[:, b, n].numpy(force=True)
-                k = np.flatnonzero(there)[1:]
+                valid = batch.valid[:, b, n].numpy(force=True)
+                k = np.flatnonzero(valid)[1:]
                 gap = (error[:, b, n + 1] - error[:, b, n]).numpy(force=True)[k]
-                slip = late[:, b, n].numpy(force=True)[k]
+                speed_error_at = speed_error[:, b, n].numpy(force=True)[k]
                 rows.append(
                     {
                         "sequence": name,
@@ -72,8 +78,8 @@ def follower_errors(simulate: Simulate, batches: Iterable[Batch], index: Index) 
                         "samples": len(k),
                         "spacing_rmse": float(np.sqrt((gap**2).mean())),
                         "spacing_bias": float(gap.mean()),
-                        "speed_rmse": float(np.sqrt((slip**2).mean())),
-                        "speed_bias": float(slip.mean()),
+                        "speed_rmse": float(np.sqrt((speed_error_at**2).mean())),
+                        "speed_bias": float(speed_error_at.mean()),
                         "final_error": float(abs(error[k[-1], b, n])),
                     }
                 )
@@ -86,7 +92,7 @@ def _slopes(x: torch.Tensor, dt: float) -> torch.Tensor:
 
 
 def by_driver(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row per driver: all samples of all his sequences together."""
+    """One row per driver, pooled over all samples of the driver's sequences."""
     weight = rows["samples"]
     sums = (
         pd.DataFrame(

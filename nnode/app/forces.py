@@ -1,14 +1,14 @@
-"""What calibrated models have learned, as pictures: ``nnode plot_forces``."""
+"""Plots of calibrated forces and speed curves: ``nnode plot_forces``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved
+from nnode.app.cli.saved import merge_saved, options_of
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
@@ -46,7 +46,7 @@ def plot_forces(config: DictConfig, folder: Path) -> None:
     """Draw the checkpoints' forces into ``folder``.
 
     Raises:
-        NNodeError: a missing or damaged checkpoint, or traffic and crowd models together.
+        NNodeError: a checkpoint is missing or damaged, or traffic and crowd models are mixed.
     """
     given = config.checkpoint
     paths = [given] if isinstance(given, str) else list(given)
@@ -72,7 +72,7 @@ def _traffic(
     models: dict[str, System], config: DictConfig, first: Checkpoint, folder: Path
 ) -> list[Path]:
     merged = with_prepared(merge_saved(config, first.config, ("data",)))
-    data: DataOptions = OmegaConf.to_object(merged.data)  # type: ignore[assignment]
+    data: DataOptions = options_of(merged.data)
     try:
         store = open_data(data, folder / "data")
         gaps = measured_gaps(store[i] for i in range(len(store)))
@@ -87,9 +87,9 @@ def _traffic(
 def _crowd(models: dict[str, System], extent: float | None, folder: Path) -> list[Path]:
     written: list[Path] = []
     for label, model in models.items():
-        # the label is of the checkpoint, whoever made it
+        # the label comes from the checkpoint and may have any characters
         stem = file_name(label.replace(", ", "_").replace(" ", ""))
-        while folder / f"{stem}_settings.png" in written:  # labels may differ in such signs alone
+        while folder / f"{stem}_settings.png" in written:  # replaced characters may cause clashes
             stem += "_"
         for component, axis in enumerate("xy"):
             path = folder / f"{stem}_force_{axis}.png"

@@ -1,4 +1,4 @@
-"""What laws, forces and effects there are: ``python -m nnode.app.laws``."""
+"""The list of laws, forces and effects: ``python -m nnode.app.laws``."""
 
 from __future__ import annotations
 

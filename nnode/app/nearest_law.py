@@ -1,5 +1,8 @@
-"""Which law comes nearest, and what it lacks: laws are compared, the nearest one is diagnosed and
-the one that was asked for, and laws are compared again with what they lack."""
+"""Comparison of laws and diagnosis of the nearest one.
+
+Laws are compared, the nearest law and the requested one are diagnosed, and laws are compared again
+with the missing effects.
+"""
 
 from __future__ import annotations
 
@@ -25,29 +28,29 @@ from nnode.model.extend import effects_of
 from nnode.model.system import Traffic
 from nnode.progress import Stages
 
-#: Laws that are compared where none are named; networks contain effects, and newell remembers step
-#: by step.
+#: Default laws of the comparison. Networks are excluded because they contain effects, and newell
+#: because it remembers steps.
 LAWS = {
     "traffic": ("lin", "log", "idm", "ovm", "fvdm", "gipps", "krauss", "helly"),
     "crowd": ("sf", "esf", "gcfm", "ttc"),
 }
 
-#: Options that say what is simulated, not by which law.
+#: Options of the simulation that all compared laws share.
 SHARED = ("desired", "neighbours")
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is diagnosed.
+    """The arguments of a diagnosis.
 
     Attributes:
-        model, data: their options in plain types.
-        groups: the configuration groups that they come from.
-        system: the model, not calibrated.
+        model, data: options of model and data in plain types.
+        groups: the configuration groups of model and data.
+        system: the uncalibrated model.
         inputs: the data.
-        options: checked.
-        laws: models to compare before, by name; none where nothing is to be compared.
-        seconds: that reading took.
+        options: the checked options.
+        laws: name to model for the comparison; empty without a comparison.
+        seconds: time of reading, s.
     """
 
     model: dict[str, Any]
@@ -61,11 +64,11 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Of the model."""
+        """Name of the model."""
         return str(self.model["name"])
 
 
-#: Shows the stages of a work by its name and their seconds.
+#: A function that shows the progress of a task, from its name and the durations of its stages.
 Watch = Callable[[str, dict[str, float]], AbstractContextManager[Stages | None]]
 
 
@@ -76,102 +79,112 @@ def unwatched(name: str, stages: dict[str, float]) -> AbstractContextManager[Non
 def candidates(
     model: Mapping[str, Any], asked: System, options: DiscoverOptions
 ) -> dict[str, System]:
-    """Models by name, the one that was asked for among them; vehicles drive behind measured
-    leaders, people want to go where the one that was asked for says. None where nothing is to be
-    compared.
+    """Name to model for the comparison, including the requested model; empty without a comparison.
+
+    Vehicles follow measured leaders. People have the destinations of the requested model.
 
     Args:
-        model: options of the one that was asked for.
+        model: options of the requested model.
+        asked: the requested model.
 
     Raises:
-        ConfigError: an unknown name, or one of another domain.
+        ConfigError: a name is unknown, or its model has another domain.
     """
     names = LAWS[asked.domain] if options.compare is None else options.compare
-    found: dict[str, System] = {}
-    for one in names:
-        if one not in MODELS:
+    models: dict[str, System] = {}
+    for name in names:
+        if name not in MODELS:
             raise ConfigError(
-                f"discover.compare: there is no model {one}, expected some of "
+                f"discover.compare: there is no model {name}, expected some of "
                 f"{', '.join(LAWS[asked.domain])}, or another name as in conf/model"
             )
-        found[one] = build_model(law_options(one, model), options.seed)
-        if found[one].domain != asked.domain:
+        models[name] = build_model(law_options(name, model), options.seed)
+        if models[name].domain != asked.domain:
             raise ConfigError(
-                f"discover.compare: {one} is a {found[one].domain} model, the data and the model "
-                f"are of {asked.domain}; leave it out"
+                f"discover.compare: {name} is a {models[name].domain} model, the data and the "
+                f"model are of {asked.domain}; leave it out"
             )
-    if found:
-        own = found[str(model["name"])] = copy.deepcopy(asked)
-        if isinstance(own, Traffic):
-            own.leader = "measured"
-    return found
+    if models:
+        asked_model = models[str(model["name"])] = copy.deepcopy(asked)
+        if isinstance(asked_model, Traffic):
+            asked_model.leader = "measured"
+    return models
 
 
 def law_options(name: str, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a model that is compared with another one."""
-    found = model_options(name, "measured")
-    return {**found, **{key: asked[key] for key in SHARED if key in asked and key in found}}
+    """Options of a model for the comparison with the model of the options ``asked``."""
+    options = model_options(name, "measured")
+    return {**options, **{key: asked[key] for key in SHARED if key in asked and key in options}}
 
 
 def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
-    """The law that was asked for, then the one that comes nearest, where that is another one.
+    """Diagnoses of the requested law and of the nearest law, if it is another one.
 
-    Laws are compared first as they are, then with what the nearest of them lacks, then with what
-    the one asked for lacks beside: a strong effect may bring another law to the front, which can
-    imitate it.
+    Laws are compared without effects, then with the effects that the nearest law lacks, and then
+    with further effects that the requested law lacks. The repetition is necessary because a law
+    that imitates a strong effect may first seem to be the nearest one.
     """
     set_threads(None, job.system.domain)
     seconds = 0.0
 
-    def compared(known: dict[str, System], effects: list[Effect]) -> tuple[Laws, dict[str, System]]:
+    def compared(
+        models: dict[str, System], effects: list[Effect]
+    ) -> tuple[Laws, dict[str, System]]:
         nonlocal seconds
         start = time.monotonic()
-        found, calibrated = _compared(job, with_effects(known, effects), watch)
-        found.effects = [effect.name for effect in effects]
+        ranking, calibrated = _compared(job, with_effects(models, effects), watch)
+        ranking.effects = [effect.name for effect in effects]
         seconds += time.monotonic() - start
-        return found, calibrated
+        return ranking, calibrated
 
     laws, systems = compared(job.laws, []) if job.laws else (None, {})
     nearest = _with_law(job, laws.best or job.name) if laws else job
-    found = _diagnose(nearest, watch)
-    effects, again = _lacking(nearest, found), None
-    hints: dict[str, System] = {}
+    outcome = _diagnose(nearest, watch)
+    effects, second_comparison = _added_effects(nearest, outcome), None
+    calibrated_laws: dict[str, System] = {}
     if systems and effects:
-        again, hints = compared(systems, effects)
-        if again.best != nearest.name:
-            nearest = _with_law(job, again.best)
-            found = _diagnose(nearest, watch, hint=hints[again.best])
-    done = _both(job, nearest, found, hints, watch)
-    # what imitates another law would bring that law's other imitations to the front
-    known = {effect.name for effect in effects}
-    more = [e for e in _lacking(*done[0]) if not e.built_into_laws and e.name not in known]
-    if len(done) > 1 and more:
-        last, hints = compared(systems, effects + more)
-        behind = {one.name: one.p_value for one in last.ranking}
-        if behind.get(nearest.name, 1.0) <= job.options.rules.level:
-            again, nearest = last, _with_law(job, last.best)
-            found = _diagnose(nearest, watch, hint=hints[last.best])
-            done = _both(job, nearest, found, hints, watch)
-    first = done[0][1].diagnosis
-    first.laws, first.laws_again = laws, again
+        second_comparison, calibrated_laws = compared(systems, effects)
+        if second_comparison.best != nearest.name:
+            nearest = _with_law(job, second_comparison.best)
+            outcome = _diagnose(nearest, watch, hint=calibrated_laws[second_comparison.best])
+    diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws, watch)
+    # effects that are built into other laws are excluded, because they would favour laws that
+    # imitate those
+    names = {effect.name for effect in effects}
+    further = [
+        e for e in _added_effects(*diagnoses[0]) if not e.built_into_laws and e.name not in names
+    ]
+    if len(diagnoses) > 1 and further:
+        last, calibrated_laws = compared(systems, effects + further)
+        p_values = {entry.name: entry.p_value for entry in last.ranking}
+        if p_values.get(nearest.name, 1.0) <= job.options.rules.level:
+            second_comparison, nearest = last, _with_law(job, last.best)
+            outcome = _diagnose(nearest, watch, hint=calibrated_laws[last.best])
+            diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws, watch)
+    first = diagnoses[0][1].diagnosis
+    first.laws, first.laws_again = laws, second_comparison
     first.seconds = {"reading": job.seconds, "laws": round(seconds, 3), **first.seconds}
-    return done
+    return diagnoses
 
 
-def _lacking(job: Job, found: DiagnosisOutcome) -> list[Effect]:
-    """Effects that the search gave to a law."""
-    own = {effect.name for effect in effects_of(job.system)}
-    return [effect for effect in effects_of(found.searched) if effect.name not in own]
+def _added_effects(job: Job, outcome: DiagnosisOutcome) -> list[Effect]:
+    """Effects that the search added to a law."""
+    present = {effect.name for effect in effects_of(job.system)}
+    return [effect for effect in effects_of(outcome.searched) if effect.name not in present]
 
 
-def _both(
-    job: Job, nearest: Job, found: DiagnosisOutcome, hints: dict[str, System], watch: Watch
+def _diagnoses(
+    job: Job,
+    nearest: Job,
+    outcome: DiagnosisOutcome,
+    calibrated_laws: dict[str, System],
+    watch: Watch,
 ) -> list[tuple[Job, DiagnosisOutcome]]:
-    """The nearest law's diagnosis, after that of the one asked for, where it is another one."""
+    """The diagnosis of the requested law, if it is not the nearest, and of the nearest law."""
     if nearest.name == job.name:
-        return [(nearest, found)]
-    nearer = BetterLaw(nearest.name, found.searched)
-    return [(job, _diagnose(job, watch, nearer, hints.get(job.name))), (nearest, found)]
+        return [(nearest, outcome)]
+    nearer = BetterLaw(nearest.name, outcome.searched)
+    return [(job, _diagnose(job, watch, nearer, calibrated_laws.get(job.name))), (nearest, outcome)]
 
 
 def _compared(job: Job, laws: dict[str, System], watch: Watch) -> tuple[Laws, dict[str, System]]:
@@ -185,32 +198,32 @@ def _compared(job: Job, laws: dict[str, System], watch: Watch) -> tuple[Laws, di
 def _diagnose(
     job: Job, watch: Watch, nearer: BetterLaw | None = None, hint: System | None = None
 ) -> DiagnosisOutcome:
-    """Run the diagnosis, and add what only its caller knows."""
+    """Run the diagnosis, and add faults of the data, notes and the name of the model."""
     inputs, name = job.inputs, job.name
     with watch(f"diagnosis of {name}", STAGES) as stages:
-        found = diagnose(
+        outcome = diagnose(
             job.system, inputs.sequences, job.options, stages=stages, nearer=nearer, hint=hint
         )
-    found.diagnosis.data_faults = inputs.data_faults
-    found.diagnosis.notes += inputs.measured
-    found.diagnosis.model = name
-    return found
+    outcome.diagnosis.data_faults = inputs.data_faults
+    outcome.diagnosis.notes += inputs.measured
+    outcome.diagnosis.model = name
+    return outcome
 
 
 def _with_law(job: Job, name: str) -> Job:
-    """The same with another law."""
+    """The job with another law."""
     if name == job.name:
         return job
     system, options = job.laws[name], job.options
-    # effects that laws of its order know
-    known = {e.name for e in CATALOGUE.of(job.inputs.domain, system.order)}
-    effects = None if options.effects is None else [e for e in options.effects if e in known]
-    out = [e for e in options.exclude if e in known]
+    # effects that are defined for laws of this order
+    applicable = {e.name for e in CATALOGUE.of(job.inputs.domain, system.order)}
+    effects = None if options.effects is None else [e for e in options.effects if e in applicable]
+    excluded = [e for e in options.exclude if e in applicable]
     return replace(
         job,
         model=law_options(name, job.model),
         groups={**job.groups, "model": name},
         system=system,
-        options=replace(options, effects=effects, exclude=out),
+        options=replace(options, effects=effects, exclude=excluded),
         laws={},
     )

@@ -1,12 +1,13 @@
-"""Raw recordings to sequences: ``nnode prepare_data``."""
+"""Preparation of raw recordings as sequences: ``nnode prepare_data``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.cli.recognised import with_recognised
+from nnode.app.cli.saved import options_of
 from nnode.data.clusters import clusters, relation
 from nnode.data.dataset import noise_of
 from nnode.data.options import DataOptions
@@ -16,13 +17,13 @@ from nnode.plots.quality import plot_faults
 
 
 def prepare_data(config: DictConfig, folder: Path) -> None:
-    """Prepare a data set into ``folder`` and say what came of it.
+    """Prepare a data set in ``folder``, and print a summary.
 
     Raises:
         NNodeError: see :func:`nnode.data.prepare.prepare`.
     """
     config = with_recognised(config)
-    options: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
+    options: DataOptions = options_of(config.data)
     store = prepare(options, folder, draw=plot_faults)
     if kinds := kinds_text(recorded(store.manifest).values()):
         print(f"faults: {kinds} sequences; pictures in {folder / 'faults'}")

@@ -1,4 +1,4 @@
-"""Players for users: of an evaluated model, and of tables from anywhere."""
+"""Pages with animated trajectories, for an evaluated model and for user's tables."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def replay(
 ) -> Path:
     """Write a page on which measured and simulated agents move side by side.
 
-    Sequences and agents go by their names; a simulation is looked at at the times that were
-    measured, evenly between its own.
+    Sequences and agents are matched by name. Simulations are interpolated linearly to the measured
+    times.
 
     Args:
         measured: CSV or Parquet, or a data frame, with ``sequence, time, agent, x`` and, for a
             crowd, ``y``, SI units; see ``docs/data.md``.
-        simulated: the same of a simulation, or of several by their titles.
-        path: of the page, ``.html``; it needs no other file.
+        simulated: the same for a simulation, or title to the same for several simulations.
+        path: path of the page, ``.html``, which needs no other file.
         domain: ``traffic`` or ``crowd``.
         walls: CSV with x1, y1, x2, y2, m.
         zones: places or times to shade.
@@ -57,7 +57,7 @@ def replay(
         The path.
 
     Raises:
-        NNodeError: a table that does not fit, tables without a sequence in common, or a path that
+        NNodeError: a table has the wrong form, the tables have no common sequence, or the path
             cannot be written to.
     """
     tables = dict(simulated) if isinstance(simulated, Mapping) else {"simulated": simulated}
@@ -69,14 +69,19 @@ def replay(
     scenes = []
     for s in real:
         name = s.name.rpartition("/")[2]
-        if all(name in found for found in models.values()):
-            there = {title: _at(found[name], s) for title, found in models.items()}
-            scenes.append(Scene(s, there))
+        if all(name in sequences_of for sequences_of in models.values()):
+            positions = {
+                title: _at(sequences_of[name], s) for title, sequences_of in models.items()
+            }
+            scenes.append(Scene(s, positions))
     if not scenes:
-        own = real[0].name.rpartition("/")[2]
-        others = ", ".join(sorted({name for found in models.values() for name in found})[:5])
+        example = real[0].name.rpartition("/")[2]
+        others = ", ".join(
+            sorted({name for sequences_of in models.values() for name in sequences_of})[:5]
+        )
         raise DataError(
-            f"no sequence is both measured and simulated: those measured are called {own} and the "
+            f"no sequence is both measured and simulated: those measured are called {example} and "
+            "the "
             f"like, those simulated {others}; give both tables the same names in column 'sequence'"
         )
     block = ReplayBlock("replay", scenes, _CAPTION, _alt(scenes), list(zones), len(real))
@@ -84,22 +89,22 @@ def replay(
 
 
 def _read(table: Table, domain: str, walls: str | Path | None) -> list[Sequence]:
-    own = DataTable(table) if isinstance(table, pd.DataFrame) else Path(table).expanduser()
+    source = DataTable(table) if isinstance(table, pd.DataFrame) else Path(table).expanduser()
     bounds = None if walls is None else Path(walls).expanduser()
-    return read_table(own, TableOptions(domain=domain, path=""), bounds)
+    return read_table(source, TableOptions(domain=domain, path=""), bounds)
 
 
-def _at(found: Sequence, measured: Sequence) -> np.ndarray:
-    """Positions of the measured agents at the measured times, NaN where there are none."""
+def _at(simulated: Sequence, measured: Sequence) -> np.ndarray:
+    """Simulated positions of the measured agents at the measured times; NaN where missing."""
     x = np.full_like(measured.x, np.nan)
-    place = {name: i for i, name in enumerate(found.agents)}
+    place = {name: i for i, name in enumerate(simulated.agents)}
     for n, agent in enumerate(measured.agents):
         if agent in place:
             for d in range(x.shape[2]):
                 x[:, n, d] = np.interp(
                     measured.time,
-                    found.time,
-                    found.x[:, place[agent], d],
+                    simulated.time,
+                    simulated.x[:, place[agent], d],
                     left=np.nan,
                     right=np.nan,
                 )
@@ -117,18 +122,18 @@ def write_replay(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Path:
-    """Write a player of some sequences of a store as measured and as a model simulates them.
+    """Write a page with measured and simulated trajectories of sequences of a store.
 
     Args:
-        indices: of the sequences; evenly chosen ones of many are shown.
-        name: of the model.
+        indices: positions of the sequences, of which at most ``MOST`` are shown.
+        name: name of the model.
     """
     shown = indices[:: -(-len(indices) // MOST)]
     real = [store[i] for i in shown]
-    found = simulated_by(simulate, real, dtype=dtype, device=device)
+    simulations = simulated_by(simulate, real, dtype=dtype, device=device)
     led = model.leader_measured
-    scenes = [Scene(s, {name: x.x}, led=led) for s, x in zip(real, found, strict=True)]
-    zones = [zone for one in effects_of(model) if (zone := _zone(one)) is not None]
+    scenes = [Scene(s, {name: x.x}, led=led) for s, x in zip(real, simulations, strict=True)]
+    zones = [zone for effect in effects_of(model) if (zone := _zone(effect)) is not None]
     block = ReplayBlock("replay", scenes, _CAPTION, _alt(scenes), zones, len(indices))
     return write_player(block, path, title=f"{name}, measured and simulated")
 

@@ -1,4 +1,4 @@
-"""Sampled motion of a run's model, and its scores: ``nnode simulate``."""
+"""Motion sampled from a run's model, and its scores: ``nnode simulate``."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.calibration import Calibration
 from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved
+from nnode.app.cli.saved import merge_saved, options_of
 from nnode.app.evaluate import choose
 from nnode.app.export import checkpoint_of
 from nnode.app.python.inputs import Table, data_used
@@ -25,11 +25,11 @@ from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError
 from nnode.exchange.trajectories import check_format
 from nnode.generate.fit import fit_noise
-from nnode.generate.noise import Noise, constant_speed, free
+from nnode.generate.noise import Noise, constant_speed, free_running
 from nnode.generate.scores import LEAST
-from nnode.generate.simulated import Sampling, Simulated, Way, batches
+from nnode.generate.simulated import SampledModel, Sampling, Simulated, batches
 
-#: At most so many training sequences, drawn by the seed, tell the noise.
+#: Largest number of randomly drawn training sequences for the fit of the noise.
 FITTED = 200
 
 
@@ -47,18 +47,19 @@ def simulate_run(
     ``docs/sampling.md``.
 
     Args:
-        run: folder of a training or of a diagnosis, a checkpoint, or what :func:`nnode.fit` gives.
-        data: the run's own data, as they were calibrated to, where its files cannot be read again:
-            a table in memory has none; None: they are read.
-        samples: of every sequence, at least 39.
-        part: of the data, ``heldout``, ``train``, ``unseen``, ``all``; ``auto``: the first there
-            is, not train.
-        seed: of all that is drawn.
+        run: folder of a training or of a diagnosis, a checkpoint, or the result of
+            :func:`nnode.fit`.
+        data: the data of the run's calibration, if they were a table in memory; None reads the
+            run's files.
+        samples: number of samples of every sequence, at least 39.
+        part: part of the data, ``heldout``, ``train``, ``unseen``, ``all``; ``auto`` is the first
+            that exists, except train.
+        seed: seed of all random numbers.
 
     Raises:
-        CheckpointError: no such run.
-        ConfigError: too few samples, no such part.
-        DataError: no such data, or sequences too short to see the noise.
+        CheckpointError: the run does not exist.
+        ConfigError: too few samples, or an unknown part.
+        DataError: the data do not exist, or sequences are too short for the fit of the noise.
     """
     if isinstance(run, Calibration):
         checkpoint, where = run.checkpoint, ""
@@ -80,18 +81,18 @@ def simulate_run(
 
 
 def simulate(config: DictConfig, folder: Path) -> None:
-    """What the command does: :func:`simulate_run` on the data that are asked for, and files of it.
+    """The command: :func:`simulate_run` on the requested data, and its files.
 
     Raises:
-        NNodeError: no such run or data, too few samples.
+        NNodeError: the run or the data do not exist, or there are too few samples.
     """
     _check(config.samples)
     checkpoint = load_checkpoint(checkpoint_of(config.run))
-    if config.format is not None:  # before the work that would be lost
+    if config.format is not None:  # checked before the long computation
         check_format("format", config.format, checkpoint.build().domain)
     config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
-    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
-    found = _simulated(
+    data: DataOptions = options_of(config.data)
+    result = _simulated(
         checkpoint,
         open_data(data, folder / "data"),
         config.solver,
@@ -101,8 +102,8 @@ def simulate(config: DictConfig, folder: Path) -> None:
         seed=int(config.seed),
         data=data.name,
     )
-    print(found)
-    files = found.write(folder, format=config.format)
+    print(result)
+    files = result.write(folder, format=config.format)
     for path in dict.fromkeys(p.parent if p.suffix == ".txt" else p for p in reversed(files)):
         print(f"{path.name.partition('.')[0]}: {path}")
 
@@ -125,26 +126,28 @@ def _simulated(
     part: str,
     seed: int,
 ) -> Simulated:
-    model, name = free(checkpoint.build()), str(checkpoint.config["model"]["name"])
+    model, name = free_running(checkpoint.build()), str(checkpoint.config["model"]["name"])
     set_threads(checkpoint.config["trainer"]["threads"], model.domain)
     store = started(checkpoint, store)
     part, indices, trained = choose(store, checkpoint, part)
     label = clusters(store.index)
-    open_ = _some(choose(store, checkpoint, "train")[1], seed)
-    seen = [batch for batch, _ in batches(store, open_, 1)]
+    training_indices = _some(choose(store, checkpoint, "train")[1], seed)
+    training_batches = [batch for batch, _ in batches(store, training_indices, 1)]
     steps = {"dt": solver.get("dt"), "method": solver.get("method")}
-    still = constant_speed(model.domain)
+    constant_speed_model = constant_speed(model.domain)
     noise = {
-        name: fit_noise(model, seen, label[open_], seed=seed, **steps),
-        "constant_speed": fit_noise(still, seen, label[open_], seed=seed),
+        name: fit_noise(model, training_batches, label[training_indices], seed=seed, **steps),
+        "constant_speed": fit_noise(
+            constant_speed_model, training_batches, label[training_indices], seed=seed
+        ),
     }
-    ways = {
-        name: Way(model, noise[name].noise, steps),
-        f"{name}, no noise": Way(model, Noise(0.0, 1.0), steps),
-        "constant_speed": Way(still, noise["constant_speed"].noise, {}),
+    samplers = {
+        name: SampledModel(model, noise[name].noise, steps),
+        f"{name}, no noise": SampledModel(model, Noise(0.0, 1.0), steps),
+        "constant_speed": SampledModel(constant_speed_model, noise["constant_speed"].noise, {}),
     }
     job = Sampling(store, indices, samples, seed)
-    scores = {key: job.scored(way) for key, way in ways.items()}
+    scores = {key: job.scored(sampled_model) for key, sampled_model in samplers.items()}
     _, numbers = np.unique(label[indices], return_inverse=True)
     first = scores[name].sequence_means()
     return Simulated(
@@ -162,12 +165,12 @@ def _simulated(
             if key != name
         },
         sampling=job,
-        way=ways[name],
+        sampled_model=samplers[name],
     )
 
 
 def _some(indices: list[int], seed: int) -> list[int]:
-    """At most :data:`FITTED` of them."""
+    """At most :data:`FITTED` of the indices, drawn at random."""
     if len(indices) <= FITTED:
         return indices
     return sorted(np.random.default_rng(seed).choice(indices, FITTED, replace=False).tolist())

@@ -1,4 +1,4 @@
-"""Calibrate a model: the command ``train``."""
+"""Calibration of a model: the command ``train``."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import signal
 import time
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nnode.app.calibration import Calibration, calibrated
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.runs import RESULT
-from nnode.app.cli.saved import merge_saved, plain_config, refuse_changes
+from nnode.app.cli.saved import merge_saved, options_of, plain_config, refuse_changes
 from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver, check, model_of, trainer_of
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -28,7 +28,7 @@ from nnode.progress import Stages
 
 log = logging.getLogger(__name__)
 
-#: Options that may change when a run is resumed: they do not touch the numbers of a step.
+#: Options that may change when a run is resumed, because they do not affect the steps' numbers.
 RESUMABLE = (
     "data.source",
     "data.prepared",
@@ -43,17 +43,17 @@ RESUMABLE = (
     "trainer.save_every",
     "trainer.figure_every",
 )
-#: Table of each sequence's own parameters, of ``trainer.pooling``.
+#: Table of the separate parameters of sequences, for ``trainer.pooling``.
 OWN = "own_parameters.csv"
-#: Table of drivers, of ``trainer.drivers``.
+#: Table of drivers, for ``trainer.drivers``.
 DRIVERS = "drivers.csv"
 SECTIONS = ("model", "data", "optimizer", "solver", "trainer", "seed")
 
 
 def train(config: DictConfig, folder: Path) -> None:
-    """Run one training as configured, write what came of it, and say where it is.
+    """Run one training, write its results, and print their places.
 
-    Processes that were started together share it; the first one's folder is taken.
+    Processes that were started together share the training and the first process's folder.
 
     Raises:
         NNodeError: see the packages below; Interrupted after a signal, with all work saved.
@@ -62,13 +62,13 @@ def train(config: DictConfig, folder: Path) -> None:
     folder = world.from_first(folder)
     with world.together():
         config, checkpoint = _composed(config)
-    options: TrainerOptions = OmegaConf.to_object(config.trainer)  # type: ignore[assignment]
+    options: TrainerOptions = options_of(config.trainer)
     device = world.use(options.device, "trainer.device")
     with world.together():
         model, store = model_of(config), None
-        solver = build_solver(OmegaConf.to_object(config.solver), device)  # type: ignore[arg-type]
+        solver = build_solver(options_of(config.solver), device)
         if world.first:
-            data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
+            data: DataOptions = options_of(config.data)
             store = open_data(data, folder / "data")
     place = world.from_first(Path() if store is None else store.folder)
     with world.together():
@@ -85,8 +85,8 @@ def train(config: DictConfig, folder: Path) -> None:
         )
         if checkpoint is not None:
             trainer.restore(Path(config.resume))
-            told = config.resume, trainer.epoch, trainer.step
-            log.info("resumed from %s at epoch %d, step %d", *told)
+            progress = config.resume, trainer.epoch, trainer.step
+            log.info("resumed from %s at epoch %d, step %d", *progress)
             if trainer.epoch >= options.max_epochs:
                 log.info("nothing left to train: raise trainer.max_epochs=%d", options.max_epochs)
     start = time.monotonic()
@@ -96,9 +96,9 @@ def train(config: DictConfig, folder: Path) -> None:
             return
         result = _result(trainer, store, start)
     except Interrupted as stop:
-        again = [shell_override("resume", trainer.last_path)]
-        again.append(shell_override("hydra.run.dir", folder))
-        command = " ".join(["nnode train", *again])
+        overrides = [shell_override("resume", trainer.last_path)]
+        overrides.append(shell_override("hydra.run.dir", folder))
+        command = " ".join(["nnode train", *overrides])
         raise Interrupted(f"{stop}\nresume with: {command}", stop.signal) from None
     paths = {
         "tensorboard": folder / "tensorboard",
@@ -120,10 +120,10 @@ def train(config: DictConfig, folder: Path) -> None:
 
 
 def _result(trainer: Trainer, store: Store, start: float) -> Calibration:
-    """What the training came to.
+    """The result of the training.
 
     Raises:
-        Interrupted: on a signal; the training is in its last checkpoint.
+        Interrupted: on a signal; the last checkpoint contains the training.
     """
     with BreakingGuard() as guard, Stages("results", {"costs and intervals": 1.0}) as stages:
         stages.begin("costs and intervals")
@@ -139,7 +139,8 @@ def _result(trainer: Trainer, store: Store, start: float) -> Calibration:
 
 
 def _composed(config: DictConfig) -> tuple[DictConfig, Checkpoint | None]:
-    """The checked configuration, that of the checkpoint under it when a run is resumed."""
+    """The checked configuration and, for a resumed run, the checkpoint, whose options are the
+    defaults."""
     checkpoint: Checkpoint | None = None
     resume = config.resume
     if resume is not None:

@@ -1,18 +1,19 @@
-"""From options to a training: what the command and :class:`nnode.Calibrator` both put together."""
+"""Composition of a training from options, for the command and :class:`nnode.Calibrator`."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch.utils.data import DataLoader
 
+from nnode.app.cli.saved import options_of
 from nnode.app.drivers import NONE, planned
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.distributed import World
@@ -46,7 +47,7 @@ def build_solver(options: SolverOptions, device: torch.device | None = None) -> 
     """The solver that the options describe.
 
     Raises:
-        ConfigError: unknown options, or a compiled solver asked to work on a GPU.
+        ConfigError: unknown options, or a compiled solver on a GPU.
     """
     if isinstance(options, FusedOptions):
         if device is not None and device.type != "cpu":
@@ -70,12 +71,12 @@ def stream(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str | None = None,
 ) -> Iterator[Batch]:
-    """The mini-batches of a loader, in the precision and on the device asked for."""
+    """The mini-batches of a loader in a precision and on a device."""
     return (batch.to(device, dtype) for batch in loader)
 
 
 def started(checkpoint: Checkpoint, store: Source) -> Source:
-    """Sequences with the speeds that simulations of a checkpoint start with, as in training."""
+    """Sequences with the start speeds of a checkpoint's simulations, as in its training."""
     model = checkpoint.build()
     if checkpoint.config["trainer"].get("start_speeds") != StartSpeeds.auto.value:
         return store
@@ -85,14 +86,14 @@ def started(checkpoint: Checkpoint, store: Source) -> Source:
 def straight_loader(
     store: Source, indices: list[int], size: int, world: World | None = None
 ) -> DataLoader[Any]:
-    """A loader that visits sequences in order; this process's shares where a world is given."""
+    """A loader that visits sequences in order; with ``world``, only this process's shares."""
     options = LoaderOptions(batch_size=size, shuffle=False)
     rank, number = (world.rank, world.size) if world else (0, 1)
     return make_loader(SequenceDataset(store, indices), options, seed=0, rank=rank, size=number)
 
 
 def set_threads(threads: int | None, domain: str) -> None:
-    """Torch's threads; by default one for traffic, whose tensors are too small to share."""
+    """Set torch's threads; by default one for traffic, whose tensors are small."""
     if threads is not None and threads < 1:
         raise ConfigError(f"trainer.threads={threads} must be at least 1, or null")
     if threads is not None or domain == "traffic":
@@ -101,7 +102,7 @@ def set_threads(threads: int | None, domain: str) -> None:
 
 @contextmanager
 def threads_given_back() -> Iterator[None]:
-    """Give torch its threads back at the end."""
+    """Restore torch's number of threads at the end."""
     before = torch.get_num_threads()
     try:
         yield
@@ -113,7 +114,7 @@ def check(config: DictConfig) -> None:
     """Refuse options of the trainer that are out of their range.
 
     Raises:
-        ConfigError: with the option.
+        ConfigError: an option is out of its range.
     """
     trainer = config.trainer
     for name, low in (("max_epochs", 0), ("evaluate_every", 1), ("figure_every", 0)):
@@ -126,16 +127,25 @@ def check(config: DictConfig) -> None:
 
 
 def model_of(config: DictConfig) -> System:
-    """The model, if it is of the data's domain; torch's threads are set for it."""
+    """Build the model, check its domain, and set torch's threads for it."""
     model = build_model(config.model, int(config.seed), getattr(torch, config.trainer.dtype.value))
     domain = str(config.data.domain)
-    if domain in ("traffic", "crowd") and domain != model.domain:
-        raise ConfigError(
-            f"model={config.model.name} is a {model.domain} model, data={config.data.name} are "
-            f"{domain} data; choose both of one domain"
-        )
+    check_domain(model, str(config.model.name), domain, str(config.data.name))
     set_threads(config.trainer.threads, domain)
     return model
+
+
+def check_domain(model: System, model_name: str, domain: str, data_name: str) -> None:
+    """Refuse a model for data of another domain, if the domain of the data is known.
+
+    Raises:
+        ConfigError: the domains differ.
+    """
+    if domain in ("traffic", "crowd") and domain != model.domain:
+        raise ConfigError(
+            f"model={model_name} is a {model.domain} model, data={data_name} are {domain} data; "
+            "choose both of one domain"
+        )
 
 
 def trainer_of(
@@ -152,21 +162,21 @@ def trainer_of(
     """A trainer of a model on some sequences.
 
     Args:
-        config: ``data``, ``optimizer``, ``trainer`` and ``seed`` are read.
+        config: configuration with ``data``, ``optimizer``, ``trainer``, ``solver`` and ``seed``.
         model, solver: see :class:`nnode.calibrate.trainer.Trainer`.
         store: the sequences, on the disk or in memory.
-        plain: the configuration as checkpoints hold it.
-        folder: receives checkpoints and curves; None: nothing is written.
-        checkpoint: of a run that is gone on with; its division of the data is kept.
+        plain: the configuration in plain types, for checkpoints.
+        folder: folder for checkpoints and curves; None writes nothing.
+        checkpoint: checkpoint of a resumed run, whose division of the data is kept.
         world: the processes that train together.
 
     Raises:
-        NNodeError: data that are not those of the checkpoint, or options that do not fit.
+        NNodeError: the data are not those of the checkpoint, or options are incompatible.
     """
     world = world or World()
-    data: DataOptions = OmegaConf.to_object(config.data)  # type: ignore[assignment]
-    options: TrainerOptions = OmegaConf.to_object(config.trainer)  # type: ignore[assignment]
-    optimizer_options: Any = OmegaConf.to_object(config.optimizer)
+    data: DataOptions = options_of(config.data)
+    options: TrainerOptions = options_of(config.trainer)
+    optimizer_options: Any = options_of(config.optimizer)
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
     _check_pooling(options.pooling, model, optimizer_options.name)
@@ -177,7 +187,7 @@ def trainer_of(
     source: Source = store
     if options.start_speeds is StartSpeeds.auto:
         source = sound_speeds(store, model.domain, model.order)
-        # drivers who differ have starts of their own
+        # calibrations to drivers who differ fit start speeds themselves
         fits = exact and options.drivers == NONE and isinstance(source, SmoothSpeeds)
         options.start_speeds = StartSpeeds.fitted if fits else StartSpeeds.given
     if options.start_speeds is StartSpeeds.fitted and not exact:
@@ -227,14 +237,14 @@ def trainer_of(
             split={k: [names[i] for i in v] for k, v in asdict(parts).items() if k in PARTS},
             free_speed=free_speed,
         ),
-        # a law of people of one's own has no force that could be drawn by itself
+        # only forces between people can be drawn
         None if model.domain == "crowd" and model.find(InteractionForce) is None else force_figure,
         world,
     )
 
 
 def brief(manifest: dict[str, Any]) -> dict[str, Any]:
-    """A manifest without its long lists, small enough to travel in every checkpoint."""
+    """A manifest without its long lists, for checkpoints."""
     return {
         key: value
         for key, value in manifest.items()
@@ -243,27 +253,33 @@ def brief(manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def source_hashes(manifest: dict[str, Any]) -> dict[str, str]:
-    """SHA-256 of every raw file that a data set was prepared from."""
+    """SHA-256 of every raw file of a data set."""
     return {name: file["sha256"] for name, file in manifest.get("files", {}).items()}
 
 
-def _parts(store: Source, data: DataOptions, checkpoint: Checkpoint | None) -> Split:
-    """Which sequences train; a resumed run keeps what its checkpoint trained on and held out."""
+def positions(store: Source, names: Iterable[str]) -> list[int]:
+    """The positions of named sequences in a store."""
     places = {entry["name"]: i for i, entry in enumerate(store.index)}
-    known = {} if checkpoint is None else checkpoint.split
-    if not known or not {name for names in known.values() for name in names} <= set(places):
+    return [places[name] for name in names]
+
+
+def _parts(store: Source, data: DataOptions, checkpoint: Checkpoint | None) -> Split:
+    """The division of the sequences; a resumed run keeps that of its checkpoint."""
+    places = {entry["name"]: i for i, entry in enumerate(store.index)}
+    saved = {} if checkpoint is None else checkpoint.split
+    if not saved or not {name for names in saved.values() for name in names} <= set(places):
         return split(store.index, data.split)
     train, heldout, dropped = (
-        sorted(places[name] for name in known.get(part, [])) for part in PARTS
+        sorted(places[name] for name in saved.get(part, [])) for part in PARTS
     )
     return Split(train=train, heldout=heldout, dropped=dropped, mode="checkpoint", note="as it was")
 
 
 def _check_pooling(kind: Pooling, model: System, optimizer: str) -> None:
-    """Say where parameters of each sequence's own have no place.
+    """Refuse separate parameters of sequences where they are not available.
 
     Raises:
-        ConfigError: people, another optimiser, or a network.
+        ConfigError: a crowd model, another optimiser, or a network.
     """
     if kind is Pooling.pooled:
         return

@@ -1,1 +1,1 @@
-"""Calibration: cost, optimisers, the training loop, checkpoints, evaluation."""
+"""Calibration: costs, optimisers, the training loop, checkpoints and evaluation."""

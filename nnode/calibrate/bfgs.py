@@ -1,4 +1,4 @@
-"""Projected BFGS for many runs side by side, as one evaluation of an ensemble serves all."""
+"""Projected BFGS for many runs at once, with one evaluation of an ensemble for all runs."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from torch import Tensor
 #: ``(R, K)`` rows to ``(R,)`` costs and ``(R, K)`` gradients.
 Evaluate = Callable[[Tensor], tuple[Tensor, Tensor]]
 
-#: Sufficient decrease (Armijo), and the factor of a step that was not good enough.
+#: Sufficient decrease (Armijo), and the factor on a refused step.
 DECREASE, SHORTEN = 1e-4, 0.25
-#: Longest step of a parameter vector: the first one, and all others.
+#: Longest step of a parameter vector: the first step, and all other steps.
 FIRST, LONGEST = 0.3, 3.0
-#: So many refused steps in a row make a run forget its curvature.
+#: Number of consecutive refused steps after which a run resets its inverse Hessian.
 PATIENCE = 8
 
 
 @dataclass(frozen=True)
 class Minima:
-    """Where R minimisations ended.
+    """The results of R minimisations.
 
     Attributes:
         rows: ``(R, K)`` parameters.
-        costs: ``(R,)``; inf where not even the start could be simulated.
+        costs: ``(R,)``; inf if the start could not be simulated.
         gradients: ``(R, K)``.
         inverses: ``(R, K, K)`` approximations of the inverse Hessians.
-        evaluations: calls of the ensemble, the same for all runs.
+        evaluations: calls of the ensemble, equal for all runs.
     """
 
     rows: Tensor
@@ -40,7 +40,7 @@ class Minima:
 
     @property
     def best(self) -> int:
-        """The run with the least cost."""
+        """Index of the run with the lowest cost."""
         return int(self.costs.argmin())
 
 
@@ -54,19 +54,20 @@ def minimise(
     tolerance: float = 1e-7,
     inverse: Tensor | None = None,
 ) -> Minima:
-    """Minimise R costs, each from a start of its own, within a box.
+    """Minimise R costs, each from a separate start, within a box.
 
-    Dense BFGS approximations of the inverse Hessian; parameters at a bound that the gradient
-    presses against are held fixed; trial points are projected onto the box. All runs try one
-    point per evaluation: a run that is refused shortens its step while the others go on.
+    The inverse Hessian is a dense BFGS approximation. Parameters at a bound are fixed while the
+    descent direction points out of the box, and trial points are projected onto the box. Each
+    evaluation tries one point per run. A run whose point is refused shortens its step.
 
     Args:
         start: ``(R, K)``.
         low, high: ``(K,)`` the box.
-        iterations: evaluations at most.
-        tolerance: ends when within 20 evaluations no cost fell by more than this share.
-        inverse: ``(K, K)`` inverse Hessian to start from, as found by an earlier minimisation
-            of nearly the same cost; None starts from the steepest descent.
+        iterations: largest number of evaluations.
+        tolerance: the minimisation ends when no cost decreases by more than this share within 20
+            evaluations.
+        inverse: ``(K, K)`` initial inverse Hessian, such as the result of an earlier minimisation
+            of a similar cost; None starts with the steepest descent.
 
     Source:
         Nocedal & Wright, Numerical Optimization, 2nd ed., sections 6.1 and 16.7.
@@ -78,13 +79,13 @@ def minimise(
     gradient = torch.where(usable[:, None], gradient, 0.0)
     unit = torch.eye(x.shape[1], dtype=x.dtype)
     inverses = (unit if inverse is None else inverse).repeat(len(x), 1, 1)
-    # without curvature yet: the first step is cut, the first curvature scales the rest
+    # fresh runs have no curvature: their step is limited, and the first curvature sets the scale
     fresh = torch.full((len(x),), inverse is None)
     length, refused = torch.ones(len(x), dtype=x.dtype), torch.zeros(len(x), dtype=torch.long)
-    along = _direction(x, gradient, inverses, fresh, low, high)
-    earlier, done = cost, 0
+    search_direction = _direction(x, gradient, inverses, fresh, low, high)
+    earlier_cost, done = cost, 0
     for done in range(1, iterations + 1):
-        trial = (x + length[:, None] * along).clamp(low, high)
+        trial = (x + length[:, None] * search_direction).clamp(low, high)
         value, slope = evaluate(trial)
         step = trial - x
         enough = cost + DECREASE * (step * gradient).sum(1)
@@ -92,48 +93,47 @@ def minimise(
         change = torch.where(taken[:, None], slope - gradient, 0.0)
         inverses, fresh = _updated(inverses, fresh, taken, step, change)
         x, gradient = (
-            torch.where(taken[:, None], *both) for both in ((trial, x), (slope, gradient))
+            torch.where(taken[:, None], *pair) for pair in ((trial, x), (slope, gradient))
         )
         cost = torch.where(taken, value, cost)
         refused = torch.where(taken, 0, refused + 1)
-        lost = refused >= PATIENCE
-        inverses = torch.where(lost[:, None, None], unit, inverses)
-        fresh |= lost
-        refused[lost] = 0
-        new = taken | lost
-        length = torch.where(new, 1.0, length * SHORTEN)
-        turned = _direction(x, gradient, inverses, fresh, low, high)
-        along = torch.where(new[:, None], turned, along)
+        stuck = refused >= PATIENCE
+        inverses = torch.where(stuck[:, None, None], unit, inverses)
+        fresh |= stuck
+        refused[stuck] = 0
+        restarted = taken | stuck
+        length = torch.where(restarted, 1.0, length * SHORTEN)
+        direction = _direction(x, gradient, inverses, fresh, low, high)
+        search_direction = torch.where(restarted[:, None], direction, search_direction)
         if done % 20 == 0:
-            still = (earlier - cost <= tolerance * cost.abs()) | ~torch.isfinite(cost)
-            if bool(still.all()):
+            stalled = (earlier_cost - cost <= tolerance * cost.abs()) | ~torch.isfinite(cost)
+            if bool(stalled.all()):
                 break
-            earlier = cost
+            earlier_cost = cost
     return Minima(x, cost, gradient, inverses, done + 1)
 
 
 def optimality_residual(
     rows: Tensor, costs: Tensor, gradients: Tensor, low: Tensor, high: Tensor
 ) -> Tensor:
-    """``(R,)`` largest relative fall of the cost, to first order, per relative change of a
+    """``(R,)`` largest relative decrease of the cost, to first order, per relative change of a
     parameter: max_k |P(u_k - g_k) - u_k| max(|u_k|, 1) / J, with P the projection onto the box.
 
-    Zero at a point that satisfies the first-order optimality conditions.
+    It is zero at a point that satisfies the first-order optimality conditions.
     """
     away = ((rows - gradients).clamp(low, high) - rows).abs() * rows.abs().clamp(min=1.0)
     return away.amax(1) / costs
 
 
 def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """``(R, K, K)`` times ``(R, K)``."""
+    """The products of ``(R, K, K)`` matrices and ``(R, K)`` vectors."""
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
 def _updated(
     inverses: Tensor, fresh: Tensor, taken: Tensor, step: Tensor, change: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Inverse Hessians after the steps that were taken and met curvature, and which runs have met
-    none yet."""
+    """The BFGS update of the inverse Hessians; and which runs still have no curvature."""
     product = (step * change).sum(1)
     good = taken & (product > 1e-12 * step.norm(dim=1) * change.norm(dim=1))
     rate = torch.where(good, 1.0 / product, 0.0)[:, None, None]
@@ -149,7 +149,7 @@ def _direction(
     x: Tensor, gradient: Tensor, inverses: Tensor, fresh: Tensor, low: Tensor, high: Tensor
 ) -> Tensor:
     free = ~(((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0)))
-    found = -_times(inverses, gradient * free) * free
-    size = found.norm(dim=1, keepdim=True)
-    most = torch.where(fresh, FIRST, LONGEST).to(size)[:, None]
-    return torch.where(size > most, found * most / size, found)
+    direction = -_times(inverses, gradient * free) * free
+    size = direction.norm(dim=1, keepdim=True)
+    longest = torch.where(fresh, FIRST, LONGEST).to(size)[:, None]
+    return torch.where(size > longest, direction * longest / size, direction)

@@ -1,4 +1,4 @@
-"""Checkpoints: written atomically, opened safely, enough to rebuild a model or go on training."""
+"""Checkpoints: atomic writing, safe reading, and all state that a resumed training needs."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from nnode.files import disk_words, interpolation, replacing
 from nnode.model import System, build_model
 from nnode.version import VERSION
 
-#: Raised when the layout of a checkpoint changes.
+#: Version number of the layout of checkpoints.
 FORMAT = 1
 
 
 @dataclass(kw_only=True)
 class Checkpoint:
-    """Everything a run needs to go on, in plain types and tensors.
+    """All state that a resumed run needs, in plain types and tensors.
 
     Attributes:
         config: the composed configuration.
-        manifest: where the data came from: sources, hashes, options, counts.
+        manifest: provenance of the data: sources, hashes, options, counts.
         model: the model's ``state_dict``.
         optimizer: the optimiser's ``state_dict``.
         progress: epoch, mini-batch and step counters, running sums, best value so far.
@@ -57,7 +57,7 @@ class Checkpoint:
             system = build_model(self.config["model"], self.config["seed"], dtype)
         except NNodeError:
             raise
-        except Exception as error:  # whatever options that nobody checked lead to
+        except Exception as error:  # unchecked options cause many kinds of errors
             raise CheckpointError(
                 "the checkpoint's configuration describes no model "
                 f"({type(error).__name__}: {error}); it is damaged: take another checkpoint"
@@ -73,7 +73,7 @@ class Checkpoint:
 
 
 def copied(value: Any) -> Any:
-    """Deep copy of nested state with detached tensors, on the CPU so that any machine reads it."""
+    """Deep copy of nested state with detached tensors on the CPU."""
     if isinstance(value, Tensor):
         return value.detach().cpu().clone()
     if isinstance(value, dict):
@@ -84,14 +84,14 @@ def copied(value: Any) -> Any:
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
-    """Write ``path`` so that at every moment it is either the old file or the new one.
+    """Write a checkpoint atomically.
 
     Raises:
-        WriteError: no room, or not allowed; the old file is kept.
+        WriteError: the disk is full or the folder is not writable; the old file is kept.
     """
     content = {f.name: getattr(checkpoint, f.name) for f in fields(checkpoint)}
     with disk_words(path.parent), replacing(path) as temporary, open(temporary, "wb") as file:
-        # through memory: writing to a full disk, torch's own words would hide the reason
+        # written to memory first, because torch's error would hide that the disk is full
         buffer = io.BytesIO()
         torch.save(content, buffer)
         file.write(buffer.getbuffer())
@@ -100,11 +100,11 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
 
 
 def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
-    """Read a checkpoint with torch's safe loading: no code in it is executed.
+    """Read a checkpoint with torch's safe loading, which executes no code of the file.
 
     Raises:
-        CheckpointError: no such file, not a checkpoint, damaged, of another format, or with
-            ``${...}`` in its configuration.
+        CheckpointError: the file does not exist, is not a checkpoint, is damaged, has another
+            format, or has ``${...}`` in its configuration.
     """
     file = Path(path)
     if not file.is_file():
@@ -130,24 +130,24 @@ def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
             "another checkpoint"
         )
     try:
-        # every value takes a byte; lists that contain each other have more values than bytes
-        most = file.stat().st_size
-        found = interpolation([content["config"], content["manifest"].get("options")], most)
+        # every value has at least one byte; cyclic lists have more values than bytes
+        limit = file.stat().st_size
+        reference = interpolation([content["config"], content["manifest"].get("options")], limit)
     except ValueError as error:
         raise CheckpointError(
             f"{file} is damaged: its configuration has {error}; take another checkpoint"
         ) from error
-    if found is not None:
+    if reference is not None:
         raise CheckpointError(
-            f"{file} is refused: its configuration holds {found[:80]!r}, and ${{...}} stands for "
-            "values of this machine, such as its environment; no run writes that: take another "
+            f"{file} is refused: its configuration holds {reference[:80]!r}, and ${{...}} stands "
+            "for values of this machine, such as its environment; no run writes that: take another "
             "checkpoint"
         )
     return Checkpoint(**content)
 
 
 def _where(file: Path) -> str:
-    """Where there are checkpoints near a path that is none."""
+    """A hint to the checkpoints near a path that is not a checkpoint."""
     if file.is_dir():
         near = sorted([*file.glob("*.pt"), *file.glob("checkpoints/*.pt")])
         return f"it is a folder, {f'name {near[0]}' if near else 'expected a file *.pt'}"
@@ -157,7 +157,7 @@ def _where(file: Path) -> str:
     return "a training prints where it leaves them: RUN/checkpoints/best.pt"
 
 
-#: What the fields are.
+#: Types of the fields.
 _KINDS: dict[str, Any] = {
     "config": dict,
     "manifest": dict,
@@ -172,7 +172,7 @@ _KINDS: dict[str, Any] = {
 
 
 def _wrong_inside(content: dict[str, Any]) -> list[str]:
-    """Fields whose entries are of another kind than a checkpoint's."""
+    """Names of the fields whose entries have wrong types."""
 
     def texts(value: Any) -> bool:
         return isinstance(value, list) and all(isinstance(item, str) for item in value)
@@ -197,20 +197,20 @@ _SECTIONS = ("model", "data", "solver", "optimizer", "trainer", "groups")
 
 
 def _content(file: Path) -> Any:
-    """What the file holds, read without executing anything and in memory of the file's size."""
+    """The content of the file, read without executing code and in memory of the file's size."""
     try:
         with zipfile.ZipFile(file) as archive:
             records = archive.infolist()
-        # torch stores without packing; a small file that unpacks to a large one is none of ours
+        # torch does not compress; a compressed file could exhaust the memory
         packed = any(record.compress_type != zipfile.ZIP_STORED for record in records)
         if packed or sum(record.file_size for record in records) > file.stat().st_size:
             raise ValueError("its records are packed")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what a damaged file makes torch say
+            warnings.simplefilter("ignore")  # torch warns of damaged files
             return torch.load(file, map_location="cpu", weights_only=True)
     except PermissionError as error:
         raise CheckpointError(f"{file} cannot be read: {error.strerror}") from error
-    except Exception as error:  # a damaged file leads to almost any error
+    except Exception as error:  # damaged files cause many kinds of errors
         raise CheckpointError(
             f"{file} cannot be opened as a checkpoint: it is damaged or of another kind "
             f"({type(error).__name__})"

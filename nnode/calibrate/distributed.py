@@ -1,8 +1,8 @@
-"""Several processes that calibrate one model together, through torch's distributed package.
+"""Data-parallel calibration in several processes, through torch's distributed package.
 
-``torchrun`` starts them and tells each one its place. Every process holds the same model and
-sees its share of each mini-batch; what they add up (cost, gradient, errors, requests to stop) is
-the same number everywhere, so that all take the same step without sending parameters around.
+``torchrun`` starts the processes and numbers them. Every process has the same model and its share
+of each mini-batch. Sums over processes (cost, gradient, errors, requests to stop) are equal in all
+processes, so all take the same step without exchanging parameters.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from nnode.errors import ConfigError, NNodeError
 
 T = TypeVar("T")
 
-#: How long one process may keep the others waiting; the first prepares the data alone.
+#: Time limit of waiting for other processes, since the first process prepares the data.
 PATIENCE = timedelta(hours=24)
 
 
 class LostProcess(NNodeError):
-    """Another process of the run has ended, so that this one cannot go on."""
+    """Another process of the run has ended, so this process cannot continue."""
 
 
 def started_together() -> bool:
     """Whether ``torchrun``, or a launcher with the same environment, started several processes."""
-    told = all(name in os.environ for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"))
-    return told and int(os.environ.get("WORLD_SIZE", "1")) > 1
+    launched = all(name in os.environ for name in ("RANK", "MASTER_ADDR", "MASTER_PORT"))
+    return launched and int(os.environ.get("WORLD_SIZE", "1")) > 1
 
 
 def join() -> None:
-    """Meet the processes that were started together; nothing to do for one alone.
+    """Connect the processes that were started together; does nothing for a single process.
 
     Raises:
-        ConfigError: they do not find each other.
+        ConfigError: the connection fails.
     """
     if not started_together() or dist.is_initialized():
         return
@@ -54,19 +54,19 @@ def join() -> None:
             f"{os.environ['WORLD_SIZE']} processes cannot find each other: {error}; start them "
             "with torchrun --nproc-per-node=NUMBER -m nnode train"
         ) from error
-    # the interpreter must not end with the threads of the group still running
+    # the threads of the group must end before the interpreter does
     atexit.register(_leave)
 
 
 class World:
-    """The processes of this run, seen from one of them; a process alone is a world of one.
+    """The processes of this run, from the point of view of one process.
 
     Attributes:
         rank: number of this process, from 0.
         size: number of processes.
     """
 
-    #: Whether the error that this process raised last was raised in all of them.
+    #: Whether all processes raised the last error of this process.
     agreed: ClassVar[bool] = False
 
     def __init__(self) -> None:
@@ -77,18 +77,18 @@ class World:
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that writes files and speaks."""
+        """Whether this process writes files and prints."""
         return self.rank == 0
 
     def use(self, option: Device, name: str) -> torch.device:
-        """The device of this process; several GPUs of a machine are shared out.
+        """The device of this process; the processes of a machine are distributed over its GPUs.
 
         Args:
-            option: ``auto`` is a CUDA device where torch finds one, else the CPU.
-            name: of the option, for the error.
+            option: ``auto`` is a CUDA device if torch finds one, or else the CPU.
+            name: name of the option, for the error message.
 
         Raises:
-            ConfigError: ``cuda`` where torch finds none.
+            ConfigError: ``cuda``, but torch finds no CUDA device.
         """
         with self.together():
             if option is Device.cuda and not torch.cuda.is_available():
@@ -104,10 +104,10 @@ class World:
             torch.cuda.set_device(device)
             alone = int(os.environ.get("LOCAL_WORLD_SIZE", "1")) <= number
         # NCCL refuses two processes on one GPU; sums then go through the CPU
-        self._device = torch.device("cpu") if self.most(not alone) else device
+        self._device = torch.device("cpu") if self.maximum(not alone) else device
         return device
 
-    def most(self, number: int) -> int:
+    def maximum(self, number: int) -> int:
         """The largest of the processes' numbers."""
         if self.size == 1:
             return int(number)
@@ -117,7 +117,7 @@ class World:
         return int(value)
 
     def total(self, values: Tensor) -> Tensor:
-        """Sum over the processes, in float64; the same bits everywhere."""
+        """Sum over the processes, in float64, equal to the bit in all processes."""
         if self.size == 1:
             return values
         result = values.detach().to(self._device, torch.float64, copy=True)
@@ -126,25 +126,25 @@ class World:
         return result.to(values.device)
 
     def from_first(self, value: T) -> T:
-        """What the first process has, for all."""
-        box: list[Any] = [value]
+        """The value of the first process, in all processes."""
+        objects: list[Any] = [value]
         if self.size > 1:
             with _others():
-                dist.broadcast_object_list(box, src=0)
-        found: T = box[0]
-        return found
+                dist.broadcast_object_list(objects, src=0)
+        received: T = objects[0]
+        return received
 
     def agree(self, error: NNodeError | None) -> None:
-        """Raise in every process what one of them has to raise."""
+        """Raise an error in every process if any process has one."""
         if self.size == 1:
             if error is not None:
                 raise error
             return
         World.agreed = False
-        found: list[Any] = [None] * self.size
+        errors: list[Any] = [None] * self.size
         with _others():
-            dist.all_gather_object(found, None if error is None else (type(error), str(error)))
-        for item in found:
+            dist.all_gather_object(errors, None if error is None else (type(error), str(error)))
+        for item in errors:
             if item is not None:
                 World.agreed = True
                 kind, message = item
@@ -173,10 +173,10 @@ class World:
         Args:
             cost: this process's part, a scalar.
             parameters: those that are trained; their ``grad`` becomes the sum.
-            error: what went wrong in this process, if anything did.
+            error: the error of this process, or None.
 
         Raises:
-            NNodeError: the error of the first process that has one, in all of them.
+            NNodeError: the error of the first process that has one, in all processes.
         """
         if self.size == 1:
             self.agree(error)
@@ -192,24 +192,25 @@ class World:
         if summed[0] > 0:
             self.agree(error)
         start = len(head)
-        for p, known in zip(trained, summed[2:start].tolist(), strict=True):
+        for p, has_gradient in zip(trained, summed[2:start].tolist(), strict=True):
             share = summed[start : start + p.numel()]
-            p.grad = share.view_as(p).to(p) if known else None
+            p.grad = share.view_as(p).to(p) if has_gradient else None
             start += p.numel()
         return summed[1].to(cost)
 
-    def meet(self) -> None:
-        """Wait until all processes are here."""
+    def barrier(self) -> None:
+        """Wait until all processes have called this method."""
         if self.size > 1:
             with _others():
                 dist.barrier()
 
-    def part(self) -> None:
-        """Leave the others, when all are ready to; whoever is gone already is not waited for."""
+    def leave(self) -> None:
+        """Disconnect from the other processes after all have called this method, without waiting
+        for processes that have ended."""
         if self.size == 1:
             return
         with suppress(RuntimeError):
-            # torchrun ends the rest as soon as one process ends with an error
+            # torchrun ends all processes as soon as one ends with an error
             dist.all_reduce(torch.zeros(1))
         _leave()
 
@@ -217,13 +218,13 @@ class World:
 def _leave() -> None:
     if dist.is_initialized():
         dist.destroy_process_group()
-        # whatever still refers to the group in a cycle would keep its threads to the very end
+        # reference cycles would keep the threads of the group alive
         gc.collect()
 
 
 @contextmanager
 def _others() -> Iterator[None]:
-    """Say in words that another process is gone."""
+    """Raise LostProcess if the communication fails."""
     try:
         yield
     except RuntimeError as error:

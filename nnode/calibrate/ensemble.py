@@ -1,4 +1,4 @@
-"""Many runs of one model at once: cost and gradient as functions of flat parameter vectors."""
+"""Cost and gradient of many runs of a model at once, as functions of parameter vectors."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from nnode.simulation.fused import FusedSolver
 
 
 class EnsembleCost:
-    """Cost of R runs of a model on one batch, each run with parameters of its own.
+    """Cost of R runs of a model on one batch, with separate parameters for each run.
 
-    A run is a row of K numbers: all parameters that are calibrated, one after the other.
-    Rows are in float64 whatever the precision of the simulation.
+    A run is a row of K numbers, the calibrated parameters. Rows are float64 for every precision of
+    the simulation.
 
     Args:
-        system: the model; it is not changed. Parameters that need no gradient stay its own.
+        system: the model, which is not changed. Parameters that need no gradient keep its values.
         batch: the sequences, in the precision of the system.
-        solver: its step, method and threads.
-        convention: what is minimised.
+        solver: gives step, method and threads.
+        convention: the cost.
 
     Attributes:
         vector: the parameters that are calibrated.
@@ -44,10 +44,10 @@ class EnsembleCost:
         self.low, self.high = (torch.from_numpy(end) for end in self.vector.bounds)
 
     def costs(self, rows: Tensor) -> Tensor:
-        """``(R, B)`` cost of every sequence, inf where a simulation blows up; no gradient."""
+        """``(R, B)`` cost of every sequence, inf if a simulation blows up; without gradient."""
         with torch.no_grad():
-            found = self._costs(self.vector.runs(rows)).double()
-        return torch.where(torch.isfinite(found), found, math.inf)
+            costs = self._costs(self.vector.runs(rows)).double()
+        return torch.where(torch.isfinite(costs), costs, math.inf)
 
     def __call__(self, rows: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """``(R,)`` weighted costs and their ``(R, K)`` gradients.
@@ -60,7 +60,7 @@ class EnsembleCost:
         if weights is None:
             cost = each.mean(1)
         else:
-            # a sequence without weight must not spoil the sum where it blows up
+            # a sequence with weight 0 may blow up
             cost = torch.where(weights > 0, each * weights.to(each), 0.0).sum(1)
         parts = torch.autograd.grad(cost.sum(), list(stacked.values()))
         gradient = torch.cat([part.reshape(len(rows), -1) for part in parts], 1).double()
@@ -71,9 +71,9 @@ class EnsembleCost:
         return cost.detach().double(), gradient
 
     def _without_the_rest(self, row: Tensor, weights: Tensor) -> Tensor:
-        """``(K,)`` gradient of one run, simulated without the sequences that have no weight.
+        """``(K,)`` gradient of one run, simulated without the sequences of weight 0.
 
-        The derivative of a simulation that blows up is not a number, even times 0.
+        The derivative of a simulation that blows up is NaN, also if it is multiplied by 0.
         """
         places = weights.nonzero().flatten()
         batch = self.batch.select(places.tolist())
@@ -83,8 +83,8 @@ class EnsembleCost:
         return torch.cat([g.flatten() for g in torch.autograd.grad(total, list(stacked.values()))])
 
     def _costs(self, stacked: Mapping[str, Tensor]) -> Tensor:
-        found = self.solver.ensemble(self.system, stacked, self.batch)
-        return sequence_costs(found, self.batch, self.convention)
+        trajectory = self.solver.ensemble(self.system, stacked, self.batch)
+        return sequence_costs(trajectory, self.batch, self.convention)
 
 
 def _leaves(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:

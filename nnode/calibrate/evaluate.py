@@ -1,4 +1,4 @@
-"""How good a model is: cost, errors by horizon, and the baselines it has to beat."""
+"""Evaluation of a model: cost, errors by horizon, and baselines."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nnode.model import Crowd, Law, System, Traffic
 from nnode.model.laws import law_from
 from nnode.simulation.base import Solver, Trajectory
 
-#: Squared distance (m²) beyond which a simulation has nothing to do with its data: 10¹² m.
+#: Largest squared distance (m²) between simulation and data, for a distance of 10¹² m.
 MOST = 1e24
 
 Simulate = Callable[[Batch], Trajectory]
@@ -27,7 +27,7 @@ Simulate = Callable[[Batch], Trajectory]
 class Metrics:
     """Errors of one model on one set of sequences.
 
-    The distances leave out agents that the model is given as they were measured, as a leader with
+    The distances exclude agents that follow their measured paths, as a leader with
     ``model.leader=measured``.
 
     Attributes:
@@ -39,8 +39,8 @@ class Metrics:
             not positive; 0 for crowds.
         sequences: number of sequences.
         costs: cost of each sequence by name.
-        objectives: of vehicles, name of a cost to its mean over sequences, whichever one was
-            minimised; see :class:`nnode.calibrate.cost.Convention`. Empty for crowds.
+        objectives: for vehicles, name of every cost to its mean over sequences, see
+            :class:`nnode.calibrate.cost.Convention`. Empty for crowds.
     """
 
     J: float
@@ -53,7 +53,7 @@ class Metrics:
     objectives: dict[str, float] = field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
-        """As plain types, for JSON."""
+        """The metrics as plain types, for JSON."""
         return dict(vars(self))
 
 
@@ -64,7 +64,8 @@ def evaluate(
     """Errors of ``simulate`` over all sequences of ``batches``.
 
     Raises:
-        SimulationError: an error is no finite number; with sequence, agent and time.
+        SimulationError: an error is not finite or too large; the message states sequence, agent
+            and time.
     """
     costs: dict[str, float] = {}
     total: dict[int, float] = {}
@@ -115,7 +116,7 @@ def evaluate(
 
 
 def _check_finite(error: Tensor, batch: Batch) -> None:
-    """Refuse squared errors (K, B, N) that would make the table's numbers infinite or NaN."""
+    """Refuse squared errors ``(K, B, N)`` that would make metrics infinite or NaN."""
     bad = ~error.isfinite() | (error > MOST)
     if bool(bad.any()):
         k, b, n = (int(i) for i in bad.nonzero()[0])
@@ -131,16 +132,16 @@ def sensitivity(
 ) -> float:
     """Largest relative change of the mean cost by the relative change of a parameter, |p g / J|.
 
-    It is 0 at a minimum, whatever the parameters' units. Slopes that press a parameter against the
-    bound where it is do not count.
+    It is 0 at a minimum and does not depend on the parameters' units. It excludes parameters at a
+    bound whose descent direction points out of the admissible set.
 
     Raises:
         SimulationError: the model cannot be simulated.
     """
     cost = sequence_costs(solver(system, batch), batch, convention).mean()
     vector = ParameterVector(system)
-    own = list(vector.parameters.values())
-    slopes = torch.autograd.grad(cost, own, allow_unused=True, materialize_grads=True)
+    parameters = list(vector.parameters.values())
+    slopes = torch.autograd.grad(cost, parameters, allow_unused=True, materialize_grads=True)
     slope, row = torch.cat([g.flatten() for g in slopes]).double(), vector.row
     low, high = (torch.from_numpy(end) for end in vector.bounds)
     pressed = ((row <= low) & (slope > 0)) | ((row >= high) & (slope < 0))
@@ -154,23 +155,23 @@ def _times(batch: Batch) -> Tensor:
 
 
 def best_common_speed(batches: Iterable[Batch], system: System | None = None) -> float:
-    """The one speed (m/s) that fits all vehicles best, in closed form.
+    """The common speed (m/s) that fits all vehicles best, in closed form.
 
     It is the calibrated v0 of a model without interaction:
     sum t (x(t) - x(0)) / sum t² over all measured samples.
 
     Args:
-        system: vehicles that this model is given as they were measured are left out.
+        system: the model whose vehicles with measured paths are excluded; None excludes none.
     """
-    above = below = 0.0
+    numerator = denominator = 0.0
     for batch in batches:
         t = _times(batch)[:, None, None]
-        way = (batch.x - batch.x[:1])[..., 0]
+        distance = (batch.x - batch.x[:1])[..., 0]
         given = None if system is None else system.given(batch)
         counts = batch.valid if given is None else batch.valid & ~given
-        above += float((t * way * counts).sum())
-        below += float((t.square() * counts).sum())
-    return above / below
+        numerator += float((t * distance * counts).sum())
+        denominator += float((t.square() * counts).sum())
+    return numerator / denominator
 
 
 def constant_velocity(system: System) -> Simulate:
@@ -188,8 +189,8 @@ def constant_velocity(system: System) -> Simulate:
 def no_interaction(system: System, solver: Solver, free_speed: float | None) -> Simulate:
     """Baseline: the model without its interaction.
 
-    Traffic: everyone at ``free_speed`` (m/s), the leader as in the model. Crowds: relaxation
-    towards the destination alone, and laws of one's own without their sums.
+    Traffic: all vehicles at ``free_speed`` (m/s), the leader as in the model. Crowds: only
+    relaxation towards the destination, and user-defined laws without their sums.
     """
     bare: System
     if isinstance(system, Traffic):
@@ -206,7 +207,7 @@ def no_interaction(system: System, solver: Solver, free_speed: float | None) -> 
 
 
 def baselines(system: System, solver: Solver, free_speed: float | None) -> dict[str, Simulate]:
-    """Name to simulation of the baselines a calibrated model is measured against."""
+    """Name to simulation of the baselines for a calibrated model."""
     return {
         "no_interaction": no_interaction(system, solver, free_speed),
         "constant_velocity": constant_velocity(system),

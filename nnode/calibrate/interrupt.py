@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request to save and stop at the next safe moment."""
+"""Handling of SIGINT (Ctrl-C) and SIGTERM as requests to save and stop."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from nnode.errors import NNodeError
 
 
 class Interrupted(NNodeError):
-    """A run was asked to stop and has saved its state.
+    """A signal stopped a run, which has saved its state.
 
     Attributes:
-        signal: number of the signal that asked.
+        signal: number of the signal.
     """
 
     def __init__(self, message: str, number: int) -> None:
@@ -25,8 +25,8 @@ class Interrupted(NNodeError):
 class InterruptGuard:
     """Inside the context, the first SIGINT or SIGTERM only sets :attr:`requested`.
 
-    A second one acts as without the guard, so that an impatient user is obeyed. Outside the
-    main thread signals cannot be caught and the guard does nothing.
+    A second signal acts as without the guard. Outside the main thread signals cannot be caught,
+    and the guard does nothing.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class InterruptGuard:
 class BreakingGuard(InterruptGuard):
     """Inside the context, the first SIGINT or SIGTERM raises KeyboardInterrupt at once.
 
-    For work that may be broken off anywhere; :attr:`requested` tells which signal it was.
+    For work that may be interrupted anywhere; :attr:`requested` is the number of the signal.
     """
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

@@ -1,8 +1,8 @@
-"""Damped least squares (Levenberg and Marquardt) within a box, many problems side by side.
+"""Damped least squares (Levenberg-Marquardt) within a box, for many problems at once.
 
-A step is a descent and a search. The descent minimises the quadratic model of the cost, damped in
-proportion to the curvature of each parameter, within the box. The search raises the damping until
-a step lowers the cost, or tries several dampings side by side.
+A step consists of a descent and a search. The descent minimises the quadratic model of the cost
+within the box, with damping in proportion to the curvature of each parameter. The search raises
+the damping until a step lowers the cost, or tries several dampings at once.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Damping: at the start, its factors after a step that was taken or refused, its least, its end.
+#: Damping: initial value, factors after an accepted and a refused step, smallest value, and the
+#: value at which a problem ends.
 DAMPING, EASE, STIFFEN, LEAST, STUCK = 1e-3, 0.2, 4.0, 1e-9, 1e8
-#: Share of the cost below which a fall is rounding.
+#: Share of the cost below which a decrease is a rounding error.
 ROUNDING = 1e-14
-#: With a cost that is asked for, a search ends when a step gains less than this share of what is
-#: missing.
+#: With a target cost (``hopeless``), a problem ends when a step gains less than this share of the
+#: distance to it.
 HOPE = 0.1
 
 
@@ -26,9 +27,9 @@ class Quadratic:
     """Costs of B problems and their derivatives by P parameters.
 
     Attributes:
-        cost: ``(B,)``; inf where a simulation blows up.
+        cost: ``(B,)``; inf if a simulation blows up.
         gradient: ``(B, P)``.
-        hessian: ``(B, P, P)`` Gauss and Newton's.
+        hessian: ``(B, P, P)`` Gauss-Newton approximation.
     """
 
     cost: np.ndarray
@@ -36,9 +37,9 @@ class Quadratic:
     hessian: np.ndarray
 
     def profiled(self, number: int) -> Quadratic:
-        """The costs as functions of the first parameters, all others at their best values.
+        """The costs as functions of the first parameters, minimised over all others.
 
-        The curvature is the Schur complement. Parameters that nothing depends on are left out.
+        The curvature is the Schur complement. Parameters without effect are ignored.
 
         Source: Golub & Pereyra 2003, variable projection.
         """
@@ -54,14 +55,14 @@ class Quadratic:
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where B minimisations ended; of a single one, the first axes may be left out.
+    """The results of B minimisations; for a single one, the first axes may be missing.
 
     Attributes:
         row: ``(B, P)`` parameters.
-        cost: ``(B,)``, penalty included.
+        cost: ``(B,)`` costs with the penalty.
         before: ``(B,)`` costs at the start.
-        steps: computations of derivatives.
-        damping: ``(B,)`` of the next step.
+        steps: number of computations of derivatives.
+        damping: ``(B,)`` damping of the next step.
     """
 
     row: np.ndarray
@@ -87,21 +88,21 @@ def least_squares(
 ) -> Minimum:
     """Minimise B sums of squares of P parameters each.
 
-    Derivatives are computed anew as soon as any problem has moved.
+    Derivatives are computed again as soon as any problem has moved.
 
     Args:
-        quadratic: of parameters ``(B, P)``.
-        costs: of T trials ``(T, B, P)``, ``(T, B)``; inf where a simulation blows up.
-        start: ``(B, P)``; moved into the box.
+        quadratic: costs and derivatives at parameters ``(B, P)``.
+        costs: costs ``(T, B)`` of T trials ``(T, B, P)``; inf if a simulation blows up.
+        start: ``(B, P)``; projected onto the box.
         low, high: ``(P,)`` or ``(B, P)`` the box.
-        steps: computations of derivatives at most.
+        steps: largest number of computations of derivatives.
         tolerance: a problem ends when a step lowers its cost by less than this share.
-        damping: of the first step, relative to each parameter's curvature.
+        damping: damping of the first step, relative to each parameter's curvature.
         penalty: centre and weights ``(P,)`` of a sum of squares that is added.
-        dampings: all of them are tried at each step, instead of one that is adapted. A problem
-            ends where none lowers its cost. For a single problem.
-        hopeless: a problem also ends when its cost has nearly stopped to fall and is still above
-            this one; 0 switches that off.
+        dampings: values that are all tried at each step, instead of one adaptive value. A problem
+            ends if none lowers its cost. Only for a single problem.
+        hopeless: a problem also ends when its cost is above this value and decreases too slowly
+            to reach it; 0 disables this.
 
     Source:
         Nocedal & Wright, Numerical Optimization, 2nd ed., sections 10.3 and 16.7.
@@ -111,17 +112,17 @@ def least_squares(
     centre, weight = (rows[0], np.zeros(rows.shape[1])) if penalty is None else penalty
     each = np.arange(len(rows))
     damp, going = np.full(len(rows), damping), np.ones(len(rows), dtype=bool)
-    before, taken = np.empty(0), 0
+    before, steps_taken = np.empty(0), 0
 
-    def tied(at: np.ndarray) -> np.ndarray:
-        found: np.ndarray = (at - centre) ** 2 @ weight
-        return found
+    def penalty_at(at: np.ndarray) -> np.ndarray:
+        value: np.ndarray = (at - centre) ** 2 @ weight
+        return value
 
-    while going.any() and taken < steps:
+    while going.any() and steps_taken < steps:
         model = quadratic(rows)
-        now = model.cost + tied(rows)
-        before = now if not taken else before
-        taken += 1
+        current = model.cost + penalty_at(rows)
+        before = current if not steps_taken else before
+        steps_taken += 1
         gradient = model.gradient + 2 * weight * (rows - centre)
         hessian = model.hessian + 2 * np.diag(weight)
         moved = np.zeros(len(rows), dtype=bool)
@@ -129,26 +130,28 @@ def least_squares(
             tried = np.outer(dampings, np.ones(len(rows))) if dampings else damp[None]
             trials = np.repeat(rows[None], len(tried), 0)
             for b in np.flatnonzero(going):
-                for trial, own in zip(trials, tried[:, b], strict=True):
-                    trial[b] = box_step(rows[b], gradient[b], hessian[b], own, low[b], high[b])
-            values = costs(trials) + tied(trials)
+                for trial, tried_damping in zip(trials, tried[:, b], strict=True):
+                    trial[b] = box_step(
+                        rows[b], gradient[b], hessian[b], tried_damping, low[b], high[b]
+                    )
+            values = costs(trials) + penalty_at(trials)
             best = np.argmin(values, 0)
             value = values[best, each]
-            moved = going & (value < now)
-            gain = np.where(moved, now - value, 0.0)
+            moved = going & (value < current)
+            gain = np.where(moved, current - value, 0.0)
             rows = np.where(moved[:, None], trials[best, each], rows)
-            enough = gain > max(tolerance, ROUNDING) * np.abs(now)
+            large_enough = gain > max(tolerance, ROUNDING) * np.abs(current)
             if hopeless > 0:
-                enough &= (value <= hopeless) | (gain >= HOPE * (value - hopeless))
-            now = np.where(moved, value, now)
+                large_enough &= (value <= hopeless) | (gain >= HOPE * (value - hopeless))
+            current = np.where(moved, value, current)
             damp = np.where(moved, np.maximum(damp * EASE, LEAST), damp * STIFFEN)
             if dampings:
-                going &= moved & enough
-                # the best one comes first: its simulation is the one that derivatives are taken of
+                going &= moved & large_enough
+                # the best damping comes first, because its simulation is reused for derivatives
                 dampings = (*dampings[best[0] :], *dampings[: best[0]])
             else:
-                going &= np.where(moved, enough, damp < STUCK)
-    return Minimum(rows, now, before, taken, damp)
+                going &= np.where(moved, large_enough, damp < STUCK)
+    return Minimum(rows, current, before, steps_taken, damp)
 
 
 def box_step(
@@ -159,7 +162,7 @@ def box_step(
     low: np.ndarray,
     high: np.ndarray,
 ) -> np.ndarray:
-    """The damped step from ``row``, bounds that it meets held one after the other."""
+    """The damped step from ``row``, with parameters fixed at the bounds that the step crosses."""
     scale = np.diag(curvature)
     scale = np.maximum(scale, 1e-12 * max(scale.max(), 1e-300))
     damped = curvature + damping * np.diag(scale)
@@ -168,11 +171,11 @@ def box_step(
     for _ in range(len(row) + 1):
         step = fixed.copy()
         if free.any():
-            rest = gradient[free] + damped[np.ix_(free, ~free)] @ fixed[~free]
-            step[free] = -np.linalg.solve(damped[np.ix_(free, free)], rest)
-        out = free & ((row + step < low) | (row + step > high))
-        if not out.any():
+            right_side = gradient[free] + damped[np.ix_(free, ~free)] @ fixed[~free]
+            step[free] = -np.linalg.solve(damped[np.ix_(free, free)], right_side)
+        outside = free & ((row + step < low) | (row + step > high))
+        if not outside.any():
             break
-        fixed[out] = (np.clip(row + step, low, high) - row)[out]
-        free &= ~out
+        fixed[outside] = (np.clip(row + step, low, high) - row)[outside]
+        free &= ~outside
     return np.clip(row + step, low, high)

@@ -1,4 +1,4 @@
-"""What a run writes for TensorBoard."""
+"""Output of a run for TensorBoard."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 
 def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, bool | int | float | str]:
-    """Nested options as ``{"group.option": scalar}``; lists and nulls become words."""
+    """Nested options as ``{"group.option": scalar}``; lists and nulls become text."""
     flat: dict[str, bool | int | float | str] = {}
     for key, value in config.items():
         if isinstance(value, dict):
@@ -29,10 +29,10 @@ class Logbook:
     """Scalars, configuration and figures of a run, under ``folder``.
 
     Args:
-        folder: the TensorBoard run.
+        folder: folder of the TensorBoard run.
         config: the composed configuration.
-        step: the step from which a resumed run writes; what an interrupted one wrote after
-            it is hidden.
+        step: the step from which a resumed run writes; TensorBoard hides what the interrupted
+            run wrote after it.
     """
 
     def __init__(self, folder: Path, config: dict[str, Any], step: int = 0) -> None:
@@ -44,26 +44,26 @@ class Logbook:
             self._writer.add_text("config", f"```\n{text}\n```", 0)
 
     def scalars(self, row: dict[str, float], step: int) -> None:
-        """One value of every scalar in ``row``."""
+        """Write one value of every scalar in ``row``."""
         for name, value in row.items():
             self._writer.add_scalar(name, value, step)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
-        """A picture."""
+        """Write a figure."""
         self._writer.add_figure(name, figure, step)
 
     def picture(self, name: str, path: Path, step: int) -> None:
-        """A picture from a file."""
+        """Write an image file."""
         self._writer.add_image(
             name, np.asarray(Image.open(path).convert("RGB")), step, dataformats="HWC"
         )
 
     def text(self, name: str, text: str) -> None:
-        """Words in Markdown."""
+        """Write a text in Markdown."""
         self._writer.add_text(name, text, 0)
 
     def close(self, result: dict[str, float] | None = None) -> None:
-        """Write the hyperparameters beside the final ``result`` and close the files."""
+        """Write the hyperparameters with the final ``result``, and close the files."""
         if result:
             self._writer.add_hparams(flatten(self._config), result, run_name=".")
         self._writer.close()

@@ -1,4 +1,4 @@
-"""Options of solving and training, as dataclasses that the configuration is checked against."""
+"""Options of solvers and training, as dataclasses that validate the configuration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nnode.calibrate.cost import Convention
 
 
 class Gradient(str, Enum):
-    """Which gradient the solver gives."""
+    """The gradient that the solver computes."""
 
     adjoint = "adjoint"
     discrete = "discrete"
@@ -26,7 +26,7 @@ class Precision(str, Enum):
 
 
 class Device(str, Enum):
-    """Where the calculation runs; auto is a CUDA device if torch finds one."""
+    """The device of the calculation; auto is a CUDA device if torch finds one."""
 
     auto = "auto"
     cpu = "cpu"
@@ -34,19 +34,18 @@ class Device(str, Enum):
 
 
 class Monitor(str, Enum):
-    """Whose cost decides which checkpoint is best and when to stop early."""
+    """The sequences whose cost selects the best checkpoint and stops training early."""
 
     train = "train"
     heldout = "heldout"
 
 
 class Pooling(str, Enum):
-    """Whether all sequences share their parameters.
+    """Whether all sequences share their parameters, see :mod:`nnode.calibrate.pooling`.
 
-    See :mod:`nnode.calibrate.pooling`.
-
-    ``pooled``: they do. ``alone``: each has its own. ``shrunk``: each has its own, drawn towards
-    those of all as far as this predicts better.
+    ``pooled``: all sequences share them. ``alone``: each sequence has separate parameters.
+    ``shrunk``: each sequence has separate parameters, which are shrunk towards the pooled ones
+    with the strength that predicts best.
     """
 
     pooled = "pooled"
@@ -55,11 +54,11 @@ class Pooling(str, Enum):
 
 
 class StartSpeeds(str, Enum):
-    """First speeds of training sequences: the data's, or fitted beside the parameters.
+    """First speeds of training sequences: from the data, or fitted with the parameters.
 
-    ``auto``: where noise makes the data's wrong by more than :data:`nnode.data.smooth.BEARABLE`,
-    vehicles' speeds are those of smoothed paths, and gauss_newton fits the first ones of laws of
-    second order; otherwise they are given.
+    ``auto``: if noise makes the data's speeds wrong by more than
+    :data:`nnode.data.smooth.BEARABLE`, vehicles' speeds are those of smoothed paths, and
+    gauss_newton fits the first speeds for laws of second order. Otherwise they are given.
     """
 
     auto = "auto"
@@ -69,13 +68,13 @@ class StartSpeeds(str, Enum):
 
 @dataclass
 class SolverOptions:
-    """What all solvers share."""
+    """Options of all solvers."""
 
     name: str = MISSING  # of the solver
     # s, step; null: 0.002 for speeds and 0.1 for accelerations of vehicles, 0.0625 in crowds
     dt: float | None = None
-    # euler, ballistic, semi_implicit, rk4, or others of torchdiffeq; null: the law's own, rk4 for
-    # smooth laws of the field, ballistic for other accelerations of vehicles, otherwise euler
+    # euler, ballistic, semi_implicit, rk4, or others of torchdiffeq; null: the law's method, rk4
+    # for smooth laws, ballistic for other accelerations of vehicles, otherwise euler
     method: str | None = None
 
 
@@ -95,28 +94,28 @@ class FusedOptions(SolverOptions):
 
     name: str = "fused"
     threads: int = 1  # of the compiled kernels
-    cutoff: float | None = None  # m, crowds: who is farther away is not felt; null: by cutoff_error
-    cutoff_error: float = 1e-10  # without cutoff: largest social force left out, in units of A
+    cutoff: float | None = None  # m, crowds: largest distance of interactions; null: cutoff_error
+    cutoff_error: float = 1e-10  # without cutoff: largest omitted social force, in units of A
 
 
 @dataclass
 class TrainerOptions:
-    """How long to train, what to watch, what to keep."""
+    """Options of the training loop."""
 
     max_epochs: int = 200  # visits to all training sequences
     evaluate_every: int = 1  # epochs between costs, checkpoints and points of the curves
-    # whose cost chooses the best checkpoint; heldout makes it a training quantity
+    # sequences whose cost selects the best checkpoint; heldout makes them part of the training
     monitor: Monitor = Monitor.train
     patience: int | None = None  # evaluations without progress before stopping; null never
-    min_delta: float = 0.0  # the least improvement that counts as progress
+    min_delta: float = 0.0  # the smallest improvement that counts as progress
     cost: Convention = Convention.integral
     pooling: Pooling = Pooling.pooled  # parameters of all sequences, or of each
     # none | auto | [T, v0]: parameters that differ between drivers, see nnode.population; auto:
-    # those of which the data tell how they differ; null: auto for laws of second order with
-    # optimizer=gauss_newton where errors of positions are 0.015 to 0.45 m, otherwise none
+    # those whose variance the data determine; null: auto for laws of second order with
+    # optimizer=gauss_newton if errors of positions are 0.015 to 0.45 m, otherwise none
     drivers: Any = None
-    # first speeds of training sequences, those of the data, or the best; auto: as the noise of the
-    # measurement asks for
+    # first speeds of training sequences: given by the data, or fitted; auto: by the noise of the
+    # measurement
     start_speeds: StartSpeeds = StartSpeeds.auto
     dtype: Precision = Precision.float64
     device: Device = Device.auto

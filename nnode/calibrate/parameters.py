@@ -13,18 +13,18 @@ from nnode.model.term import Interval
 
 
 class ParameterVector:
-    """The parameters of a model that need a gradient, one number after the other.
+    """The parameters of a model that need a gradient, as a vector of K numbers.
 
-    Vectors are in float64, whatever the precision of the model.
+    Vectors are float64 for every precision of the model.
 
     Args:
         system: the model.
-        places: of each of the K numbers the parameter's name and the place in the flattened
-            parameter; None: all of them, in the order of ``system.named_parameters()``.
+        places: parameter's name and index in the flattened parameter for each of the K numbers;
+            None takes all, in the order of ``system.named_parameters()``.
 
     Attributes:
-        parameters: those that need a gradient, by name.
-        names: K names, of the parameter that each number belongs to.
+        parameters: name to parameter that needs a gradient.
+        names: the parameter's name for each of the K numbers.
     """
 
     def __init__(self, system: System, places: Iterable[tuple[str, int]] | None = None) -> None:
@@ -38,19 +38,22 @@ class ParameterVector:
 
     @property
     def row(self) -> Tensor:
-        """``(K,)`` their values."""
+        """``(K,)`` values."""
         return self._flat()[self._order]
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """``(K,)`` lower and upper ends of what is admissible; infinite where it is open."""
+        """``(K,)`` lower and upper bounds of the admissible set; infinite without a bound."""
         limits, free = self.system.bounds(), Interval()
-        known = [limits.get(name, free) for name in self.names]
-        return np.array([b.low for b in known]), np.array([b.high for b in known])
+        intervals = [limits.get(name, free) for name in self.names]
+        return np.array([b.low for b in intervals]), np.array([b.high for b in intervals])
 
     def runs(self, rows: Tensor | np.ndarray) -> dict[str, Tensor]:
-        """Rows ``(R, K)`` as parameters by name, each with a leading axis of R runs, in the
-        model's precision. Numbers that are not in the vector are the model's own."""
+        """Name to the parameter's values with a leading axis of R runs, in the model's precision.
+
+        Args:
+            rows: ``(R, K)``. Numbers that are not in the vector keep the model's values.
+        """
         rows = torch.as_tensor(rows)
         flat = self._flat().repeat(len(rows), 1)
         flat[:, self._order] = rows.to(flat)
@@ -68,5 +71,5 @@ class ParameterVector:
         return self.system
 
     def _flat(self) -> Tensor:
-        own = [p.detach().double().flatten() for p in self.parameters.values()]
-        return torch.cat(own) if own else torch.zeros(0, dtype=torch.float64)
+        values = [p.detach().double().flatten() for p in self.parameters.values()]
+        return torch.cat(values) if values else torch.zeros(0, dtype=torch.float64)

@@ -1,8 +1,9 @@
-"""Parameters of each sequence's own: alone, or drawn towards those of all (the pool).
+"""Separate parameters of each sequence, optionally shrunk towards pooled parameters.
 
-Parameters of a sequence cannot be judged on what they were calibrated on. Here they are calibrated
-on first halves and judged on second halves; what both halves have in common (method of moments) is
-what lasts of a driver, and the unit in which shrinkage counts deviations from the pool.
+Parameters of a sequence must be evaluated on other data than those of their calibration. They are
+calibrated on first halves and evaluated on second halves. The covariance between both halves
+(method of moments) estimates the variance of permanent differences between drivers. Its root is
+the unit of deviations from the pooled parameters in the penalty.
 """
 
 from __future__ import annotations
@@ -25,43 +26,43 @@ from nnode.errors import ConfigError
 from nnode.model.system import System
 from nnode.model.term import short_names
 
-#: Factors on the penalty by which sequences are drawn towards the pool.
+#: Factors on the penalty of deviations from the pooled parameters.
 STRENGTHS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-#: A parameter's spread between sequences is at least this share of the pooled value.
+#: A parameter's standard deviation between sequences is at least this share of the pooled value.
 LEAST_SPREAD = 0.02
-#: Starts of parameters with limits: a value times a factor that is drawn from here.
+#: Range of the random factors on start values of bounded parameters.
 FACTORS = (0.5, 2.0)
-#: Starts of each sequence's calibration, the pool's parameters first.
+#: Number of starts of each sequence's calibration; the first is the pooled parameters.
 STARTS = 4
-#: Folds of clusters, each of which takes its strength from the others; at most.
+#: Largest number of folds of clusters; the strength of a fold is the best of the other folds.
 FOLDS = 5
-#: Fewest samples of half a sequence.
+#: Smallest number of samples of half a sequence.
 LEAST = 5
 
 
-def scattered(cost: ResidualProblem, rows: Iterable[np.ndarray], seed: int) -> np.ndarray:
-    """``(R, P)`` starts: the first row, then rows times random factors where there are limits."""
+def random_starts(cost: ResidualProblem, rows: Iterable[np.ndarray], seed: int) -> np.ndarray:
+    """``(R, P)`` starts: the first row, then rows with random factors on bounded parameters."""
     rng = np.random.default_rng(seed)
     limited = np.isfinite(cost.low) & np.isfinite(cost.high)
-    found = []
+    starts = []
     for i, row in enumerate(rows):
         if i:
             factor = np.exp(rng.uniform(math.log(FACTORS[0]), math.log(FACTORS[1]), len(row)))
             row = np.where(limited, row * factor, row)
-        found.append(np.clip(row, cost.low, cost.high))
-    return np.stack(found)
+        starts.append(np.clip(row, cost.low, cost.high))
+    return np.stack(starts)
 
 
 def best_alone(
     cost: ResidualProblem, starts: Iterable[np.ndarray], **options: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Every sequence by itself, the best of several starts.
+    """Calibrate every sequence separately, and take the best of several starts.
 
     Args:
-        options: of :func:`nnode.calibrate.problem.alone`.
+        options: options of :func:`nnode.calibrate.problem.alone`.
 
     Returns:
-        ``(B, P)`` parameters, ``(B,)`` costs with what a pool adds to them.
+        ``(B, P)`` parameters and ``(B,)`` costs with the penalty.
     """
     fits = [alone(cost, row, **options) for row in starts]
     costs = np.array([fit.cost for fit in fits])
@@ -74,12 +75,13 @@ class Halves:
     """Calibrations on the first halves of B sequences.
 
     Attributes:
-        centre: ``(P,)`` the pool.
-        between: ``(P,)`` standard deviation of the sequences' own parameters.
-        spread: ``(P,)`` that of what both halves have in common.
-        scale: ``(P,)`` the unit of deviations from the pool: the spread, or a share of the centre.
+        centre: ``(P,)`` pooled parameters.
+        between: ``(P,)`` standard deviation of the sequences' separate parameters.
+        spread: ``(P,)`` root of the covariance between both halves.
+        scale: ``(P,)`` unit of deviations from the pooled parameters: the spread, or at least a
+            share of the centre.
         pooled, alone, shrunk: ``(B,)`` costs of second halves.
-        strengths: of shrinkage, by fold: the best of the other folds' sequences.
+        strengths: strength of shrinkage of every fold, the best for the other folds' sequences.
         by_strength: mean cost of second halves by strength.
     """
 
@@ -99,35 +101,36 @@ def halves(
     second: ResidualProblem,
     row: np.ndarray,
     others: Iterable[np.ndarray],
-    fold: np.ndarray,
+    sequence_fold: np.ndarray,
     strengths: ListLike[float] = STRENGTHS,
 ) -> Halves:
-    """Pooled, alone and in between: calibrated on first halves, judged on second ones.
+    """Pooled, separate and shrunk calibrations of first halves, evaluated on second halves.
 
     Args:
-        row: ``(P,)`` start of the pool.
-        others: further starts of the sequences' own parameters.
-        fold: ``(B,)`` of every sequence.
-        strengths: factors, in the unit of the cost, on squares of deviations from the pool; the
-            first is 0.
+        row: ``(P,)`` start of the pooled calibration.
+        others: further starts of the separate calibrations.
+        sequence_fold: ``(B,)`` fold of every sequence.
+        strengths: factors, in the unit of the cost, on squared deviations from the pooled
+            parameters; the first is 0.
     """
     centre = pooled(first, row).row
     begin = [centre, *others]
-    own = [best_alone(cost, begin)[0] for cost in (first, second)]
-    spread = np.sqrt(_lasting(*own))
+    separate = [best_alone(cost, begin)[0] for cost in (first, second)]
+    spread = np.sqrt(_shared_variance(*separate))
     scale = np.maximum(spread, LEAST_SPREAD * np.where(centre == 0, 1.0, np.abs(centre)))
-    tried = [
-        alone(first, centre, penalty=(centre, s / scale**2)).row if s else own[0] for s in strengths
+    candidates = [
+        alone(first, centre, penalty=(centre, s / scale**2)).row if s else separate[0]
+        for s in strengths
     ]
-    costs = np.stack([second.costs(one) for one in tried])
-    shrunk, chosen = np.zeros(len(fold)), []
-    for k in range(int(fold.max()) + 1):
-        i = int(np.argmin(costs[:, fold != k].mean(1)))
-        shrunk[fold == k] = costs[i, fold == k]
+    costs = np.stack([second.costs(candidate) for candidate in candidates])
+    shrunk, chosen = np.zeros(len(sequence_fold)), []
+    for k in range(int(sequence_fold.max()) + 1):
+        i = int(np.argmin(costs[:, sequence_fold != k].mean(1)))
+        shrunk[sequence_fold == k] = costs[i, sequence_fold == k]
         chosen.append(float(strengths[i]))
     return Halves(
         centre=centre,
-        between=np.std(own[0], axis=0),
+        between=np.std(separate[0], axis=0),
         spread=spread,
         scale=scale,
         pooled=second.costs(centre),
@@ -138,76 +141,77 @@ def halves(
     )
 
 
-def _lasting(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """``(P,)`` variance of what both halves of a sequence have in common; at least 0.
+def _shared_variance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """``(P,)`` covariance between both halves of the sequences; at least 0.
 
-    The middle 90 % of each half's numbers set the limits that others are moved to: a number that
-    a half does not determine may lie anywhere.
+    Values are clipped to the middle 90 % of each half, because a parameter that a half does not
+    determine may have any value.
     """
-    found = []
-    for one, other in zip(first.T, second.T, strict=True):
-        tame = [np.clip(x, *np.quantile(x, [0.05, 0.95])) for x in (one, other)]
-        found.append(max(float(np.cov(*tame)[0, 1]), 0.0))
-    return np.array(found)
+    variances = []
+    for first_half, second_half in zip(first.T, second.T, strict=True):
+        clipped = [np.clip(x, *np.quantile(x, [0.05, 0.95])) for x in (first_half, second_half)]
+        variances.append(max(float(np.cov(*clipped)[0, 1]), 0.0))
+    return np.array(variances)
 
 
 @dataclass(frozen=True)
-class Own:
-    """What each sequence's own parameters are, and whether they help.
+class SequenceParameters:
+    """Separate parameters of each sequence, and their evaluation.
 
     Attributes:
         table: a row per sequence: ``sequence``, ``cluster``, ``cost_pool``, ``cost``, its
-            parameters, and ``at_bound``: those that ended at an end of what is admissible.
-        facts: what ``result.json`` says of them.
+            parameters, and ``at_bound``, the names of parameters at a bound.
+        facts: entries of ``result.json``.
     """
 
     table: pd.DataFrame
     facts: dict[str, Any]
 
 
-def own_parameters(
+def sequence_parameters(
     kind: Pooling,
     system: System,
     sequences: list[Sequence],
     cost: Callable[[System, Batch], ResidualProblem],
     seed: int,
-) -> Own:
-    """Parameters of every sequence's own, of a model with the pool's.
+) -> SequenceParameters:
+    """Separate parameters of every sequence.
 
-    Args:
-        cost: what is minimised of some sequences.
-
-    The strength of shrinkage is relative to the mean cost of the pool, and the one that predicts
+    The strength of shrinkage is relative to the mean pooled cost. It is the one that predicts
     second halves best.
 
+    Args:
+        system: the model with the pooled parameters.
+        cost: function from the model and sequences to the problem.
+
     Raises:
-        ConfigError: sequences that are too short to be halved, or of one cluster.
+        ConfigError: sequences are too short to be halved, or belong to one cluster.
     """
     label = clusters(index_of(sequences)).astype(int)
     number = int(label.max()) + 1
-    short = min(sequences, key=lambda s: s.n_samples)
-    if short.n_samples < 2 * LEAST or number < 2:
+    shortest = min(sequences, key=lambda s: s.n_samples)
+    if shortest.n_samples < 2 * LEAST or number < 2:
         raise ConfigError(
             f"trainer.pooling={kind.value} calibrates on first halves and judges on second ones, "
             f"of sequences of {2 * LEAST} samples or more in two clusters or more; found "
-            f"{number} cluster(s), and {short.n_samples} samples in {short.name}: take longer "
-            "sequences (data.window), more of them, or trainer.pooling=pooled"
+            f"{number} cluster(s), and {shortest.n_samples} samples in {shortest.name}: take "
+            "longer sequences (data.window), more of them, or trainer.pooling=pooled"
         )
     parts = [[s.part(low, low + 0.5) for s in sequences] for low in (0.0, 0.5)]
     whole, first, second = (cost(system, collate(part)) for part in (sequences, *parts))
     row = whole.start
-    starts = scattered(whole, [row] * STARTS, seed)
+    starts = random_starts(whole, [row] * STARTS, seed)
     at_pool = whole.costs(row)
     unit = float(at_pool.mean())
-    fold = folds(label, min(FOLDS, number), seed)
+    sequence_fold = folds(label, min(FOLDS, number), seed)
     strengths = [unit * s for s in STRENGTHS] if kind is Pooling.shrunk else [0.0]
-    found = halves(first, second, row, starts[1:], fold, strengths)
-    strength = strengths[int(np.argmin(found.by_strength))]
-    pool = (row, strength / found.scale**2) if strength else None
+    judged = halves(first, second, row, starts[1:], sequence_fold, strengths)
+    strength = strengths[int(np.argmin(judged.by_strength))]
+    pool = (row, strength / judged.scale**2) if strength else None
     rows, _ = best_alone(whole, starts if pool is None else starts[:1], penalty=pool)
     costs = whole.costs(rows)
-    known = short_names(whole.names)
-    names = [known[name] for name in whole.names]
+    printed = short_names(whole.names)
+    names = [printed[name] for name in whole.names]
     table = pd.DataFrame(
         {
             "sequence": [s.name for s in sequences],
@@ -217,7 +221,7 @@ def own_parameters(
             **dict(zip(names, rows.T, strict=True)),
             "at_bound": [
                 " ".join(np.array(names)[low | high])
-                for low, high in (at_bounds(whole, one) for one in rows)
+                for low, high in (at_bounds(whole, values) for values in rows)
             ],
         }
     )
@@ -226,13 +230,13 @@ def own_parameters(
         "cost_pool": unit,
         "cost": float(costs.mean()),
         "second_half": {
-            name: float(getattr(found, name).mean())
+            name: float(getattr(judged, name).mean())
             for name in ("pooled", "alone", "shrunk")
             if name != "shrunk" or kind is Pooling.shrunk
         },
-        "spread": dict(zip(names, found.spread.tolist(), strict=True)),
+        "spread": dict(zip(names, judged.spread.tolist(), strict=True)),
         "heldout": "with the pool's parameters: those of a sequence say nothing of another",
     }
     if kind is Pooling.shrunk:
         facts["strength"] = strength
-    return Own(table, facts)
+    return SequenceParameters(table, facts)

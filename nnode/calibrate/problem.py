@@ -1,4 +1,4 @@
-"""What a calibration minimises, as a problem of least squares with derivatives."""
+"""Calibration as a least-squares problem with derivatives."""
 
 from __future__ import annotations
 
@@ -30,53 +30,51 @@ from nnode.simulation.base import Trajectory, simulated_batch, substeps
 from nnode.simulation.fused import FusedSolver
 from nnode.simulation.kernels import lanes
 
-#: Relative size of central differences of laws, in float64: the cube root of its precision, where
-#: the errors by rounding and by curvature are equal (Press et al. 2007, section 5.7). Parameters
-#: smaller than the second number are varied as if they had this size, in their own units.
+#: Relative size of central differences for laws, in float64: the cube root of the precision, where
+#: rounding and truncation errors are equal (Press et al. 2007, section 5.7); and the smallest
+#: parameter that the size is relative to, in the parameter's unit.
 _CENTRAL = float(np.finfo(np.float64).eps) ** (1 / 3), 0.01
-#: The same of forward differences of networks, by precision: they have tens of weights, and bear
-#: the errors.
+#: The same for forward differences of networks, by precision. Networks have tens of weights and
+#: tolerate less accurate derivatives.
 _FORWARD = {torch.float32: (1e-3, 0.1), torch.float64: (1e-6, 0.1)}
-#: Difference of first speeds, m/s; steps of their fits at most, and the share of the cost below
-#: which a fall ends them.
+#: For first speeds: difference, m/s; largest number of steps of a fit; its tolerance.
 _SPEED, _TURNS, _SETTLED = 1e-5, 10, 1e-12
-#: Samples of the first horizons: each doubles the one before. Steps at each of them at most.
+#: Numbers of samples of the first horizons, and the largest number of steps at each horizon.
 _HORIZONS, _SHORT = tuple(4 * 2**k for k in range(30)), 8
 
 
 class ResidualProblem:
     """The weighted residuals of a model on the sequences of a batch.
 
-    Costs, gradients and curvatures are those of each sequence by itself: pooled calibrations add
-    them up, calibrations of every sequence alone do not, and their spread between clusters tells
-    how sure the pooled ones are.
+    Costs, gradients and curvatures are those of each sequence. Pooled calibrations minimise their
+    sum, separate calibrations each of them, and confidence intervals use their variation between
+    clusters.
 
-    Derivatives of lanes are exact tangents. Those of people are differences, in float64 where the
-    model is a formula without networks: compared with forward-mode derivatives by PyTorch, the
-    gradient of ``model=sf`` agrees to nine digits in a fortieth of the time.
+    Derivatives are exact tangents for lanes, and difference quotients for people, in float64 if
+    the model is a formula without networks. The gradient of ``model=sf`` agrees to nine digits
+    with PyTorch's forward mode and takes a fortieth of its time.
 
-    First speeds that are fitted are parameters of each sequence, at least 0, of all vehicles that
-    the model drives. Costs are the least over them, for any other parameters.
+    Fitted first speeds are non-negative parameters of each sequence, for all simulated vehicles.
+    Costs are minimised over them (profile likelihood).
 
     Args:
-        system: the model; it is not changed. Parameters that need no gradient stay its own.
+        system: the model, which is not changed. Parameters that need no gradient keep its values.
         batch: the sequences.
-        solver: its step, method and threads.
-        convention: what is minimised.
+        solver: gives step, method and threads.
+        convention: the cost.
         start_speeds: whether first speeds are fitted.
 
     Attributes:
-        vector: the parameters that are calibrated.
+        vector: the calibrated parameters.
         names: their P addresses, ``idm.T``.
         physical: ``(P,)`` False for the weights of networks.
-        start, low, high: ``(P,)`` the system's own values, and the admissible set.
-        simulations: how many there were, without those of tangents.
-        last_speeds: ``(B, N)`` the first speeds (m/s) from which the next search for the best ones
-            goes on.
+        start, low, high: ``(P,)`` the system's values, and the bounds of the admissible set.
+        simulations: number of simulations, without those of tangents.
+        last_speeds: ``(B, N)`` start values (m/s) of the next fit of first speeds.
 
     Raises:
-        ConfigError: vehicles whose model is no formula; first speeds of people, or of a law of
-            first order, which has none.
+        ConfigError: a lane model is not a formula; or first speeds are fitted for people, or for a
+            law of first order, which has none.
 
     Source:
         Murphy & van der Vaart 2000, profile likelihood.
@@ -95,25 +93,27 @@ class ResidualProblem:
         formula = system.formula if isinstance(system, Crowd) else self.lane
         vector = ParameterVector(system)
         if formula is None:
-            every = [(f"{name}.{i}", (name, k, 0)) for i, (name, k) in enumerate(vector.places)]
+            candidates = [
+                (f"{name}.{i}", (name, k, 0)) for i, (name, k) in enumerate(vector.places)
+            ]
         else:
-            every = [(s.replace("__", ".", 1), place) for s, place in formula.owned.items()]
-        own = [(name, at) for name, at in every if at[0] in vector.parameters]
-        self.names = [name for name, _ in own]
-        self.physical = np.array([axes is None for _, (_, _, axes) in own], dtype=bool)
+            candidates = [(s.replace("__", ".", 1), place) for s, place in formula.owned.items()]
+        calibrated = [(name, at) for name, at in candidates if at[0] in vector.parameters]
+        self.names = [name for name, _ in calibrated]
+        self.physical = np.array([axes is None for _, (_, _, axes) in calibrated], dtype=bool)
         if self.lane is None:
             system = copy.deepcopy(system)
             if self.physical.all():
                 system, batch = system.double(), batch.to(None, torch.float64)
         self.system, self.batch = system, batch
-        self.vector = ParameterVector(system, [at[:2] for _, at in own])
+        self.vector = ParameterVector(system, [at[:2] for _, at in calibrated])
         self.low, self.high = self.vector.bounds
         self.start = np.clip(self.vector.row.numpy(), self.low, self.high)
         self.fitted: np.ndarray | None = None
         if start_speeds is StartSpeeds.fitted:
-            self._fit_speeds()
+            self._prepare_start_speeds()
 
-    def _fit_speeds(self) -> None:
+    def _prepare_start_speeds(self) -> None:
         if self.lane is None:
             raise ConfigError(
                 "trainer.start_speeds=fitted is for vehicles in lanes; take "
@@ -132,32 +132,31 @@ class ResidualProblem:
     # -- costs and derivatives of every sequence -------------------------------------------------
 
     def costs(self, rows: np.ndarray) -> np.ndarray:
-        """``(B,)`` costs for parameters ``(P,)``, or, of lanes, for those of every sequence
-        ``(B, P)``."""
+        """``(B,)`` costs for parameters ``(P,)``, or, for lanes, for separate parameters of every
+        sequence ``(B, P)``."""
         if self.fitted is not None:
-            return np.asarray(self._settled(rows).cost)
+            return np.asarray(self._fit_start_speeds(rows).cost)
         return self._cost(*self._paths(rows)[:2])
 
     def __call__(self, rows: np.ndarray) -> Quadratic:
-        """Costs and their derivatives, of parameters as in :meth:`costs`."""
+        """Costs and their derivatives for parameters as in :meth:`costs`."""
         if self.fitted is None:
             return self._quadratic(*self.linearised(rows))
-        self.last_speeds = start = self._settled(rows).row
-        cost, away, slope = self.linearised(rows, start)
-        both = torch.cat([slope, self._by_start(rows, start, away)])
-        return self._quadratic(cost, away, both).profiled(len(slope))
+        self.last_speeds = start = self._fit_start_speeds(rows).row
+        cost, deviation, slope = self.linearised(rows, start)
+        slopes = torch.cat([slope, self._by_start(rows, start, deviation)])
+        return self._quadratic(cost, deviation, slopes).profiled(len(slope))
 
     def start_speeds(self, rows: np.ndarray) -> dict[str, list[float]]:
-        """First speeds (m/s) that are best for parameters, by sequence and vehicle; none where
-        they are given."""
+        """Sequence's name to the vehicles' fitted first speeds (m/s); empty if they are given."""
         if self.fitted is None:
             return {}
-        self.last_speeds = self._settled(rows).row
-        found, agents = self.last_speeds.tolist(), self.batch.agent.sum(1).tolist()
-        return {name: v[:n] for name, v, n in zip(self.batch.names, found, agents, strict=True)}
+        self.last_speeds = self._fit_start_speeds(rows).row
+        speeds, agents = self.last_speeds.tolist(), self.batch.agent.sum(1).tolist()
+        return {name: v[:n] for name, v, n in zip(self.batch.names, speeds, agents, strict=True)}
 
-    def complain(self, cost: np.ndarray) -> None:
-        """Say which sequences cannot be simulated.
+    def raise_blow_up(self, cost: np.ndarray) -> None:
+        """Report the sequences that cannot be simulated.
 
         Raises:
             SimulationError: always.
@@ -168,58 +167,61 @@ class ResidualProblem:
             "other parameters, or take a smaller solver.dt"
         )
 
-    def begin(
+    def initial_fit(
         self, row: np.ndarray, horizons: Sequence[int] = _HORIZONS, **options: Any
     ) -> np.ndarray:
-        """A better start for people: the minimum of the first samples of every sequence, followed
-        as the horizon grows.
+        """A better start for people, from fits to the first samples with a growing horizon.
 
-        Over a second, strong forces throw people metres away, and the cost has many minima. Over
-        few samples nearly every start leads to the same one.
+        Within a second, strong forces move people by metres, and the cost has many minima. For few
+        samples nearly every start leads to the same minimum.
 
         Args:
             horizons: numbers of samples.
-            options: of :func:`pooled`.
+            options: options of :func:`pooled`.
         """
         if self.lane is not None:
             return row
-        found, timed = row, ("x", "v", "valid")
+        best, sampled = row, ("x", "v", "valid")
         for samples in horizons:
             if samples >= self.batch.n_samples:
                 break
-            batch = replace(self.batch, **{k: getattr(self.batch, k)[:samples] for k in timed})
+            batch = replace(self.batch, **{k: getattr(self.batch, k)[:samples] for k in sampled})
             short = ResidualProblem(self.system, batch, self.solver, self.convention)
-            if np.isfinite(short.costs(found)).all():
-                found = pooled(short, found, **{"steps": _SHORT, **options}).row
+            if np.isfinite(short.costs(best)).all():
+                best = pooled(short, best, **{"steps": _SHORT, **options}).row
             self.simulations += short.simulations
-        before, after = (float(self.costs(one).mean()) for one in (row, found))
-        return found if after < before else row
+        before, after = (float(self.costs(candidate).mean()) for candidate in (row, best))
+        return best if after < before else row
 
     # -- first speeds ----------------------------------------------------------------------------
 
-    def _settled(self, rows: np.ndarray) -> Minimum:
-        """The best first speeds ``(B, N)`` of every sequence for parameters.
+    def _fit_start_speeds(self, rows: np.ndarray) -> Minimum:
+        """The best first speeds ``(B, N)`` of every sequence for given parameters.
 
-        The search begins at the better of the last ones and of those that were given: speeds that
-        other parameters asked for may be far from the best, where no step helps.
+        The fit starts at the better of the last first speeds and the measured ones. The last ones
+        belong to other parameters and may be too far from the minimum.
         """
         assert self.fitted is not None
         best = np.full(len(self.batch), math.inf)
-        away = torch.zeros(0)
+        deviation = torch.zeros(0)
 
         def costs(trials: np.ndarray) -> np.ndarray:
-            """They leave the errors of the best speeds, which the search goes on from."""
-            nonlocal away, best
+            """Costs of a trial. Side effect: ``deviation`` has the errors of the best speeds."""
+            nonlocal deviation, best
             (start,) = trials
             x, v, *_ = self._paths(rows, start)
-            cost, new = self._cost(x, v), errors(x, v, self.batch, self.convention)[0]
+            cost, trial_deviation = self._cost(x, v), errors(x, v, self.batch, self.convention)[0]
             better = torch.from_numpy(cost < best)[:, None]
-            away = torch.where(better, new, away) if len(away) else new
+            deviation = (
+                torch.where(better, trial_deviation, deviation)
+                if len(deviation)
+                else trial_deviation
+            )
             best = np.minimum(cost, best)
             return cost[None]
 
         def quadratic(start: np.ndarray) -> Quadratic:
-            return self._quadratic(best, away, self._by_start(rows, start, away))
+            return self._quadratic(best, deviation, self._by_start(rows, start, deviation))
 
         given, last = costs(self._given[None])[0], costs(self.last_speeds[None])[0]
         start = np.where((last < given)[:, None], self.last_speeds, self._given)
@@ -227,44 +229,44 @@ class ResidualProblem:
         high = np.where(self.fitted, math.inf, self._given)
         return least_squares(quadratic, costs, start, low, high, steps=_TURNS, tolerance=_SETTLED)
 
-    def _by_start(self, rows: np.ndarray, start: np.ndarray, away: Tensor) -> Tensor:
+    def _by_start(self, rows: np.ndarray, start: np.ndarray, deviation: Tensor) -> Tensor:
         """``(N, K, B, ...)`` derivatives of errors by the first speed of every vehicle."""
         assert self.fitted is not None
-        found = torch.zeros(start.shape[1], *away.shape, dtype=torch.float64)
+        derivatives = torch.zeros(start.shape[1], *deviation.shape, dtype=torch.float64)
         for i in np.flatnonzero(self.fitted.any(0)):
             other = start.copy()
             other[:, i] += _SPEED * self.fitted[:, i]
             x, v, *_ = self._paths(rows, other)
-            found[i] = (errors(x, v, self.batch, self.convention)[0] - away) / _SPEED
-        return torch.nan_to_num(found)
+            derivatives[i] = (errors(x, v, self.batch, self.convention)[0] - deviation) / _SPEED
+        return torch.nan_to_num(derivatives)
 
     # -- simulations -----------------------------------------------------------------------------
 
     def _paths(
         self, rows: np.ndarray, start: np.ndarray | None = None, slopes: bool = False
     ) -> tuple[Tensor, Tensor | None, Tensor, Tensor | None]:
-        """Coordinates ``(K, B, N D)`` and speeds, and their derivatives ``(P, K, B, N D)`` where
-        these are asked for.
+        """Coordinates ``(K, B, N D)``, speeds, and their derivatives ``(P, K, B, N D)``.
 
         Args:
-            start: ``(B, N)`` first speeds, m/s; None: those that are given.
+            start: ``(B, N)`` first speeds, m/s; None takes the measured ones.
+            slopes: whether derivatives are computed; otherwise P is 0.
         """
         if self.lane is None:
             x = self._positions(rows)
-            found = [self._difference(rows, x, i) for i in range(len(rows))] if slopes else []
-            return x, None, torch.stack(found) if found else x.new_zeros(0), None
+            derivatives = [self._difference(rows, x, i) for i in range(len(rows))] if slopes else []
+            return x, None, torch.stack(derivatives) if derivatives else x.new_zeros(0), None
         batch, system, solver = self.batch, cast(Traffic, self.system), self.solver
         if start is not None:
             v = batch.v.clone()
             v[0, ..., 0] = torch.from_numpy(start)
             batch = replace(batch, v=v)
         n = substeps(batch.dt, solver.dt, system)
-        near, origin = simulated_batch(system, batch)
+        local, origin = simulated_batch(system, batch)
         symbols = tuple(name.replace(".", "__", 1) for name in self.names)
         y, dy = lanes.tangents(
             system,
             self.lane,
-            near,
+            local,
             n,
             symbols if slopes else (),
             solver.threads,
@@ -285,11 +287,11 @@ class ResidualProblem:
         return self.solver.unchecked(self.vector.fill_(row), self.batch).x.flatten(-2)
 
     def _difference(self, row: np.ndarray, x: Tensor, i: int) -> Tensor:
-        """``(K, B, N D)`` derivative by the i-th parameter, inside the admissible set; 0 where a
-        simulation blows up."""
+        """``(K, B, N D)`` difference quotient by the i-th parameter inside the admissible set; 0
+        if a simulation blows up."""
         central = self.physical.all()
-        relative, least = _CENTRAL if central else _FORWARD[self.batch.dtype]
-        step = relative * max(abs(row[i]), least)
+        relative, min_size = _CENTRAL if central else _FORWARD[self.batch.dtype]
+        step = relative * max(abs(row[i]), min_size)
 
         def at(number: int) -> Tensor:
             other = row.copy()
@@ -314,23 +316,23 @@ class ResidualProblem:
     ) -> tuple[np.ndarray, Tensor, Tensor]:
         """Costs ``(B,)``, errors ``(K, B, N D)`` and their derivatives ``(P, K, B, N D)``.
 
-        Of followers, ``(K, B, N - 1)`` and ``(P, K, B, N - 1)``.
+        For costs of followers the shapes are ``(K, B, N - 1)`` and ``(P, K, B, N - 1)``.
         """
         x, v, slope, dv = self._paths(rows, start, slopes=True)
-        away, seen = errors(x, v, self.batch, self.convention)
+        deviation, counted = errors(x, v, self.batch, self.convention)
         if self.convention is Convention.speed:
             assert dv is not None
             slope = dv[..., :-1]
         elif self.convention in FOLLOWING:
             gap, measured = (net_gaps(p, self.batch) for p in (x, self.batch.x[..., 0]))
             with torch.enable_grad():
-                own = gap.detach().requires_grad_()
-                change = changed_gap(own, measured, self.convention)
-                (factor,) = torch.autograd.grad(change.sum(), own)
+                gap_variable = gap.detach().requires_grad_()
+                change = changed_gap(gap_variable, measured, self.convention)
+                (factor,) = torch.autograd.grad(change.sum(), gap_variable)
             slope = torch.diff(slope) * factor
-        return self._cost(x, v), away.double(), torch.where(seen, slope, 0.0).double()
+        return self._cost(x, v), deviation.double(), torch.where(counted, slope, 0.0).double()
 
-    def _quadratic(self, cost: np.ndarray, away: Tensor, slope: Tensor) -> Quadratic:
+    def _quadratic(self, cost: np.ndarray, deviation: Tensor, slope: Tensor) -> Quadratic:
         number = self.batch.valid[1:, :, 1:].sum((0, -1)).clamp(min=1).numpy()
         match self.convention:
             case Convention.integral:
@@ -342,7 +344,7 @@ class ResidualProblem:
             case _:
                 scale = 2 / number
         scale = np.where(np.isfinite(cost), scale, 0.0)
-        gradient = torch.einsum("kbn,pkbn->bp", away, slope).numpy()
+        gradient = torch.einsum("kbn,pkbn->bp", deviation, slope).numpy()
         hessian = torch.einsum("pkbn,qkbn->bpq", slope, slope).numpy()
         return Quadratic(
             cost,
@@ -373,11 +375,11 @@ def pooled(
     weights: np.ndarray | None = None,
     **options: Any,
 ) -> Minimum:
-    """The parameters ``(P,)`` that are best for all sequences together.
+    """The parameters ``(P,)`` that minimise the weighted mean of the sequences' costs.
 
     Args:
-        weights: ``(B,)`` of sum 1; None takes the mean.
-        options: of :func:`~nnode.calibrate.least_squares.least_squares`.
+        weights: ``(B,)`` of sum 1; None takes equal weights.
+        options: options of :func:`~nnode.calibrate.least_squares.least_squares`.
     """
     number = len(problem.batch)
     share = np.full(number, 1 / number) if weights is None else weights
@@ -392,16 +394,16 @@ def pooled(
         return np.array([share[used] @ problem.costs(row)[used] for (row,) in trials])[:, None]
 
     begin = (problem.start if start is None else start)[None]
-    found = least_squares(quadratic, costs, begin, problem.low, problem.high, **options)
-    return replace(found, row=found.row[0], cost=found.cost[0])
+    minimum = least_squares(quadratic, costs, begin, problem.low, problem.high, **options)
+    return replace(minimum, row=minimum.row[0], cost=minimum.cost[0])
 
 
 def alone(problem: ResidualProblem, start: np.ndarray | None = None, **options: Any) -> Minimum:
-    """The parameters ``(B, P)`` that are best for every sequence by itself, side by side.
+    """The parameters ``(B, P)`` that minimise the cost of every sequence separately.
 
     Args:
         start: ``(P,)`` or ``(B, P)``.
-        options: of :func:`~nnode.calibrate.least_squares.least_squares`.
+        options: options of :func:`~nnode.calibrate.least_squares.least_squares`.
     """
     begin = problem.start if start is None else start
     return least_squares(

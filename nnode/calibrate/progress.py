@@ -1,4 +1,4 @@
-"""Steps of a training, with rate and time left."""
+"""Progress of a training: steps, rate and remaining time."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from nnode.progress import OnTerminal
 
 
 class Reporter(OnTerminal):
-    """Shows how far a run is; use as a context manager.
+    """Shows the progress of a run; use as a context manager.
 
     Args:
         total: number of steps at the end.
         done: steps done before this start.
     """
 
-    def __init__(self, total: int, done: int = 0, what: str = "training") -> None:
+    def __init__(self, total: int, done: int = 0) -> None:
         super().__init__(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -31,13 +31,15 @@ class Reporter(OnTerminal):
             TimeRemainingColumn(),
             TextColumn("{task.fields[note]}"),
         )
-        self.total, self.done, self.what = total, done, what
+        self.total, self.done = total, done
         self._begun, self._first, self._note = done, done, ""
         if self._bar:
-            self._task = self._bar.add_task(what, total=total, completed=done, rate=0.0, note="")
+            self._task = self._bar.add_task(
+                "training", total=total, completed=done, rate=0.0, note=""
+            )
 
     def advance(self, note: str = "") -> None:
-        """One step more is done."""
+        """Count a finished step."""
         self.done += 1
         if self.done == self._begun + 1:  # the first step includes compilation
             self._first, self._start = self.done, time.monotonic()
@@ -48,8 +50,8 @@ class Reporter(OnTerminal):
             self.log_if_due()
 
     def line(self) -> str:
-        """Steps, their rate, and the time left."""
-        text = f"{self.what}: step {self.done} of {self.total}"
+        """The steps, their rate and the remaining time as text."""
+        text = f"training: step {self.done} of {self.total}"
         if self.done == self._first:
             return text
         left = (self.total - self.done) / self._rate()

@@ -1,4 +1,4 @@
-"""Resampling: intervals and paired tests where sequences that share vehicles go together."""
+"""Intervals and paired tests by resampling of groups, such as sequences that share vehicles."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Draws of every resampling here; its own error is then below what a table shows.
+#: Number of draws; the Monte Carlo error is then below the digits of tables.
 DRAWS = 4000
 
 
 def group_weights(group: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
-    """``(draws, S)`` weights of S items whose groups are drawn with replacement; rows sum to 1.
+    """``(draws, S)`` bootstrap weights of S items by groups; rows sum to 1.
 
     Args:
         group: ``(S,)`` group of each item, counted from 0.
@@ -57,28 +57,28 @@ class Paired:
 
 
 def paired(first: np.ndarray, second: np.ndarray, group: np.ndarray, seed: int) -> Paired:
-    """Compare two models by sequence; groups are exchangeable, sequences within them are not."""
+    """Compare two models by sequence, with groups as the exchangeable units."""
     rng = np.random.default_rng(seed)
-    away = first - second
-    low, high = np.quantile(group_weights(group, DRAWS, rng) @ away, [0.025, 0.975])
-    total = np.bincount(group, weights=away)
+    difference = first - second
+    low, high = np.quantile(group_weights(group, DRAWS, rng) @ difference, [0.025, 0.975])
+    total = np.bincount(group, weights=difference)
     signs = rng.choice([-1.0, 1.0], size=(DRAWS, len(total)))
-    beyond = np.abs(signs @ total) >= abs(total.sum()) * (1 - 1e-12)
+    exceeds = np.abs(signs @ total) >= abs(total.sum()) * (1 - 1e-12)
     return Paired(
-        difference=float(away.mean()),
+        difference=float(difference.mean()),
         low=float(low),
         high=float(high),
-        p=float((1 + beyond.sum()) / (1 + DRAWS)),
-        better=float((away < 0).mean()),
+        p=float((1 + exceeds.sum()) / (1 + DRAWS)),
+        better=float((difference < 0).mean()),
     )
 
 
 def holm(p: Mapping[str, float]) -> dict[str, float]:
     """p values corrected for their number, by Holm's step-down method (1979)."""
     order = sorted(p, key=lambda name: p[name])
-    found: dict[str, float] = {}
-    least = 0.0
+    corrected: dict[str, float] = {}
+    largest = 0.0
     for rank, name in enumerate(order):
-        least = max(least, min(1.0, (len(order) - rank) * p[name]))
-        found[name] = least
-    return {name: found[name] for name in p}
+        largest = max(largest, min(1.0, (len(order) - rank) * p[name]))
+        corrected[name] = largest
+    return {name: corrected[name] for name in p}

@@ -1,4 +1,4 @@
-"""The training loop: stochastic descent, projection, evaluation, checkpoints."""
+"""The training loop: optimisation steps, projection, evaluation and checkpoints."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class Provenance:
-    """What a checkpoint says of the run it comes from; see :class:`Checkpoint`."""
+    """The origin of a checkpoint; see :class:`Checkpoint`."""
 
     config: dict[str, Any]
     manifest: dict[str, Any]
@@ -50,26 +50,26 @@ class Provenance:
 
 
 class _StopRequested(Exception):
-    """A signal arrived during an evaluation, which will be done again after resuming."""
+    """A signal arrived during an evaluation, which a resumed run repeats."""
 
 
 class Trainer:
-    """Calibrates a model; the state of a run is its checkpoint, at any mini-batch.
+    """Calibrates a model. A checkpoint at any mini-batch contains the state of a run.
 
-    Several processes calibrate together when each has a trainer whose loaders give its share of
-    the mini-batches; only the first one writes files. Model, optimiser state and costs are the
-    same in all of them, so a run may be resumed with another number of processes.
+    Several processes calibrate together if each has a trainer whose loaders give its share of the
+    mini-batches. Only the first process writes files. Model, optimiser state and costs are equal
+    in all processes, so a run may be resumed with another number of processes.
 
     Args:
         model, solver, optimizer: what is calibrated, and how.
         train: loader whose batch sampler is an :class:`EpochSampler`.
         heldout: loader of the held-out sequences, or None.
         options: see :class:`TrainerOptions`.
-        folder: ``checkpoints/`` and ``tensorboard/`` are written here; None: nothing is written,
-            and Ctrl-C ends the run at once.
-        provenance: goes into the checkpoints.
+        folder: folder of ``checkpoints/`` and ``tensorboard/``; None writes nothing, and Ctrl-C
+            ends the run at once.
+        provenance: origin, stored in the checkpoints.
         figure: draws the model for TensorBoard.
-        world: the processes that train together; by default those that were joined.
+        world: the processes that train together; by default the joined ones.
     """
 
     def __init__(
@@ -109,11 +109,11 @@ class Trainer:
 
     @property
     def best_path(self) -> Path:
-        """The checkpoint of least monitored cost."""
+        """The checkpoint with the lowest monitored cost."""
         return self.last_path.with_name("best.pt")
 
     def best_checkpoint(self) -> Checkpoint:
-        """The state of least monitored cost; of a run gone on with perhaps one on the disk."""
+        """The state with the lowest monitored cost; for a resumed run it may be on the disk."""
         if self._best is None and self.folder is not None and self.best_path.is_file():
             return load_checkpoint(self.best_path)
         return self.checkpoint() if self._best is None else self._best
@@ -149,10 +149,11 @@ class Trainer:
         )
 
     def restore(self, path: Path) -> None:
-        """Go on from the checkpoint at ``path``, of this run or of another folder's.
+        """Continue from the checkpoint at ``path``, of this run or of another folder.
 
         Raises:
-            CheckpointError: see :func:`load_checkpoint`; or it is of another model or optimiser.
+            CheckpointError: see :func:`load_checkpoint`; or the checkpoint has another model or
+                optimiser.
         """
         checkpoint = load_checkpoint(path)
         try:
@@ -160,7 +161,7 @@ class Trainer:
             self.optimizer.load_state_dict(checkpoint.optimizer)
             for name in self._COUNTERS:
                 setattr(self, name, checkpoint.progress[name])
-        except Exception as error:  # each optimiser has its own words for a state of another kind
+        except Exception as error:  # optimisers raise various errors for the state of another one
             raise CheckpointError(
                 f"{path} does not fit the model and the optimiser of this run "
                 f"({type(error).__name__}: {error}); take another checkpoint, or start a new run"
@@ -173,7 +174,7 @@ class Trainer:
                 shutil.copyfile(best, temporary)
 
     def save(self) -> None:
-        """Write the best checkpoint, if there is a new one, then the last."""
+        """Write the best checkpoint, if it is new, and then the last one."""
         if self.world.first and self.folder is not None:
             if self._best is not None and not self._best_saved:
                 save_checkpoint(self._best, self.best_path)
@@ -188,7 +189,7 @@ class Trainer:
         return float(torch.linalg.vector_norm(torch.cat(gradients))) if gradients else 0.0
 
     def _share(self, batch: Batch | None, number: int) -> Tensor:
-        """This process's part of the mean cost of ``number`` sequences; its gradient as well."""
+        """This process's part of the mean cost of ``number`` sequences, and of its gradient."""
         if batch is None:
             return torch.zeros((), dtype=self.dtype, device=self.device)
         costs = sequence_costs(self.solver(self.model, batch), batch, self.options.cost)
@@ -226,10 +227,10 @@ class Trainer:
                 return evaluate_here()
             except SimulationError:
                 if not torch.is_grad_enabled():
-                    return torch.tensor(float("inf"))  # a particle outside the model's range
+                    return torch.tensor(float("inf"))  # a trial point outside the model's range
                 if not costs:
                     raise
-                # a line search went too far: a high, flat cost sends it back
+                # a line search went too far: a high, flat cost shortens its step
                 self.optimizer.zero_grad()
                 return torch.tensor(1e3 * (1 + abs(costs[0])), dtype=self.dtype)
 
@@ -249,7 +250,7 @@ class Trainer:
 
     def costs(self) -> dict[str, float]:
         """Cost of the present model on the training and on the held-out sequences."""
-        found = {}
+        costs = {}
         for name, loader in (("train", self.train), ("heldout", self.heldout)):
             if loader is None:
                 continue
@@ -263,20 +264,24 @@ class Trainer:
                 sums[0], sums[1] = metrics.J * metrics.sequences, metrics.sequences
             if self.world.size > 1:
                 total, number = self.world.total(sums).tolist()
-                found[f"cost/{name}"] = total / number
+                costs[f"cost/{name}"] = total / number
             else:
-                found[f"cost/{name}"] = metrics.J
-        return found
+                costs[f"cost/{name}"] = metrics.J
+        return costs
 
     def _shares(self, loader: DataLoader[Any]) -> Iterator[Batch]:
-        """This process's shares of the mini-batches, where it has one."""
+        """This process's shares of the mini-batches, if they are not empty."""
         for batch in loader:
-            # several processes have to agree before they stop, which they do after a step
+            # several processes can only stop together, after a step
             if self.world.size == 1 and self._guard.requested is not None:
                 raise _StopRequested
             if batch is not None:
-                moved, told = batch.to(self.device, self.dtype), self.optimizer
-                yield told.started(moved) if isinstance(told, GaussNewton) else moved
+                placed, optimizer = batch.to(self.device, self.dtype), self.optimizer
+                yield (
+                    optimizer.with_start_speeds(placed)
+                    if isinstance(optimizer, GaussNewton)
+                    else placed
+                )
 
     def _evaluate(self, logbook: Logbook | None, minibatch: float | None = None) -> None:
         row: dict[str, float] = {"epoch": float(self.epoch), "step": float(self.step)}
@@ -300,13 +305,13 @@ class Trainer:
 
     def _draw(self, logbook: Logbook | None) -> None:
         if self.figure is not None and logbook is not None:
-            model = copy.deepcopy(self.model).cpu()  # plots are drawn from CPU tensors
+            model = copy.deepcopy(self.model).cpu()  # plots need CPU tensors
             logbook.figure("force", self.figure(model), self.step)
 
     # -- the loop --------------------------------------------------------------------------
 
     def fit(self) -> None:
-        """Train up to ``max_epochs`` or until nothing improves any more.
+        """Train until ``max_epochs``, convergence, or the end of the patience.
 
         Raises:
             Interrupted: on SIGINT or SIGTERM to any of the processes, after saving.
@@ -351,7 +356,7 @@ class Trainer:
                 logbook.close({"cost/best": self.best} if finished else None)
 
     def _start(self, logbook: Logbook | None) -> None:
-        self.save()  # something to resume from, even during a long first evaluation
+        self.save()  # allows resuming if the first evaluation is interrupted
         try:
             self._evaluate(logbook)
         except _StopRequested:
@@ -361,7 +366,7 @@ class Trainer:
 
     def _end_epoch(self, logbook: Logbook | None, per_epoch: int) -> None:
         before = self.epoch, self.batch, self.sum
-        # counters first: a checkpoint made below belongs to the start of the next epoch
+        # counters first, because a checkpoint made below belongs to the start of the next epoch
         self.epoch, self.batch, self.sum = self.epoch + 1, 0, 0.0
         last = self.epoch == self.options.max_epochs
         if self.epoch % self.options.evaluate_every == 0 or last:
@@ -382,16 +387,16 @@ class Trainer:
         return f"epoch {self.epoch + 1}, best {self.options.monitor.value} cost {self.best:.4g}"
 
     def _save_if_due(self) -> None:
-        number = self.world.most(self._guard.requested or 0)
+        number = self.world.maximum(self._guard.requested or 0)
         if number:
             self._stop(number)
         if time.monotonic() - self._saved >= self.options.save_every:
             self.save()
 
     def _stop(self, number: int) -> NoReturn:
-        """Save, and end because the signal ``number`` asked for it."""
+        """Save, and stop the run because of the signal ``number``."""
         self.save()
-        self.world.meet()  # nobody leaves before the state is on the disk
+        self.world.barrier()  # no process ends before the state is on the disk
         World.agreed = True
         raise Interrupted(
             f"stopped at step {self.step} (epoch {self.epoch + 1}); "

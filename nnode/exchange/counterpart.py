@@ -1,16 +1,16 @@
-"""Parameters of another program, and what of a model that program cannot say."""
+"""Parameters of another program for a model, and parts of the model without a counterpart."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 from nnode.model import System
 from nnode.model.laws import law_from
 from nnode.model.term import Term, short_names
 
-#: Address of a parameter to what a run says of it: ``low`` and ``high``, None where not known.
+#: Address of a parameter to its interval: ``low`` and ``high``, None where unknown.
 Intervals = Mapping[str, Mapping[str, Any]]
 
 
@@ -20,9 +20,9 @@ class Counterpart:
 
     Attributes:
         text: the parameter file.
-        notes: how values were made that are not the model's own.
-        missing: what of the model has no counterpart, and what that means.
-        values: parameter of the other program to its text, where it takes them so.
+        notes: explanations of values that are not the model's parameters.
+        missing: parts of the model without a counterpart, and the consequences.
+        values: parameter of the other program to its text, if it reads such values.
     """
 
     text: str = ""
@@ -32,20 +32,20 @@ class Counterpart:
 
 
 def effects_without(system: System, first: int, counted: set[str]) -> list[str]:
-    """A line for each effect that is not ``counted``, of the terms from number ``first`` on."""
+    """A line for each effect that is not ``counted``, among the terms from index ``first``."""
     return [
         f"effect {term.name}: {term.formula_for(system.order)}"
-        for term in cast(list[Term], list(system.terms))[first:]
+        for term in system.term_list[first:]
         if term.name not in counted
     ]
 
 
 def field_law(system: System, described: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
-    """Which of the field's laws a model has, whatever it calls it.
+    """The package's law that a model has, whatever the model's name; None for other laws.
 
     Args:
-        described: their descriptions by name, see :func:`nnode.model.laws.law_from`.
-        names: those that are asked for.
+        described: name to description of laws, see :func:`nnode.model.laws.law_from`.
+        names: names of the compared laws.
     """
     term = system.terms[0] if len(system.terms) else None
     for name in names:
@@ -57,7 +57,7 @@ def field_law(system: System, described: Mapping[str, Any], names: tuple[str, ..
 
 
 def interval_lines(system: System, intervals: Intervals) -> list[str]:
-    """A line for each parameter: its value and, where it is known, its interval of 95 %."""
+    """A line for each parameter: its value, and its 95 % interval if known."""
     values = system.physical()
     short, lines = short_names(values), []
     for address, (value, unit) in values.items():

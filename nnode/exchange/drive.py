@@ -1,4 +1,4 @@
-"""A model drives vehicles of a scenario in SUMO: every step their speeds are set."""
+"""Control of vehicles in a SUMO scenario by a model, which sets their speeds in every step."""
 
 from __future__ import annotations
 
@@ -14,24 +14,28 @@ from nnode.exchange.drivers import Drivers, drivable
 from nnode.exchange.running_sumo import RunningSumo, Steps
 from nnode.model import System
 
-#: What SUMO writes, which ``data=sumo`` reads.
+#: SUMO's output, which ``data=sumo`` reads.
 TRAJECTORIES = "fcd.xml.gz"
 
 
 @dataclass(kw_only=True)
 class Drive:
-    """What came of it.
+    """The result of a simulation with controlled vehicles.
 
     Attributes:
         trajectories: floating car data of all vehicles.
-        driven: number of vehicles that the model has driven.
-        seconds: simulated, s; steps: how many; step, method: each of them.
-        mean_speed: of the driven vehicles, over vehicles and time, m/s; None: there was none.
-        collisions: pairs of vehicles of which one ran into the other; driven_collisions: those
-            with a driven one.
-        teleports: vehicles that SUMO carried elsewhere.
-        stranded: driven vehicles that SUMO stopped where their lane did not lead on.
-        wall: s that it took; in_sumo: of these within SUMO's own steps.
+        driven: number of controlled vehicles.
+        seconds: simulated time, s.
+        steps: number of steps.
+        step, method: length, s, and method of a step.
+        mean_speed: mean speed of the controlled vehicles over vehicles and time, m/s; None if
+            there was none.
+        collisions: number of pairs of vehicles that collided.
+        driven_collisions: number of those pairs with a controlled vehicle.
+        teleports: number of vehicles that SUMO teleported.
+        stranded: number of controlled vehicles that SUMO stopped at the end of their lane.
+        wall: wall time, s.
+        in_sumo: part of the wall time in SUMO's steps, s.
     """
 
     trajectories: Path
@@ -57,7 +61,7 @@ def drive(
     *,
     program: str = "libsumo",
     expected: Steps | None = None,
-    told: Steps | None = None,
+    forced_steps: Steps | None = None,
     end: float | None = None,
     far: float | None = None,
     lengths: bool = True,
@@ -65,29 +69,29 @@ def drive(
     seed: int = 0,
     steer: Callable[[RunningSumo], None] | None = None,
 ) -> Drive:
-    """Let a lane's model drive vehicles in SUMO.
+    """Control vehicles in SUMO by a lane model.
 
     Args:
         system: a model that is a formula.
         scenario: SUMO's configuration.
-        types: of the vehicles to drive.
-        folder: receives :data:`TRAJECTORIES`.
+        types: types of the controlled vehicles.
+        folder: folder for :data:`TRAJECTORIES`.
         program: ``libsumo`` or ``traci``.
-        expected: the steps that the model was calibrated with; None: any are taken.
-        told: SUMO is told to make these steps; None: the scenario's.
-        end: s of SUMO's clock; None: the scenario's, or when everybody has arrived.
+        expected: steps of the model's calibration, which the scenario must have; None allows any.
+        forced_steps: steps that SUMO must use; None takes the scenario's.
+        end: end on SUMO's clock, s; None takes the scenario's, or the arrival of all vehicles.
         far, lengths, seed: see :class:`nnode.exchange.drivers.Drivers`.
-        lane_changes: whether SUMO may change lanes of driven vehicles.
-        steer: is called before every step, as for vehicles that somebody else drives.
+        lane_changes: whether SUMO may change lanes of controlled vehicles.
+        steer: function that is called before every step, for example to control other vehicles.
 
     Raises:
-        ConfigError: what does not fit; SUMO, the scenario or the model are named.
-        SimulationError: the law says no finite number.
+        ConfigError: SUMO, the scenario or the model is not suitable; the message names it.
+        SimulationError: the law's speed is not finite.
     """
     order = drivable(system).order
     folder.mkdir(parents=True, exist_ok=True)
-    started = time.perf_counter()
-    sumo = RunningSumo(program, scenario, folder / TRAJECTORIES, told)
+    start = time.perf_counter()
+    sumo = RunningSumo(program, scenario, folder / TRAJECTORIES, forced_steps)
     try:
         sumo.check_types(types)
         steps = _steps(sumo, order, scenario)
@@ -95,24 +99,24 @@ def drive(
             check_steps(steps, expected, scenario)
         drivers = Drivers(system, steps.seconds, steps.method, far=far, lengths=lengths, seed=seed)
         job = _Job(sumo, drivers, types, lane_changes)
-        while sumo.going_on(end):
+        while sumo.continues(end):
             if steer is not None:
                 steer(sumo)
             job.step()
-        result = job.found(folder / TRAJECTORIES)
+        result = job.result(folder / TRAJECTORIES)
     finally:
         sumo.close()
     result.step, result.method = steps.seconds, steps.method
     result.seconds = result.steps * steps.seconds
-    result.wall = time.perf_counter() - started
+    result.wall = time.perf_counter() - start
     return result
 
 
 def check_steps(steps: Steps, expected: Steps, scenario: Path) -> None:
-    """Refuse a scenario whose steps are not those that a model was calibrated with.
+    """Refuse a scenario whose steps differ from those of a model's calibration.
 
     Raises:
-        ConfigError: says both, and what to do.
+        ConfigError: the steps differ.
     """
     same = abs(steps.seconds - expected.seconds) <= 1e-9 and steps.method == expected.method
     if not same:
@@ -125,10 +129,10 @@ def check_steps(steps: Steps, expected: Steps, scenario: Path) -> None:
 
 
 def _steps(sumo: RunningSumo, order: int, scenario: Path) -> Steps:
-    """What SUMO makes, in the words of the laws.
+    """SUMO's steps, with the name of the method in :data:`nnode.model.steps.METHODS`.
 
     Raises:
-        ConfigError: a law of first order and ballistic steps.
+        ConfigError: ballistic steps for a law of first order.
     """
     if order == 1 and sumo.ballistic:
         raise ConfigError(
@@ -141,7 +145,7 @@ def _steps(sumo: RunningSumo, order: int, scenario: Path) -> Steps:
 
 
 class _Job:
-    """The vehicles that are driven, in the order of the drivers, and what is counted."""
+    """The controlled vehicles, in the order of the drivers, and statistics."""
 
     def __init__(
         self, sumo: RunningSumo, drivers: Drivers, types: Sequence[str], lane_changes: bool
@@ -149,7 +153,7 @@ class _Job:
         self._sumo, self._drivers = sumo, drivers
         self._types, self._lane_changes = set(types), lane_changes
         self._names: list[str] = []
-        self._zero = np.empty(0)  # m along the lane where the way began
+        self._zero = np.empty(0)  # m, positions along the lane at the departure
         self._every: set[str] = set()
         self._crashed: set[tuple[str, str]] = set()
         self._stranded: set[str] = set()
@@ -158,16 +162,16 @@ class _Job:
         self._take(sumo.vehicles)
 
     def step(self) -> None:
-        """Speeds for those who are driven, and a step of SUMO's."""
-        sumo, drivers, subscribed = self._sumo, self._drivers, self._sumo.told()
+        """Set the speeds of controlled vehicles, and run a step of SUMO."""
+        sumo, drivers, subscribed = self._sumo, self._drivers, self._sumo.subscriptions()
         stays = np.array([name in subscribed for name in self._names], bool)
         if not stays.all():
             drivers.keep(stays)
             self._zero = self._zero[stays]
             self._names = [name for name in self._names if name in subscribed]
         if self._names:
-            views = sumo.seen(self._names, subscribed, twice=drivers.looks_twice)
-            if drivers.names_places:
+            views = sumo.driver_inputs(self._names, subscribed, second=drivers.needs_second_leader)
+            if drivers.depends_on_position:
                 views.x[:] = self._zero + sumo.places(self._names, subscribed)[1]
             sumo.set_speeds(self._names, drivers.speeds(sumo.time, views))
             self._speeds += float(views.v.sum())
@@ -182,19 +186,19 @@ class _Job:
         self._take(sumo.departed)
 
     def _take(self, vehicles: Sequence[str]) -> None:
-        """Take over vehicles of the types."""
+        """Take control of vehicles of the controlled types."""
         taken = [name for name in vehicles if self._sumo.type_of(name) in self._types]
         if not taken:
             return
         for name in taken:
             self._sumo.take(name, lane_changes=self._lane_changes)
         self._drivers.enter([self._sumo.classes_of(name) for name in taken])
-        lane, way = self._sumo.places(taken, self._sumo.told())
-        self._zero = np.concatenate([self._zero, lane - way])
+        lane, driven = self._sumo.places(taken, self._sumo.subscriptions())
+        self._zero = np.concatenate([self._zero, lane - driven])
         self._names += taken
         self._every.update(taken)
 
-    def found(self, trajectories: Path) -> Drive:
+    def result(self, trajectories: Path) -> Drive:
         return Drive(
             trajectories=trajectories,
             driven=len(self._every),

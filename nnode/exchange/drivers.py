@@ -1,11 +1,11 @@
-"""Vehicles that a model drives and another program moves: their speeds in a step, all at once."""
+"""Speeds by a model for vehicles that another program moves."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -15,35 +15,34 @@ from nnode.model.arrays import numpy_function
 from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.lane import VehicleClass
 from nnode.model.expression import symbol, symbols, topological
-from nnode.model.formula import own_values, values_of
 from nnode.model.lane_rates import Rates
 from nnode.model.steps import stepped
 from nnode.model.term import Term
-from nnode.model.terms import LaneDynamics
+from nnode.model.terms import LaneDynamics, parameter_values
 
-#: Gaps, m, that stand for an empty road: a law that drives there says the same at both.
+#: Gaps of an empty road, m. The law of a model must have the same values at both.
 EMPTY = (1e6, 1e9)
-#: How much it may differ there, m/s and m/s², of one and of the value.
+#: Tolerance of this, m/s and m/s², absolute and relative.
 _SAME = 1e-3
-#: Speeds, m/s, at which this is looked at.
+#: Speeds, m/s, at which this is tested.
 _SPEEDS = (0.0, 5.0, 15.0, 30.0)
-#: Formulas of gaps are computed from gaps: places may begin anew on every edge of a road.
+#: Gaps are computed as inputs, because positions may start again on every edge of a road.
 _GAPS = (symbol("x_1") - symbol("x"), symbol("x_2") - symbol("x_1"))
-#: Nobody's pace or time gap is changed to less than this share.
+#: Smallest random factor on a driver's pace or time gap.
 _SLOWEST = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seen:
-    """What n drivers see at one moment, ``(n,)`` each.
+class DriverInputs:
+    """Inputs of n drivers at one time, ``(n,)`` each.
 
     Attributes:
-        v: own speeds, m/s.
-        gap: to the vehicle ahead, front to front, m; infinite where there is none.
-        v_1, length_1: its speed, m/s, and length, m.
-        lead: its number among the drivers; -1 where it is none of them.
-        gap_1, v_2: of the next one ahead of that, m, m/s; infinite where there is none.
-        x: places, m, for laws that name them.
+        v: speeds of the drivers, m/s.
+        gap: gap to the vehicle ahead, front to front, m; infinite without one.
+        v_1, length_1: speed, m/s, and length, m, of the vehicle ahead.
+        lead: index of the vehicle ahead among the drivers; -1 if it is not among them.
+        gap_1, v_2: gap, m, and speed, m/s, of the second vehicle ahead; infinite without one.
+        x: positions, m, for laws that depend on them.
     """
 
     v: np.ndarray
@@ -57,23 +56,24 @@ class Seen:
 
 
 class Drivers:
-    """Vehicles with one model, each with memories, delays and numbers of its own.
+    """Vehicles with the same model and separate states, delays and random numbers.
 
-    Whoever changes his leader keeps them. Nobody ahead, or nobody within ``far``, is a vehicle at
-    that distance with one's own speed; without ``far`` it is infinitely far away.
+    A vehicle keeps its states if its leader changes. Without a vehicle ahead within ``far``, the
+    law's leader is at the distance ``far``, or very far away if ``far`` is None, with the
+    vehicle's speed.
 
     Args:
-        system: a lane's model.
+        system: a lane model.
         dt: step of the other program, s.
-        method: how it places vehicles, ``semi_implicit`` or ``ballistic``; of no account for laws
-            that say a speed, whose vehicles are placed with the speed that they said.
-        far: m.
+        method: method by which it moves vehicles, ``semi_implicit`` or ``ballistic``; ignored for
+            laws of first order, whose vehicles move with the law's speed.
+        far: largest considered distance of a vehicle ahead, m.
         lengths: whether gaps were calibrated bumper to bumper; otherwise they contain a length.
-        seed: of what is drawn for each driver.
+        seed: seed of the random numbers of drivers.
 
     Raises:
-        ConfigError: people; code that is no formula; what only recorded data tell; no ``far`` for
-            a law that says nothing certain at an infinite gap.
+        ConfigError: a crowd model; code that is not a formula; inputs that only recorded data have;
+            or ``far`` is None and the law has no limit for large gaps.
     """
 
     def __init__(
@@ -90,12 +90,12 @@ class Drivers:
             raise ConfigError(f"far={far} must be a distance in m, below {EMPTY[0]:g}, or null")
         lane = drivable(system)
         self._system = copy.deepcopy(system).double()
-        self._terms = cast(list[Term], list(self._system.terms))
+        self._terms = self._system.term_list
         self.lane, self.dt = stepped(lane, method), dt
         self._far, self._lengths = EMPTY[1] if far is None else far, lengths
         self._rng = np.random.default_rng(seed)
-        values = values_of(lane, own_values(self._terms, lane))
-        self._fixed = {s: float(v.detach()) for s, v in zip(lane.owned, values, strict=True)}
+        values = parameter_values(self._terms, lane)
+        self._fixed = {name: float(value.detach()) for name, value in values.items()}
         self._added = list(lane.rates)[lane.order :]
         self._states = {state: np.empty(0) for state in self._added}
         self._inputs = {name: np.empty(0) for name in lane.inputs}
@@ -108,23 +108,23 @@ class Drivers:
         return len(self._begun)
 
     @property
-    def names_places(self) -> bool:
-        """Whether places matter, not only distances."""
+    def depends_on_position(self) -> bool:
+        """Whether speeds depend on positions and not only on gaps."""
         outputs = [*self._rates.after.outputs, *self.lane.starts.values()]
         named = {part.value for part in topological(outputs, set(_GAPS))}
         return not {"x", "x_1", "x_2"}.isdisjoint(named)
 
     @property
-    def looks_twice(self) -> bool:
-        """Whether the second vehicle ahead matters, at the start at least."""
+    def needs_second_leader(self) -> bool:
+        """Whether the law or its start depends on the second vehicle ahead."""
         at_start = symbols(self.lane.starts.values())
         return "x_2" in at_start or any(j == 2 for _, j in self.lane.ahead)
 
     def enter(self, kinds: Sequence[Collection[str]]) -> None:
-        """Add drivers behind those that there are.
+        """Append drivers.
 
         Args:
-            kinds: of each the names of its class.
+            kinds: names of the classes of each driver.
         """
         n = len(kinds)
         for name, (place, _) in self.lane.inputs.items():
@@ -135,24 +135,24 @@ class Drivers:
         self._begun = np.concatenate([self._begun, np.zeros(n)])
         self._fresh = np.concatenate([self._fresh, np.ones(n, bool)])
 
-    def keep(self, who: np.ndarray) -> None:
-        """Forget the others.
+    def keep(self, stays: np.ndarray) -> None:
+        """Remove drivers.
 
         Args:
-            who: ``(n,)`` True for who stays.
+            stays: ``(n,)`` True for the drivers that stay.
         """
-        for every in (self._states, self._inputs):
-            every.update({name: values[who] for name, values in every.items()})
-        self._begun, self._fresh = self._begun[who], self._fresh[who]
+        for values_by_name in (self._states, self._inputs):
+            values_by_name.update({name: values[stays] for name, values in values_by_name.items()})
+        self._begun, self._fresh = self._begun[stays], self._fresh[stays]
 
-    def speeds(self, time: float, views: Seen) -> np.ndarray:
+    def speeds(self, time: float, views: DriverInputs) -> np.ndarray:
         """``(n,)`` speeds, m/s, at the end of the step that begins now; never negative.
 
         Args:
-            time: of the clock, s.
+            time: clock time, s.
 
         Raises:
-            SimulationError: the law says no finite number.
+            SimulationError: a speed or a state is not finite.
         """
         speed = self._advanced(time, views)
         bad = ~np.isfinite([speed, *self._states.values()]).all(0)
@@ -164,8 +164,8 @@ class Drivers:
             )
         return np.maximum(speed, 0.0)
 
-    def _advanced(self, time: float, views: Seen) -> np.ndarray:
-        """``(n,)`` what the law says of the end of the step; memories are brought there."""
+    def _advanced(self, time: float, views: DriverInputs) -> np.ndarray:
+        """``(n,)`` the law's speeds at the end of the step; also advances the added states."""
         given = self._given(time, views)
         if self._fresh.any():
             self._begin(time, views, given)
@@ -176,29 +176,29 @@ class Drivers:
         return speed
 
     def _formulas(self) -> Rates:
-        """That of the law, then those of added states."""
+        """The rates of the law and of added states."""
         return Rates([self.lane.rates[s] for s in (self.lane.top, *self._added)], _GAPS)
 
     def _said(self, given: dict[str, Any]) -> list[np.ndarray]:
-        """``(n,)`` each: the rates; who depends on that of the vehicle ahead comes after it."""
+        """``(n,)`` each: the rates. Chained rates are computed after those of the vehicle ahead."""
         n, lead = len(self), given["lead"]
         ready = [np.broadcast_to(part, n) for part in self._rates.at_once(given, given["gaps"])]
         if not self._rates.chained:
             return ready
         chained: list[np.ndarray] = []
         ahead = np.array(given["dx_1"])
-        for who in one_behind_the_other(lead):
+        for who in leaders_first(lead):
             led = who[lead[who] >= 0]
             if chained:
                 ahead[led] = np.maximum(chained[0][lead[led]], 0.0)
             rates = self._rates.after({"dx_1": ahead[who]}, [part[who] for part in ready])
             chained = chained or [np.empty(n) for _ in rates]
-            for every, rate in zip(chained, rates, strict=True):
-                every[who] = rate
+            for target, rate in zip(chained, rates, strict=True):
+                target[who] = rate
         return chained
 
-    def _given(self, time: float, views: Seen) -> dict[str, Any]:
-        """Values of all symbols, and of the gaps."""
+    def _given(self, time: float, views: DriverInputs) -> dict[str, Any]:
+        """Values of all symbols and gaps."""
         n = len(self)
         follows = views.gap <= self._far
         second = follows & np.isfinite(views.gap_1)
@@ -227,29 +227,29 @@ class Drivers:
             "lead": np.where(follows, views.lead, -1),
         }
 
-    def _begin(self, time: float, views: Seen, given: dict[str, Any]) -> None:
-        """The states of those that have just been added."""
+    def _begin(self, time: float, views: DriverInputs, given: dict[str, Any]) -> None:
+        """Initialise the states of new drivers."""
         new = self._fresh
         self._begun = given["start"]
         starts = self.lane.starts
-        begun = numpy_function(tuple(starts.values()), _GAPS)(given, given["gaps"])
-        for state, start in zip(starts, begun, strict=True):
+        values = numpy_function(tuple(starts.values()), _GAPS)(given, given["gaps"])
+        for state, start in zip(starts, values, strict=True):
             self._states[state] = np.where(new, start, self._states[state])
             given[state] = self._states[state]
         self._fresh = np.zeros(len(self), bool)
 
     def _check_empty(self, lane: LaneDynamics) -> None:
-        """Refuse a law that does not come to an end as the gap grows.
+        """Refuse a law without a limit for large gaps.
 
         Args:
-            lane: as it is before a step ends at rest at the latest.
+            lane: the formula without the changes of a method of stepping.
         """
         v = np.array(_SPEEDS)
         inf, zero = np.full_like(v, np.inf), np.zeros_like(v)
-        views = Seen(
+        views = DriverInputs(
             v=v, gap=inf, v_1=v, length_1=zero, lead=zero.astype(int) - 1, gap_1=inf, v_2=v, x=zero
         )
-        said = []
+        results = []
         for far in EMPTY:
             trial = copy.copy(self)
             trial._far, trial.lane = far, lane
@@ -258,11 +258,12 @@ class Drivers:
             trial._rng = np.random.default_rng(0)
             trial.enter([()] * len(v))
             with np.errstate(all="ignore"):
-                said.append([trial._advanced(k * self.dt, views) for k in range(3)])
-            said[-1] += list(trial._states.values())
+                results.append([trial._advanced(k * self.dt, views) for k in range(3)])
+            results[-1] += list(trial._states.values())
         with np.errstate(all="ignore"):
             same = all(
-                (np.abs(a - b) <= _SAME * (1 + np.abs(b))).all() for a, b in zip(*said, strict=True)
+                (np.abs(a - b) <= _SAME * (1 + np.abs(b))).all()
+                for a, b in zip(*results, strict=True)
             )
         if not same:
             raise ConfigError(
@@ -273,28 +274,28 @@ class Drivers:
             )
 
 
-def one_behind_the_other(lead: np.ndarray) -> list[np.ndarray]:
-    """Numbers of vehicles in an order in which everybody comes after his leader.
+def leaders_first(lead: np.ndarray) -> list[np.ndarray]:
+    """Groups of indices of vehicles, such that leaders come before their followers.
 
     Args:
-        lead: ``(n,)`` number of the leader; -1: none. In a ring somebody begins.
+        lead: ``(n,)`` index of the leader; -1 for none. A ring starts at an arbitrary vehicle.
     """
     done = lead < 0
     groups = [np.flatnonzero(done)] if done.any() else []
     while not done.all():
-        now = ~done & done[lead]
-        if not now.any():
-            now[int(done.argmin())] = True
-        groups.append(np.flatnonzero(now))
-        done = done | now
+        ready = ~done & done[lead]
+        if not ready.any():
+            ready[int(done.argmin())] = True
+        groups.append(np.flatnonzero(ready))
+        done = done | ready
     return groups
 
 
 def drivable(system: System) -> LaneDynamics:
-    """The formula of a model that can drive vehicles in another program.
+    """The formula of a model that can control vehicles in another program.
 
     Raises:
-        ConfigError: there is none, or it names what only recorded data tell.
+        ConfigError: the model has no formula, or needs inputs that only recorded data have.
     """
     if not isinstance(system, Traffic):
         raise ConfigError(
@@ -321,8 +322,11 @@ def drivable(system: System) -> LaneDynamics:
 
 
 def drawn(term: Term, kinds: Sequence[Collection[str]], rng: np.random.Generator) -> np.ndarray:
-    """``(n,)`` what new drivers have of an effect: whether they belong to its class, or a number
-    drawn from its normal distribution, at least what leaves a tenth of a pace."""
+    """``(n,)`` inputs of new drivers for an effect.
+
+    They are 1 for members of the effect's class, or numbers from the effect's normal distribution,
+    which are at least -0.9.
+    """
     if isinstance(term, VehicleClass):
         return np.array([float(term.kind in names) for names in kinds])
     assert isinstance(term, IndividualEffect)

@@ -1,11 +1,11 @@
-"""Calibrated laws of people as parameters of JuPedSim's models.
+"""Calibrated pedestrian laws as parameters of JuPedSim's models.
 
-Collision-free speeds (``cfsm``) are the same there, the generalised centrifugal force (``gcfm``)
-nearly. Social forces have the same force between two people in both, A exp((2r - d)/B) n with
-contact and sliding friction. Two things differ. Here a person's forces are averaged over the N
-people and the P wall points of the scene, there they are summed; and walls are points here, there
-the nearest point of each edge. The mass takes up the first difference, the strength of obstacles
-the second.
+The collision-free speed model (``cfsm``) is equal in both programs, the generalised centrifugal
+force model (``gcfm``) nearly equal. The social force between two people is equal,
+A exp((2r - d)/B) n with contact and sliding friction, but there are two differences. nnode averages
+a person's forces over the N people and the P wall points of the scene, and JuPedSim sums them.
+nnode represents walls by points, and JuPedSim by the nearest point of each edge. The mass accounts
+for the first difference, and the strength of obstacles for the second.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from nnode.model.scene import Scene, wall_points
 
 @dataclass
 class Scenes:
-    """What parameters depend on beside the model: means over sequences.
+    """Properties of the data that parameters depend on, as means over sequences.
 
     Attributes:
         people: number of people.
-        points: number of wall points; 0 where no sequence has walls.
+        points: number of wall points; 0 without walls.
         spacing: distance of neighbouring wall points, m.
         speed: median of the measured speeds, m/s.
-        pace: median of people's preferred speeds, m/s, as laws of the field take them.
+        pace: median of people's preferred speeds, m/s.
     """
 
     people: float
@@ -54,7 +54,7 @@ class Scenes:
 
 
 def scenes_of(sequences: Iterable[Sequence], spacing: float) -> Scenes:
-    """Look at all sequences, whose walls become points ``spacing`` (m) apart or closer."""
+    """The properties of sequences, with walls as points that are at most ``spacing`` (m) apart."""
     people, points, speeds, gaps, paces = [], [], [], [], []
     for s in sequences:
         paces.append(Scene.of(collate([s]), spacing).pace[0].numpy())
@@ -77,22 +77,22 @@ def scenes_of(sequences: Iterable[Sequence], spacing: float) -> Scenes:
 
 
 def points_per_edge(r: float, B: float, spacing: float) -> float:
-    """How much stronger a long row of points acts than the nearest point of an edge.
+    """The force of a long row of points relative to that of the nearest point of an edge.
 
-    At distance r (m), where a person touches the wall, only the pushes' parts along the normal
-    add up: the mean over the row's places of sum exp((r - d_p)/B) r/d_p, which is
+    At distance r (m), where a person touches the wall, the components along the normal add up. The
+    sum of exp((r - d_p)/B) r/d_p, averaged over positions along the row, is
     2 r exp(r/B) K_0(r/B) / spacing with the Bessel function K_0.
     """
     return float(2 * r * kve(0, r / B) / spacing)
 
 
-#: Laws of the field that JuPedSim has.
+#: Laws that JuPedSim has.
 SAME = ("cfsm", "gcfm")
 _PACE = "desired_speed: the median of people's preferred speeds; each has his own"
 
 
 def has_parameters(system: System) -> bool:
-    """Whether JuPedSim has a counterpart to a model."""
+    """Whether JuPedSim has a counterpart of a model."""
     return (
         system.find_law("social_force") is not None
         or field_law(system, PEDESTRIAN_LAWS, SAME) is not None
@@ -102,18 +102,18 @@ def has_parameters(system: System) -> bool:
 def jupedsim_parameters(
     system: System, scenes: Scenes, intervals: Intervals | None = None
 ) -> Counterpart:
-    """JSON with the arguments of one of JuPedSim's models (``model``), of its agents' parameters
+    """JSON with the arguments of one of JuPedSim's models (``model``) and of its agents' parameters
     (``agent``), in JuPedSim's units, and the names of both classes (``classes``).
 
     Args:
-        intervals: of the parameters, for the file's notes.
+        intervals: intervals of the parameters, for the file's notes.
 
     Raises:
-        ConfigError: JuPedSim has no counterpart to the model.
+        ConfigError: JuPedSim has no counterpart of the model.
     """
     name = field_law(system, PEDESTRIAN_LAWS, SAME)
     if name is not None:
-        counterpart, content = _of_the_field(system, name, scenes)
+        counterpart, content = _same_law(system, name, scenes)
     else:
         counterpart, content = _social_force(system, scenes)
     counterpart.notes[:0] = interval_lines(system, intervals or {})
@@ -132,8 +132,8 @@ def _content(model: str, arguments: dict[str, Any], agent: dict[str, Any]) -> di
     }
 
 
-def _of_the_field(system: System, name: str, scenes: Scenes) -> tuple[Counterpart, dict[str, Any]]:
-    """``cfsm`` or ``gcfm``."""
+def _same_law(system: System, name: str, scenes: Scenes) -> tuple[Counterpart, dict[str, Any]]:
+    """The counterpart of ``cfsm`` or ``gcfm``."""
     counterpart, law = Counterpart(), cast(Law, system.terms[0])
     values = {p: float(getattr(law, p).detach()) for p in law.scalars}
     fixed = {name: value for name, (value, _) in law.formulas.constants.items()}

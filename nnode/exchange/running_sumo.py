@@ -1,6 +1,7 @@
-"""SUMO as it runs, step by step: who is where, who is ahead of whom, and how fast they shall drive.
+"""Interface to a running SUMO: steps, positions, leaders and commanded speeds.
 
-Through ``libsumo``, in this process, or ``traci``, in one of its own; both have the same interface.
+It uses ``libsumo`` in this process or ``traci`` with another process, which have the same
+functions.
 """
 
 from __future__ import annotations
@@ -20,24 +21,24 @@ from uuid import uuid4
 import numpy as np
 
 from nnode.errors import ConfigError
-from nnode.exchange.drivers import Seen
+from nnode.exchange.drivers import DriverInputs
 
-#: What can be run.
+#: Supported programs.
 PROGRAMS = ("libsumo", "traci")
-#: Within these, m, a vehicle ahead is looked for.
-LOOK = 5000.0
-#: Decimals of what SUMO writes: what is read is what was driven, to the nanometre.
+#: Largest distance of a vehicle ahead that SUMO reports, m.
+MAX_DISTANCE = 5000.0
+#: Number of decimals of SUMO's output, for exact trajectories.
 DIGITS = 9
-#: Of a vehicle that is off the road SUMO says numbers far below this.
+#: SUMO's values for vehicles off the road are far below this.
 _OFF_ROAD = -1e6
 
-#: Vehicle to what is known of it, by SUMO's numbers of quantities.
-Told = dict[str, dict[int, Any]]
+#: Vehicle to its subscribed values, by SUMO's numbers of quantities.
+Subscriptions = dict[str, dict[int, Any]]
 
 
 @dataclass(frozen=True)
 class Steps:
-    """How a program steps: length, s, and method, of :data:`nnode.model.steps.METHODS`."""
+    """Steps of a program: length, s, and method, one of :data:`nnode.model.steps.METHODS`."""
 
     seconds: float
     method: str
@@ -52,11 +53,11 @@ class RunningSumo:
     Args:
         program: one of :data:`PROGRAMS`.
         scenario: ``.sumocfg``.
-        output: floating car data are written there.
-        steps: SUMO is told to make these; None: the scenario's own.
+        output: file for floating car data.
+        steps: steps that SUMO must use; None takes the scenario's.
 
     Raises:
-        ConfigError: no such program or file, or SUMO does not load it.
+        ConfigError: the program or the file does not exist, or SUMO cannot load it.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class RunningSumo:
             str(DIGITS),
             "--no-step-log",
             "true",
-            # a law may stop closer than the type's minGap: a collision is where bodies touch
+            # a law may stop closer than the type's minGap, so collisions are contacts of bodies
             "--collision.mingap-factor",
             "0",
             "--aggregate-warnings",
@@ -86,8 +87,8 @@ class RunningSumo:
             ballistic = str(steps.method == "ballistic").lower()
             options += ["--step-length", repr(steps.seconds), "--step-method.ballistic", ballistic]
         try:
-            with redirect_stdout(StringIO()):  # traci counts its attempts to connect
-                # of a start that failed traci keeps the name
+            with redirect_stdout(StringIO()):  # traci prints its attempts to connect
+                # a unique label, because traci keeps the label of a failed start
                 self.api.start([binary, *options], label=uuid4().hex)
         except (self.api.TraCIException, self.api.FatalTraCIError) as error:
             raise ConfigError(f"sumo={scenario} cannot be loaded by SUMO: {error}") from error
@@ -107,20 +108,20 @@ class RunningSumo:
 
     @property
     def time(self) -> float:
-        """Of the clock, s, at which SUMO writes that vehicles were where they are now."""
+        """Clock time, s, of the present positions in SUMO's output."""
         return float(self.api.simulation.getTime()) - self.seconds
 
-    def going_on(self, end: float | None) -> bool:
-        """Whether somebody is on the road or will be, before the end, s."""
+    def continues(self, end: float | None) -> bool:
+        """Whether there are present or future vehicles, before the end, s."""
         last = float(self.api.simulation.getEndTime()) if end is None else end
         soon = last < 0 or self.api.simulation.getTime() < last - self.seconds / 2
         return soon and self.api.simulation.getMinExpectedNumber() > 0
 
     def check_types(self, types: Sequence[str]) -> None:
-        """Refuse types that there are not, or whose vehicles do not decide in every step.
+        """Refuse unknown types, and types whose vehicles do not decide in every step.
 
         Raises:
-            ConfigError: names them.
+            ConfigError: a type is not suitable.
         """
         types_of_scenario = [
             t for t in self.api.vehicletype.getIDList() if not t.startswith("DEFAULT_")
@@ -144,49 +145,51 @@ class RunningSumo:
 
     @property
     def vehicles(self) -> tuple[str, ...]:
-        """Everybody on the road."""
+        """All vehicles on the road."""
         return tuple(self.api.vehicle.getIDList())
 
     @property
     def departed(self) -> tuple[str, ...]:
-        """Who has entered the road in the last step."""
+        """Vehicles that entered the road in the last step."""
         return tuple(self.api.simulation.getDepartedIDList())
 
     def type_of(self, vehicle: str) -> str:
         return str(self.api.vehicle.getTypeID(vehicle))
 
     def classes_of(self, vehicle: str) -> set[str]:
-        """Its type, which ``data=sumo`` calls its kind, and SUMO's class of vehicles."""
+        """A vehicle's type, which ``data=sumo`` reads as its kind, and SUMO's vehicle class."""
         return {self.type_of(vehicle), str(self.api.vehicle.getVehicleClass(vehicle))}
 
     def take(self, vehicle: str, *, lane_changes: bool) -> None:
-        """Take over a vehicle: SUMO no longer looks after its speed, nor, if so, after its lane."""
-        every, c = self.api.vehicle, self._constants
-        every.setSpeedMode(vehicle, 0)
+        """Take control of a vehicle's speed, and unless ``lane_changes`` of its lane."""
+        vehicles, c = self.api.vehicle, self._constants
+        vehicles.setSpeedMode(vehicle, 0)
         if not lane_changes:
-            every.setLaneChangeMode(vehicle, 0)
-        every.subscribe(vehicle, [c.VAR_SPEED, c.VAR_DISTANCE, c.VAR_LANEPOSITION])
-        every.subscribeLeader(vehicle, LOOK)
+            vehicles.setLaneChangeMode(vehicle, 0)
+        vehicles.subscribe(vehicle, [c.VAR_SPEED, c.VAR_DISTANCE, c.VAR_LANEPOSITION])
+        vehicles.subscribeLeader(vehicle, MAX_DISTANCE)
 
     def set_speeds(self, vehicles: Iterable[str], speeds: np.ndarray) -> None:
-        """At the end of the step that begins now, m/s."""
+        """Command speeds at the end of the step that begins now, m/s."""
         command = self.api.vehicle.setSpeed
         for vehicle, speed in zip(vehicles, speeds.tolist(), strict=True):
             command(vehicle, speed)
 
-    def told(self) -> Told:
-        """What was subscribed to, of the vehicles that were taken over and have not arrived."""
-        results: Told = self.api.vehicle.getAllSubscriptionResults()
+    def subscriptions(self) -> Subscriptions:
+        """Subscribed values of controlled vehicles that have not arrived."""
+        results: Subscriptions = self.api.vehicle.getAllSubscriptionResults()
         return results
 
-    def seen(self, vehicles: Sequence[str], subscribed: Told, *, twice: bool) -> Seen:
-        """What vehicles see; those that SUMO carries elsewhere see nobody.
+    def driver_inputs(
+        self, vehicles: Sequence[str], subscribed: Subscriptions, *, second: bool
+    ) -> DriverInputs:
+        """Inputs of the law for vehicles; teleported vehicles have no vehicle ahead.
 
         Args:
-            subscribed: see :meth:`told`.
-            twice: whether the second vehicle ahead is asked for.
+            subscribed: see :meth:`subscriptions`.
+            second: whether the second vehicle ahead is needed.
         """
-        speed, leader, every = self._speed, self._constants.VAR_LEADER, self.api.vehicle
+        speed, leader, vehicle_api = self._speed, self._constants.VAR_LEADER, self.api.vehicle
         n = len(vehicles)
         number = {vehicle: i for i, vehicle in enumerate(vehicles)}
         v = np.array([max(subscribed[vehicle][speed], 0.0) for vehicle in vehicles])
@@ -199,40 +202,42 @@ class RunningSumo:
                 continue
             name = ahead[0]
             length[i] = self._length_of(name)
-            # SUMO's distance ends minGap before the bumper
+            # SUMO's distance excludes minGap
             gap[i] = ahead[1] + self._min_gap_of(vehicle) + length[i]
             at = number.get(name, -1)
             if at < 0 and name not in others:
-                others[name] = max(float(every.getSpeed(name)), 0.0)
+                others[name] = max(float(vehicle_api.getSpeed(name)), 0.0)
             lead[i], v_1[i] = at, v[at] if at >= 0 else others[name]
-            after = every.getLeader(name, LOOK) if twice and at < 0 else None
+            after = vehicle_api.getLeader(name, MAX_DISTANCE) if second and at < 0 else None
             if after and after[0]:
                 gap_1[i] = after[1] + self._min_gap_of(name) + self._length_of(after[0])
-                v_2[i] = max(float(every.getSpeed(after[0])), 0.0)
+                v_2[i] = max(float(vehicle_api.getSpeed(after[0])), 0.0)
         led = np.flatnonzero(lead >= 0)
         gap_1[led], v_2[led] = gap[lead[led]], v_1[lead[led]]
-        return Seen(
+        return DriverInputs(
             v=v, gap=gap, v_1=v_1, length_1=length, lead=lead, gap_1=gap_1, v_2=v_2, x=np.zeros(n)
         )
 
-    def places(self, vehicles: Sequence[str], subscribed: Told) -> tuple[np.ndarray, np.ndarray]:
-        """``(n,)`` each: m along the lane, and m driven since the departure."""
-        lane, way = self._constants.VAR_LANEPOSITION, self._constants.VAR_DISTANCE
-        return tuple(np.array([subscribed[v][key] for v in vehicles]) for key in (lane, way))  # type: ignore[return-value]
+    def places(
+        self, vehicles: Sequence[str], subscribed: Subscriptions
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """``(n,)`` each: position along the lane, and distance since the departure, m."""
+        lane, driven = self._constants.VAR_LANEPOSITION, self._constants.VAR_DISTANCE
+        return tuple(np.array([subscribed[v][key] for v in vehicles]) for key in (lane, driven))  # type: ignore[return-value]
 
     def collisions(self) -> list[tuple[str, str]]:
-        """Who runs into whom."""
+        """Pairs of colliding vehicle and victim."""
         return [
             (collision.collider, collision.victim)
             for collision in self.api.simulation.getCollisions()
         ]
 
     def teleports(self) -> int:
-        """How many vehicles SUMO has begun to carry elsewhere in the last step."""
+        """Number of vehicles whose teleport began in the last step."""
         return int(self.api.simulation.getStartingTeleportNumber())
 
     def stranded(self) -> tuple[str, ...]:
-        """Vehicles that SUMO has stopped in the last step where their lane does not lead on."""
+        """Vehicles that SUMO stopped in the last step at the end of their lane."""
         return tuple(self.api.simulation.getEmergencyStoppingVehiclesIDList())
 
     def close(self) -> None:
@@ -250,10 +255,10 @@ class RunningSumo:
 
 
 def _loaded(program: str) -> tuple[Any, str]:
-    """The module, and SUMO's own program.
+    """The Python module, and SUMO's executable.
 
     Raises:
-        ConfigError: unknown, or not installed.
+        ConfigError: the program is unknown or not installed.
     """
     if program not in PROGRAMS:
         raise ConfigError(f"program={program} is unknown, expected {' or '.join(PROGRAMS)}")
@@ -263,7 +268,7 @@ def _loaded(program: str) -> tuple[Any, str]:
         sys.path.append(tools)  # traci comes with SUMO
     binary = str(home / "bin" / "sumo") if home else shutil.which("sumo")
     try:
-        # libsumo warns of a pyarrow of another version, which matters to tables that it would write
+        # libsumo warns of other versions of pyarrow, which only matters for its table output
         with redirect_stdout(StringIO()):
             module = importlib.import_module(program)
     except ImportError as error:

@@ -1,9 +1,9 @@
 """Calibrated laws as a vehicle type for SUMO.
 
 ``idm`` and ``krauss`` are SUMO's IDM and KraussOrig1, parameter by parameter. SUMO has no
-car-following model of first order: for laws of the gap Krauss' model without its noise is taken,
-whose gap at a constant speed v is length + minGap + tau v; the type keeps from a law what such a
-state shows: the gap at rest, the gap at the recorded speed, and the greatest speed.
+car-following model of first order. Krauss' model without noise replaces laws of the gap. Its gap
+at a constant speed v is length + minGap + tau v. The parameters are chosen such that the gap at
+rest, the gap at the recorded speed, and the greatest speed are the law's.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from nnode.exchange.counterpart import (
 from nnode.model import Law, System
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 
-#: SUMO's own length of a passenger car, m, where the data tell none.
+#: SUMO's length of a passenger car, m, for data without lengths.
 DEFAULT_LENGTH = 5.0
-#: Laws that SUMO has, and what it calls them.
+#: Laws that SUMO has, to SUMO's names.
 SAME = {"idm": "IDM", "krauss": "KraussOrig1"}
-#: What SUMO calls their parameters, beside the gap at rest.
+#: Parameters of these laws, except the gap at rest, to SUMO's names.
 _SAME = {"v0": "maxSpeed", "T": "tau", "a": "accel", "b": "decel"}
 
 
@@ -49,10 +49,10 @@ def traffic_of(sequences: Iterable[Sequence]) -> tuple[float, float | None]:
 
 
 def equilibrium_gap(law: Law, speed: float, time_gap: float = 0.0) -> float:
-    """Gap (m, front to front) that a law asks for at ``speed`` (m/s); infinite from v0 on.
+    """Equilibrium gap (m, front to front) of a law at ``speed`` (m/s); infinite from v0 on.
 
     Args:
-        time_gap: h of the effect of this name, s.
+        time_gap: parameter h of the effect ``time_gap``, s.
     """
     v0, standstill = _value(law, "v0"), _value(law, "L") + time_gap * speed
     if law.entry == "log":
@@ -61,7 +61,7 @@ def equilibrium_gap(law: Law, speed: float, time_gap: float = 0.0) -> float:
 
 
 def has_type(system: System) -> bool:
-    """Whether SUMO has a counterpart to a model's law."""
+    """Whether SUMO has a counterpart of a model's law."""
     return (
         system.find_law("lin", "log") is not None
         or field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME)) is not None
@@ -79,38 +79,38 @@ def sumo_type(
 
     Args:
         system: ``idm``, ``krauss`` or a law of the gap, with or without effects.
-        name: of the vehicle type.
-        speed: m/s at which gaps are to agree, the median of the data; of laws of the gap.
-        length: of the vehicles, m; None, the data have none, takes SUMO's own.
-        intervals: of the parameters, for the file's comments.
+        name: name of the vehicle type.
+        speed: speed (m/s) at which gaps agree for laws of the gap, the median of the data.
+        length: length of the vehicles, m; None takes SUMO's default.
+        intervals: intervals of the parameters, for the file's comments.
 
     Raises:
-        ConfigError: SUMO has no counterpart to the law.
+        ConfigError: SUMO has no counterpart of the law.
     """
     law = field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME))
     if law is not None:
-        counterpart = _same(system, law, name, length)
+        counterpart = _same_law(system, law, name, length)
     else:
-        counterpart = _of_the_gap(system, name, speed, length)
+        counterpart = _krauss_of_gap(system, name, speed, length)
     counterpart.notes[:0] = interval_lines(system, intervals or {})
     counterpart.text = _document(counterpart.values, counterpart)
     return counterpart
 
 
-def _same(system: System, law: str, name: str, length: float | None) -> Counterpart:
-    """A law that SUMO has."""
+def _same_law(system: System, law: str, name: str, length: float | None) -> Counterpart:
+    """The counterpart of a law that SUMO has."""
     counterpart = Counterpart()
     term: Any = system.terms[0]
     s0 = _value(term, "s0")
-    size, room = (length, s0) if length is not None else _parted(s0, DEFAULT_LENGTH)
+    body, min_gap = (length, s0) if length is not None else _split_standstill(s0, DEFAULT_LENGTH)
     counterpart.values = {
         "id": name,
         "carFollowModel": SAME[law],
         "sigma": "0",
         "speedFactor": "1",
         "speedDev": "0",
-        "length": _exactly(size),
-        "minGap": _exactly(room),
+        "length": _exactly(body),
+        "minGap": _exactly(min_gap),
         **{_SAME[p]: _exactly(_value(term, p)) for p in _SAME},
     }
     if law == "idm":
@@ -125,7 +125,7 @@ def _same(system: System, law: str, name: str, length: float | None) -> Counterp
                 "run's by one that is a length longer; calibrate with lengths for the same paths"
             )
     else:
-        counterpart.notes.append(f"length: the data's median, {size:.4g} m")
+        counterpart.notes.append(f"length: the data's median, {body:.4g} m")
     counterpart.notes.append(
         "maxSpeed: no faster than a lane allows; leave speedFactor at 1 and limits above v0"
     )
@@ -137,14 +137,14 @@ def _same(system: System, law: str, name: str, length: float | None) -> Counterp
     return counterpart
 
 
-def _parted(whole: float, length: float) -> tuple[float, float]:
-    """A gap at rest from front to front as a length and what is between bumpers, m."""
+def _split_standstill(whole: float, length: float) -> tuple[float, float]:
+    """A gap at rest from front to front as a vehicle length and a gap between bumpers, m."""
     of_body = min(length, whole)
     return of_body, whole - of_body
 
 
-def _of_the_gap(system: System, name: str, speed: float, length: float | None) -> Counterpart:
-    """A law of the gap as Krauss' model."""
+def _krauss_of_gap(system: System, name: str, speed: float, length: float | None) -> Counterpart:
+    """Krauss' model as the counterpart of a law of the gap."""
     law = system.find_law("lin", "log")
     if law is None:
         raise ConfigError(
@@ -155,14 +155,14 @@ def _of_the_gap(system: System, name: str, speed: float, length: float | None) -
     counterpart = Counterpart()
     effects = {str(term.name): term for term in list(system.terms)[1:]}
     L, v0 = _value(law, "L"), _value(law, "v0")
-    of_body, room = _parted(L, DEFAULT_LENGTH if length is None else length)
+    of_body, min_gap = _split_standstill(L, DEFAULT_LENGTH if length is None else length)
     values = {
         "id": name,
         "carFollowModel": "Krauss",
         "sigma": "0",
         "speedDev": "0",
         "length": _digits(of_body),
-        "minGap": _digits(room),
+        "minGap": _digits(min_gap),
     }
     text = f"{of_body:.3g} m of it are the length, "
     text += "SUMO's own, cut to L" if length is None else "the data's median, cut to L"

@@ -1,4 +1,4 @@
-"""A run's results as tidy CSV: one value a row, with its unit."""
+"""A run's results as tidy CSV with one value per row."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def write_results(
     """``parameters``, ``history``, ``sequences`` and ``horizons``, each ``.csv`` in ``folder``.
 
     Args:
-        folder: made where it is missing.
-        checkpoint: its history becomes one row per epoch and quantity.
+        folder: folder, created if it is missing.
+        checkpoint: gives the history, with one row per epoch and quantity.
         model: the calibrated model.
         metrics: errors of the model on the exported sequences.
-        unit: of their costs.
+        unit: unit of the sequences' costs.
     """
     parameters = [
         {"parameter": name, "value": float(value), "unit": of}

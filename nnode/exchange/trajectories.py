@@ -1,4 +1,4 @@
-"""Sequences, measured or simulated, as files that other programs read."""
+"""Measured or simulated sequences in file formats of other programs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from nnode.errors import ConfigError, DataError
 from nnode.exchange.tables import write_csv
 from nnode.files import csv_safe, replacing, write_text
 
-#: Formats of trajectories, and of whom each can be.
+#: Format of trajectories to the domains that it supports.
 FORMATS = {
     "parquet": ("traffic", "crowd"),
     "csv": ("traffic", "crowd"),
@@ -40,13 +40,13 @@ def simulated(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str | None = None,
 ) -> Iterator[Sequence]:
-    """The sequences as a model moves the agents from their first measured state.
+    """The sequences as simulated by a model from their first measured states.
 
-    Velocities are the model's own in second-order models, else None. Where people walk to is
-    what the simulation was told, also where that was their last measured position.
+    Velocities are those of second-order models, or else None. Destinations are the simulation's,
+    also if they are the last measured positions.
 
     Args:
-        size: so many are simulated at once.
+        size: number of sequences that are simulated at once.
     """
     for group in _groups(sequences, size):
         path = simulate(collate(group).to(device, dtype))
@@ -58,14 +58,15 @@ def simulated(
 
 
 def check_format(option: str, name: str, domain: str) -> None:
-    """Refuse a format that there is not, or that has no place for such positions.
+    """Refuse an unknown format, or a format that does not support the domain.
 
     Args:
-        option: that names the format.
+        option: name of the option, for the error message.
+        name: the format.
         domain: ``traffic`` or ``crowd``.
 
     Raises:
-        ConfigError: names those that fit.
+        ConfigError: the format is not suitable.
     """
     if domain in FORMATS.get(name, ()):
         return
@@ -77,12 +78,12 @@ def check_format(option: str, name: str, domain: str) -> None:
 def write_trajectories(
     folder: Path, stem: str, name: str, sequences: Iterable[Sequence], dims: int
 ) -> list[Path]:
-    """Files of one of the :data:`FORMATS`, as :func:`check_format` let it pass.
+    """Write files of one of the :data:`FORMATS`, which :func:`check_format` has accepted.
 
     Args:
-        folder: made where it is missing.
-        stem: of the file, or name of the folder of a file per sequence.
-        name: of the format.
+        folder: folder, created if it is missing.
+        stem: stem of the file, or name of the folder with a file per sequence.
+        name: name of the format.
         dims: number of space dimensions.
     """
     if name == "pedpy":
@@ -93,24 +94,23 @@ def write_trajectories(
 
 
 def write_pedpy(folder: Path, sequences: Iterable[Sequence]) -> list[Path]:
-    """Text as PedPy and the Jülich archive have it, one file per sequence, in m.
+    """Write text in the format of PedPy and the Jülich archive, one file per sequence, in m.
 
-    Lines hold ``id frame x y z`` with z = 0; frames count sampling intervals, the first one is
-    the sequence's start. Identifiers that are no whole numbers, or are not there, are counted
-    from 1 in the order of the sequence, and listed in the file's head. Walls are not part of
-    this format.
+    Lines contain ``id frame x y z`` with z = 0. Frames count sampling intervals from the start of
+    the recording. Identifiers that are missing or not whole numbers are replaced by numbers from 1
+    in the order of the sequence, which the file's head lists. The format has no walls.
 
     Raises:
-        DataError: a sequence of traffic, which has no second coordinate, or of one sample.
+        DataError: a sequence has one coordinate, as in traffic, or one sample.
     """
     return [_pedpy_file(folder / f"{name}.txt", s) for name, s in _named(sequences)]
 
 
 def write_fcd(path: Path, sequences: Iterable[Sequence]) -> Path:
-    """Vehicles as ``sumo --fcd-output`` writes them, XML in gzip, in s, m and m/s.
+    """Write vehicles as ``sumo --fcd-output`` does, XML in gzip, in s, m and m/s.
 
-    Every sequence is a lane of its own, called after it, so that those of one time do not mix;
-    vehicles are called ``LANE.AGENT``. Speeds are there where a sequence has them.
+    Every sequence is a separate lane with its name, and vehicles have the names ``LANE.AGENT``.
+    Speeds are written if a sequence has them.
 
     Source: SUMO's documentation, FCDOutput.
     """
@@ -128,7 +128,7 @@ def write_fcd(path: Path, sequences: Iterable[Sequence]) -> Path:
     with (
         replacing(path) as temporary,
         temporary.open("wb") as raw,
-        # without a file's name and a time within: the same vehicles give the same bytes
+        # without file name and time in the header, for reproducible bytes
         gzip.GzipFile("", "wb", fileobj=raw, mtime=0) as file,
     ):
         file.write(b'<?xml version="1.0" encoding="UTF-8"?>\n<fcd-export>\n')
@@ -140,17 +140,17 @@ def write_fcd(path: Path, sequences: Iterable[Sequence]) -> Path:
 
 
 def _vehicles(s: Sequence, k: int, heads: list[str]) -> Iterator[str]:
-    """Elements of the sequence's vehicles at its k-th time."""
+    """XML elements of the sequence's vehicles at its k-th time."""
     speeds = [""] * s.n_agents if s.v is None else [f' speed="{v}"' for v in s.v[k, :, 0].tolist()]
     for head, x, speed in zip(heads, s.x[k, :, 0].tolist(), speeds, strict=True):
         yield f'<vehicle {head} pos="{x}"{speed}/>'
 
 
 def write_table(path: Path, sequences: Iterable[Sequence], dims: int) -> Path:
-    """The tidy table that ``data=table`` reads, with velocities where there are such.
+    """Write the tidy table that ``data=table`` reads, with velocities if there are any.
 
     Args:
-        path: of the table, ``.csv`` or else Parquet.
+        path: path of the table, ``.csv`` or else Parquet.
         sequences: one row per sequence, time and agent.
         dims: number of space dimensions.
     """
@@ -165,7 +165,7 @@ def write_table(path: Path, sequences: Iterable[Sequence], dims: int) -> Path:
 
 
 def _safe(table: pa.Table) -> pa.Table:
-    """The table with texts that a spreadsheet does not take for formulas."""
+    """The table with escaped texts that a spreadsheet would read as formulas."""
     for i, field in enumerate(table.schema):
         if pa.types.is_string(field.type) and table[i].null_count < table.num_rows:
             cells = pa.array(map(csv_safe, table[i].to_pylist()), field.type)
@@ -174,10 +174,10 @@ def _safe(table: pa.Table) -> pa.Table:
 
 
 def write_walls(path: Path, sequences: Iterable[Sequence]) -> tuple[Path | None, int]:
-    """The walls that go with such a table, where all sequences have the same ones.
+    """Write the walls for such a table, if all sequences have the same walls.
 
     Returns:
-        The path, None where nothing is written, and the number of distinct sets.
+        The path, or None if nothing is written; and the number of distinct sets of walls.
     """
     distinct = {None if s.walls is None else s.walls.tobytes(): s.walls for s in sequences}
     (walls, *others) = distinct.values()
@@ -187,7 +187,7 @@ def write_walls(path: Path, sequences: Iterable[Sequence]) -> tuple[Path | None,
 
 
 def _directed(s: Sequence) -> Sequence:
-    """The sequence with destinations spelled out; a table's column is filled or absent."""
+    """The sequence with explicit destinations, since a table's column is complete or absent."""
     return s if s.destination is not None else replace(s, destination=s.x[-1])
 
 
@@ -203,11 +203,11 @@ def _groups(sequences: Iterable[Sequence], size: int) -> Iterator[list[Sequence]
 
 
 def _named(sequences: Iterable[Sequence]) -> Iterator[tuple[str, Sequence]]:
-    """Sequences with names that files, and SUMO's lanes, can have; none comes twice."""
+    """Sequences with unique names that are valid for files and SUMO's lanes."""
     taken: set[str] = set()
     for s in sequences:
         name = "".join(sign if sign.isalnum() or sign in "-_.+~" else "_" for sign in s.name)
-        while name in taken:  # names may differ in such signs alone
+        while name in taken:  # replaced characters may cause clashes
             name += "_"
         taken.add(name)
         yield name, s
@@ -225,7 +225,7 @@ def _pedpy_file(path: Path, s: Sequence) -> Path:
     numbered = len(numbers) == s.n_agents and len(set(numbers)) == len(numbers)
     ids = numbers if numbered else list(range(1, s.n_agents + 1))
     first = round(float(s.time[0]) / s.dt)
-    # PedPy looks for the rate and for "x/cm" in every such line: the rate stands first
+    # PedPy searches every line of the head for the rate and for "x/cm", so the rate comes first
     head = [f"# framerate: {_rate(s.dt)}", f"# {_word(s.name)}, from {s.time[0]:.9g} s on"]
     if not numbered and s.agents:
         head += [f"# {i} is {_word(name)}" for i, name in zip(ids, s.agents, strict=True)]

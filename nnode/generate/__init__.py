@@ -1,1 +1,1 @@
-"""Sampled motion: a calibrated model with noise, and drivers drawn at random, and its scores."""
+"""Motion sampled from a calibrated model with noise and random drivers, and its scores."""

@@ -1,10 +1,10 @@
-"""Size and time of the noise, from how far vehicles and people come away from a model without it.
+"""Estimation of the noise by the method of simulated moments (McFadden 1989).
 
-The residual of a vehicle, or of a component of a person's place, is its measured minus its
-simulated place. Its mean square, those of its changes over several times, and of the changes of
-these over the shorter ones, are compared with those of sampled motion minus the motion without
-noise: the method of simulated moments (McFadden 1989). All are averages over all samples of all
-clusters; intervals come from clusters drawn with replacement.
+The residual of a vehicle, or of a component of a person's position, is the measured minus the
+simulated position. The moments are the mean squares of the residual, of its changes over several
+times, and of its second differences over the shorter ones. They are compared with those of sampled
+motion minus the motion without noise. All are averages over the samples of all clusters, and
+intervals come from a bootstrap of clusters.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from nnode.calibrate.resampling import group_weights
 from nnode.data.paths import noise_variance
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
-from nnode.generate.noise import Noise, sample, sample_each, takes_drivers
+from nnode.generate.noise import Noise, allows_driver_differences, sample, sample_each
 from nnode.model import System
 
-#: s; times of the noise at which motion is sampled, between which moments are interpolated.
+#: Correlation times of the noise at which motion is sampled, s. Moments are interpolated between.
 TIMES = np.geomspace(0.25, 128.0, 8)
-#: Samples per sequence of each.
+#: Samples per sequence for each correlation time.
 SAMPLES = 2
-#: Pushes of the first round, m/s and m/s²; the second one has those that the first one found.
+#: Order to the size of the noise in the first round, m/s and m/s². The second round uses the
+#: estimate of the first.
 _FIRST = {1: 0.5, 2: 0.2}
-#: Spread of the drivers in the first round; and the least and largest one that is sampled.
+#: Spread of the drivers in the first round; and the smallest and largest sampled spread.
 _SPREAD, _SPREADS = 0.15, (0.05, 0.4)
 _WHO = {"traffic": "followers", "crowd": "people"}
-#: Draws of the clusters.
+#: Number of bootstrap draws of the clusters.
 DRAWS = 200
-#: Number of times over which changes are looked at, from the shortest to a third of the longest
-#: sequence.
+#: Number of lags, from the shortest to a third of the longest sequence.
 _LAGS = 8
-#: s; the shortest: what people do against the pushes of others lasts half a second.
+#: Shortest lag, s. Reactions of people to others last half a second.
 _SHORTEST = {"traffic": 1.0, "crowd": 0.25}
-#: Of these the shorter ones, over which changes of changes are looked at.
+#: Number of the shorter lags, which are also used for second differences.
 _SHORT = 4
 
 
@@ -50,13 +50,12 @@ class FittedNoise:
     """Noise with 95 % intervals.
 
     Attributes:
-        noise: size, time and measurement error.
-        sigma, tau, drivers: 95 % intervals, clusters resampled; of at least two clusters, else
-            None.
-        clusters: their number.
-        lags: s; over them changes of the residual were compared.
-        measured, modelled: m², mean squares of these changes, of changes of changes over the
-            first lags, and of the residual itself.
+        noise: size, correlation time and measurement error.
+        sigma, tau, drivers: 95 % intervals by a bootstrap of clusters; None for one cluster.
+        clusters: number of clusters.
+        lags: lags of the compared changes of the residual, s.
+        measured, modelled: m², mean squares of these changes, of second differences over the first
+            lags, and of the residual.
     """
 
     noise: Noise
@@ -71,15 +70,15 @@ class FittedNoise:
 
 @dataclass
 class _Sums:
-    """Sums of squares and numbers of samples per cluster, ``(G, M)`` each, of M moments."""
+    """Sums of squares and numbers of samples of M moments per cluster, ``(G, M)`` each."""
 
     squares: np.ndarray
     number: np.ndarray
 
     def mean(self, weight: np.ndarray) -> np.ndarray:
-        """``(M,)`` m², clusters weighted."""
-        found: np.ndarray = weight @ self.squares / (weight @ self.number)
-        return found
+        """``(M,)`` moments, m², with weights of clusters."""
+        mean: np.ndarray = weight @ self.squares / (weight @ self.number)
+        return mean
 
 
 def fit_noise(
@@ -91,55 +90,60 @@ def fit_noise(
     dt: float | None = None,
     method: str | None = None,
 ) -> FittedNoise:
-    """The noise with which sampled motion comes as far away from the model as measured motion.
+    """The noise for which sampled motion deviates from the model as much as measured motion.
 
     Args:
-        system: of :func:`nnode.generate.noise.free`.
-        batches: of sequences that the model was calibrated to.
+        system: model of :func:`nnode.generate.noise.free_running`.
+        batches: batches of sequences of the model's calibration.
         label: ``(S,)`` cluster of each sequence, in the order of the batches.
-        seed: of what is sampled and resampled.
-        dt, method: of the steps, see :func:`nnode.generate.noise.sample`.
+        seed: seed of samples and bootstrap.
+        dt, method: steps, see :func:`nnode.generate.noise.sample`.
 
     Raises:
-        DataError: sequences too short to see changes, or no follower in them.
+        DataError: the sequences are too short, or have no followers.
     """
     options: dict[str, Any] = {"dt": dt, "method": method}
     sampling, longest = batches[0].dt, max(batch.n_samples for batch in batches)
     lags = lags_of(sampling, longest, _SHORTEST[system.domain])
     _, label = np.unique(label, return_inverse=True)
     groups = np.split(label, np.cumsum([len(batch) for batch in batches])[:-1])
-    plain = [sample(system, batch, Noise(0.0, 1.0), 1, seed=seed, **options).x for batch in batches]
+    without_noise = [
+        sample(system, batch, Noise(0.0, 1.0), 1, seed=seed, **options).x for batch in batches
+    ]
     error = _measurement(batches)
     number = int(label.max()) + 1
     measured = _sums(
-        [batch.x - x for batch, x in zip(batches, plain, strict=True)],
+        [batch.x - x for batch, x in zip(batches, without_noise, strict=True)],
         batches,
         groups,
         lags,
         number,
     )
     if not (measured.number.sum(0) > 0).all():
-        least = 3 * _SHORTEST[system.domain]
+        shortest = 3 * _SHORTEST[system.domain]
         raise DataError(
-            f"the noise needs {_WHO[system.domain]} that are measured for more than {least:g} s"
+            f"the noise needs {_WHO[system.domain]} that are measured for more than {shortest:g} s"
         )
 
     def sampled(*noises: Noise) -> list[_Sums]:
         parts = [
             [
-                found.x - x.repeat(1, SAMPLES, 1, 1)
-                for found in sample_each(
+                trajectory.x - x.repeat(1, SAMPLES, 1, 1)
+                for trajectory in sample_each(
                     system, batch, list(noises), SAMPLES, seed=(seed, i), **options
                 )
             ]
-            for i, (batch, x) in enumerate(zip(batches, plain, strict=True))
+            for i, (batch, x) in enumerate(zip(batches, without_noise, strict=True))
         ]
         return [
             _sums(list(each), batches, groups, lags, number) for each in zip(*parts, strict=True)
         ]
 
-    every = np.ones(number)
-    sigma, spread = _FIRST[system.order], _SPREAD if takes_drivers(system, batches[0]) else 0.0
+    equal_weights = np.ones(number)
+    sigma, spread = (
+        _FIRST[system.order],
+        _SPREAD if allows_driver_differences(system, batches[0]) else 0.0,
+    )
     starts = TIMES[1:-1:2]
     for _ in range(2):
         search = _Search(
@@ -150,7 +154,7 @@ def fit_noise(
             spread,
             _white(len(lags), error),
         )
-        sigma, tau, drivers, modelled = search(every, starts)
+        sigma, tau, drivers, modelled = search(equal_weights, starts)
         spread = float(np.clip(drivers, *_SPREADS)) if spread else 0.0
     fitted = FittedNoise(
         Noise(sigma, tau, error, drivers),
@@ -159,7 +163,7 @@ def fit_noise(
         None,
         number,
         [lag * sampling for lag in lags],
-        measured.mean(every).tolist(),
+        measured.mean(equal_weights).tolist(),
         modelled.tolist(),
     )
     if number < 2:
@@ -167,17 +171,19 @@ def fit_noise(
     weights = number * group_weights(np.arange(number), DRAWS, np.random.default_rng(seed))
     draws = np.array([search(weight, np.array([tau]))[:3] for weight in weights])
     ends = np.quantile(draws, [0.025, 0.975], axis=0).T.tolist()
-    own_sigma, own_tau, own_drivers = ((low, high) for low, high in ends)
-    return replace(fitted, sigma=own_sigma, tau=own_tau, drivers=own_drivers if spread else None)
+    sigma_interval, tau_interval, drivers_interval = ((low, high) for low, high in ends)
+    return replace(
+        fitted, sigma=sigma_interval, tau=tau_interval, drivers=drivers_interval if spread else None
+    )
 
 
 def lags_of(sampling: float, samples: int, shortest: float) -> list[int]:
-    """Numbers of samples over which changes are looked at.
+    """The lags of changes, in samples.
 
     Args:
-        sampling: interval, s.
-        samples: of the longest sequence.
-        shortest: time to begin with, s.
+        sampling: sampling interval, s.
+        samples: number of samples of the longest sequence.
+        shortest: shortest lag, s.
 
     Raises:
         DataError: sequences are too short.
@@ -192,14 +198,14 @@ def lags_of(sampling: float, samples: int, shortest: float) -> list[int]:
 
 
 def _measurement(batches: list[Batch]) -> float:
-    """Variance of the measurement error, m², of a component of everybody's places."""
+    """Variance of the measurement error of a component of positions, m²."""
     parts = [
         noise_variance(batch.x[batch.valid[:, b, i], b, i].numpy())
         for batch in batches
         for b, i in batch.agent.nonzero().tolist()
     ]
-    known = [part for part in parts if np.isfinite(part)]
-    return float(np.mean(known)) if known else 0.0
+    finite = [part for part in parts if np.isfinite(part)]
+    return float(np.mean(finite)) if finite else 0.0
 
 
 def _sums(
@@ -215,11 +221,11 @@ def _sums(
     for e, batch, group in zip(residuals, batches, groups, strict=True):
         copies = e.shape[1] // len(batch)
         follower = batch.valid.clone()
-        if e.shape[-1] == 1:  # who leads is as measured
+        if e.shape[-1] == 1:  # leaders follow their measured paths
             follower[:, torch.arange(len(batch)), batch.agent.sum(1) - 1] = False
         valid = follower.repeat(1, copies, 1)[..., None].expand(-1, -1, -1, e.shape[-1])
-        own = np.tile(group, copies)
-        # of short batches nothing is left
+        cluster = np.tile(group, copies)
+        # short batches give empty parts
         parts = [(e[lag:] - e[: max(len(e) - lag, 0)], valid[lag:]) for lag in lags]
         for lag in short:
             bend = e[2 * lag :] - 2 * e[lag:][: max(len(e) - 2 * lag, 0)]
@@ -227,28 +233,29 @@ def _sums(
         parts.append((e[1:], valid[1:]))
         for j, (change, real) in enumerate(parts):
             total = torch.where(real, change.square(), 0.0).sum((0, 2, 3)).numpy()
-            squares[:, j] += np.bincount(own, total, number)
-            count[:, j] += np.bincount(own, real.sum((0, 2, 3)).numpy(), number)
+            squares[:, j] += np.bincount(cluster, total, number)
+            count[:, j] += np.bincount(cluster, real.sum((0, 2, 3)).numpy(), number)
     return _Sums(squares, count)
 
 
 def _white(lags: int, error: float) -> np.ndarray:
-    """``(M,)`` m², what an error of measurement of variance ``error`` adds to the moments."""
-    # the start is taken as measured
+    """``(M,)`` moments, m², of a white measurement error with the variance ``error``."""
+    # simulations start at measured positions, whose error is not added
     return error * np.array([2.0] * lags + [6.0] * min(_SHORT, lags) + [1.0])
 
 
 @dataclass
 class _Search:
-    """The least distance of moments, of their logarithms: none counts more than another.
+    """Least-squares fit of the logarithms of moments.
 
-    Pushes and drivers are independent, and their moments proportional to their squares.
+    Noise and driver differences are independent, and their moments are proportional to their
+    variances.
 
     Attributes:
-        measured: moments.
-        pushes: those of pushes of size ``unit``, by time.
-        drivers: those of drivers of spread ``spread``; None: all are alike.
-        white: ``(M,)`` m², of the measurement.
+        measured: measured moments.
+        pushes: moments of noise of size ``unit``, by correlation time.
+        drivers: moments of drivers with the spread ``spread``; None if all drivers are equal.
+        white: ``(M,)`` moments of the measurement error, m².
     """
 
     measured: _Sums
@@ -261,22 +268,22 @@ class _Search:
     def __call__(
         self, weight: np.ndarray, starts: np.ndarray
     ) -> tuple[float, float, float, np.ndarray]:
-        """Size, time, spread, and the moments ``(M,)`` m² that they make.
+        """Size, correlation time, spread, and their moments ``(M,)``, m².
 
         Args:
-            weight: ``(G,)`` of clusters.
-            starts: times, s, that the search begins from: it may have more than one valley.
+            weight: ``(G,)`` weights of clusters.
+            starts: start values of the correlation time, s, since there may be several minima.
         """
         goal = np.log(np.maximum(self.measured.mean(weight), 1e-12))
         pushes = np.array([sums.mean(weight) for sums in self.pushes]) / self.unit**2
-        at = PchipInterpolator(np.log(TIMES), np.log(pushes))
-        rise = at.derivative()
-        others = 0.0 * goal
+        log_push = PchipInterpolator(np.log(TIMES), np.log(pushes))
+        slope = log_push.derivative()
+        driver_moments = 0.0 * goal
         if self.drivers is not None:
-            others = self.drivers.mean(weight) / self.spread**2
+            driver_moments = self.drivers.mean(weight) / self.spread**2
 
         def parts(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return np.exp(2 * p[0] + at(p[1])), np.exp(2 * p[2]) * others
+            return np.exp(2 * p[0] + log_push(p[1])), np.exp(2 * p[2]) * driver_moments
 
         def moments(p: np.ndarray) -> np.ndarray:
             pushed, driven = parts(p)
@@ -284,21 +291,21 @@ class _Search:
 
         def slopes(p: np.ndarray) -> np.ndarray:
             pushed, driven = parts(p)
-            columns = [2 * pushed, rise(p[1]) * pushed, 2 * driven]
+            columns = [2 * pushed, slope(p[1]) * pushed, 2 * driven]
             return np.stack(columns, -1) / (pushed + self.white + driven)[:, None]
 
         low, high = np.log(TIMES[[0, -1]])
         best = None
         for start in np.clip(np.log(starts), low + 1e-6, high - 1e-6):
-            size = 0.5 * float(np.mean(goal - at(start)))
-            found = least_squares(
+            size = 0.5 * float(np.mean(goal - log_push(start)))
+            fit = least_squares(
                 lambda p: np.log(moments(p)) - goal,
                 [size, start, np.log(0.05)],
                 slopes,
                 x_scale="jac",
                 bounds=([-20.0, low, -20.0], [20.0, high, 0.0]),
             )
-            best = found if best is None or found.cost < best.cost else best
+            best = fit if best is None or fit.cost < best.cost else best
         assert best is not None
         sigma, tau, drivers = np.exp(best.x).tolist()
         return sigma, tau, drivers if self.spread else 0.0, moments(best.x)

@@ -15,7 +15,7 @@ from torchdiffeq import odeint
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.exchange.drivers import drawn
-from nnode.generate.people import sample_people, takes_paces
+from nnode.generate.people import depends_on_preferred_speed, sample_people
 from nnode.model import Crowd, Traffic
 from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.crowd import GaitSway
@@ -32,19 +32,19 @@ from nnode.simulation.ode import Rates, whole_steps
 
 @dataclass(frozen=True)
 class Noise:
-    """What drivers and people do beside their law, and what measurements add.
+    """Noise of drivers and people, and of measurements.
 
-    In samples a step dt apart the push is autoregressive of first order with the factor
-    exp(-dt/tau), in any step.
+    Sampled at steps dt, the noise of a driver is an autoregressive process of first order with the
+    factor exp(-dt/tau).
 
     Attributes:
-        sigma: standard deviation of the push, m/s (first order) or m/s² (second order); of people
-            that of each of its two components.
-        tau: its correlation time, s.
+        sigma: standard deviation of the noise, m/s (first order) or m/s² (second order); for
+            people of each of two components.
+        tau: correlation time of the noise, s.
         measurement: variance of the white error of measured positions, m², of each component.
-        drivers: standard deviation of the pace (first order) or time gap (second order) among
-            drivers, as a share; of models without ``driver_heterogeneity``. Of people, that of
-            their preferred speed from what was taken for it.
+        drivers: relative standard deviation of the pace (first order) or time gap (second order)
+            between drivers, for models without ``driver_heterogeneity``; for people of the
+            preferred speed.
     """
 
     sigma: float
@@ -58,16 +58,16 @@ class Noise:
 
 
 class Push(Term):
-    """A state of each vehicle that is added to what the law and all effects say.
+    """The noise of each vehicle, a state that is added to the rate by the law and all effects.
 
-    By itself it stays; :func:`sample` lets it decay and kicks it after each step. A push stops a
-    vehicle, it does not make it drive backwards.
+    The state is constant by its formula. :func:`sample` updates it after each step. The noise may
+    stop a vehicle, but vehicles do not drive backwards.
     """
 
     name = "noise"
     rules: ClassVar[dict[int, Rule]] = {
         1: Rule(rate="max(W + push, min(W, 0*W))", states={"push": ("m/s", "0*push/tau", "0*W")}),
-        # whoever stands stays: steps end at a speed of 0 at the least
+        # the method of stepping keeps speeds at least 0
         2: Rule(rate="W + push", states={"push": ("m/s^2", "0*push/tau", "0*W")}),
     }
     source = "Uhlenbeck & Ornstein 1930; in car following: Treiber, Kesting & Helbing 2006"
@@ -81,19 +81,19 @@ class Push(Term):
 
 
 def constant_speed(domain: str = "traffic") -> System:
-    """Baseline: every follower, or everybody, keeps the first measured speed."""
+    """Baseline: every follower, or every person, keeps the first measured speed."""
     if domain == "crowd":
         return Crowd([])
     law = law_from("constant_speed", {"parameters": {"change": "0 m/s^2"}, "rate": {"v": "change"}})
     return Traffic([law], leader="measured")
 
 
-def takes_drivers(system: System, batch: Batch) -> bool:
-    """Whether drivers or people may differ, and the model does not say how already."""
+def allows_driver_differences(system: System, batch: Batch) -> bool:
+    """Whether the model allows differences between drivers or people, and has none yet."""
     if any(isinstance(term, IndividualEffect) for term in system.terms):
         return False
     if isinstance(system, Crowd):
-        return takes_paces(system, batch)
+        return depends_on_preferred_speed(system, batch)
     assert isinstance(system, Traffic)
     trial = copy.deepcopy(system)
     trial.terms.append(DriverHeterogeneity())
@@ -103,14 +103,14 @@ def takes_drivers(system: System, batch: Batch) -> bool:
         return False
 
 
-def free(system: System) -> System:
-    """A copy of a model in which all move but the first vehicle, which drives as measured."""
-    found = copy.deepcopy(system).double()
-    if isinstance(found, Traffic):
-        found.leader = "measured"
-    if isinstance(found, Crowd):
-        found.neighbours = "simulated"
-    return found
+def free_running(system: System) -> System:
+    """A copy of a model in which all agents are simulated, except the measured first vehicle."""
+    model = copy.deepcopy(system).double()
+    if isinstance(model, Traffic):
+        model.leader = "measured"
+    if isinstance(model, Crowd):
+        model.neighbours = "simulated"
+    return model
 
 
 @torch.no_grad()
@@ -124,29 +124,29 @@ def sample(
     dt: float | None = None,
     method: str | None = None,
 ) -> Trajectory:
-    """Sampled motion from the measured start, each vehicle and everybody with an own push.
+    """Sampled motion from the measured start, with independent noise for each agent.
 
-    The push starts in its stationary distribution. Drivers who differ (``driver_heterogeneity``)
-    get numbers drawn from their distribution where the model knows none of them, and so do people
-    (``walker_heterogeneity``).
+    The noise starts in its stationary distribution. Numbers of drivers (``driver_heterogeneity``)
+    and people (``walker_heterogeneity``) that the model does not know are drawn from their
+    distribution.
 
     Args:
-        system: of :func:`free`.
+        system: model of :func:`free_running`.
         batch: B sequences.
-        noise: its measurement error is not added: places are those of the vehicles.
-        samples: S.
-        seed: of all that is drawn; batches that are to be independent need different ones.
-        dt: step, s; None: the default of the model.
-        method: of stepping, ``semi_implicit``, ``ballistic`` or ``rk4``; others are the model's
-            own. The push stays the same during a step, also between the stages of ``rk4``:
-            without noise the motion is that of the solver.
+        noise: the noise; its measurement error is not added.
+        samples: S, the number of samples.
+        seed: seed of all random numbers; independent batches need different seeds.
+        dt: step, s; None takes the model's default.
+        method: method of stepping, ``semi_implicit``, ``ballistic`` or ``rk4``; for others, the
+            model's method. The noise is constant during a step, also between the stages of
+            ``rk4``, so that the motion without noise is that of the solver.
 
     Returns:
         ``(K, S * B, N, D)``, sample by sample.
 
     Raises:
-        SimulationError: no finite number.
-        ConfigError: a step that does not divide the sampling interval.
+        SimulationError: a state is not finite.
+        ConfigError: the step does not divide the sampling interval.
     """
     return sample_each(system, batch, [noise], samples, seed=seed, dt=dt, method=method)[0]
 
@@ -162,39 +162,38 @@ def sample_each(
     dt: float | None = None,
     method: str | None = None,
 ) -> list[Trajectory]:
-    """What :func:`sample` gives of each of several noises, from the same random numbers.
+    """The results of :func:`sample` for several noises, with the same random numbers.
 
-    Vehicles of all noises are simulated side by side where nothing but size and time of the push
-    differs between them.
+    Vehicles are simulated at once for all noises if these only differ in size and correlation time.
     """
     alike = len({noise.drivers for noise in noises}) == 1
     drawn_each = any(isinstance(term, IndividualEffect) for term in system.terms)
     if len(noises) > 1 and (isinstance(system, Crowd) or not alike or drawn_each):
         options: dict[str, Any] = {"seed": seed, "dt": dt, "method": method}
-        return [sample_each(system, batch, [one], samples, **options)[0] for one in noises]
+        return [sample_each(system, batch, [noise], samples, **options)[0] for noise in noises]
     rng = np.random.default_rng(seed)
     copies = samples * len(noises)
-    many = batch.select([b for _ in range(copies) for b in range(len(batch))])
-    many = replace(many, names=numbered(batch.names, copies))
+    repeated = batch.select([b for _ in range(copies) for b in range(len(batch))])
+    repeated = replace(repeated, names=numbered(batch.names, copies))
     if isinstance(system, Crowd):
         moving = copy.deepcopy(system)
-        _give_drivers(moving, many, batch.names, rng)
+        _assign_drivers(moving, repeated, batch.names, rng)
         (noise,) = noises
-        own = (noise.sigma, noise.tau, noise.drivers)
-        return [sample_people(moving, many, own, rng, dt)]
+        parameters = (noise.sigma, noise.tau, noise.drivers)
+        return [sample_people(moving, repeated, parameters, rng, dt)]
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     n = substeps(batch.dt, dt, system)
     step = batch.dt / n
     noisy = copy.deepcopy(system)
     if noises[0].drivers:
         noisy.terms.append(DriverHeterogeneity(sigma=noises[0].drivers))
-    _give_drivers(noisy, many, batch.names, rng)
+    _assign_drivers(noisy, repeated, batch.names, rng)
     noisy.terms.append(Push())
     if method not in ("semi_implicit", "ballistic", "rk4"):
         method = noisy.step
-    rates = Rates(noisy, many, n, method)
-    y = noisy.initial(many, step)
-    # of each sampled sequence
+    rates = Rates(noisy, repeated, n, method)
+    y = noisy.initial(repeated, step)
+    # values for each sampled sequence
     sigma, kept = (
         torch.tensor(values, dtype=y.dtype).repeat_interleave(samples * len(batch))[:, None]
         for values in ([o.sigma for o in noises], [math.exp(-step / o.tau) for o in noises])
@@ -207,25 +206,25 @@ def sample_each(
 
     y[..., -1] = sigma * normal()
 
-    still = torch.ones_like(y[0, 0])
-    still[-1] = 0.0
+    state_mask = torch.ones_like(y[0, 0])
+    state_mask[-1] = 0.0
 
     def change(step: Tensor, y: Tensor) -> Tensor:
-        found: Tensor = rates(step, y)
+        rate: Tensor = rates(step, y)
         if STAGES[method] == "rk4":
-            second = rates(step + 0.5, y + still * found / 2)
-            third = rates(step + 0.5, y + still * second / 2)
-            last = rates(step + 1, y + still * third)
-            found = found + still * ((found + 2 * second + 2 * third + last) / 6 - found)
-        # exact for an autoregressive process
-        found[..., -1] = (kept - 1) * y[..., -1] + kick * normal()
-        return found
+            second = rates(step + 0.5, y + state_mask * rate / 2)
+            third = rates(step + 0.5, y + state_mask * second / 2)
+            last = rates(step + 1, y + state_mask * third)
+            rate = rate + state_mask * ((rate + 2 * second + 2 * third + last) / 6 - rate)
+        # the exact step of the autoregressive process
+        rate[..., -1] = (kept - 1) * y[..., -1] + kick * normal()
+        return rate
 
     times = n * torch.arange(batch.n_samples, dtype=y.dtype)
     grid = {"grid_constructor": whole_steps}
     states = odeint(change, y, times, method="euler", options=grid)
-    x, v = noisy.observe(states, many)
-    check_finite(Trajectory(x, v), many)
+    x, v = noisy.observe(states, repeated)
+    check_finite(Trajectory(x, v), repeated)
     each = samples * len(batch)
     parts = zip(
         x.split(each, 1), [None] * len(noises) if v is None else v.split(each, 1), strict=True
@@ -238,19 +237,19 @@ def numbered(names: tuple[str, ...], samples: int) -> tuple[str, ...]:
     return tuple(f"{name}~{s + 1}" for s in range(samples) for name in names)
 
 
-def _give_drivers(
-    system: System, many: Batch, names: tuple[str, ...], rng: np.random.Generator
+def _assign_drivers(
+    system: System, repeated: Batch, names: tuple[str, ...], rng: np.random.Generator
 ) -> None:
-    """Give everybody a number, in effects that differ by driver or person.
+    """Assign numbers to all agents in effects that differ between agents.
 
-    Gait is known or not: nobody's is drawn.
+    Unknown numbers are drawn, except phases of the gait.
     """
     for term in system.terms:
         if isinstance(term, IndividualEffect):
             people = {}
-            for i, name in enumerate(many.names):
-                own = term.people.get(names[i % len(names)])
-                if own is None and isinstance(term, GaitSway):
+            for i, name in enumerate(repeated.names):
+                numbers = term.people.get(names[i % len(names)])
+                if numbers is None and isinstance(term, GaitSway):
                     continue
-                people[name] = own or drawn(term, [()] * many.agent.shape[1], rng).tolist()
+                people[name] = numbers or drawn(term, [()] * repeated.agent.shape[1], rng).tolist()
             term.people = people

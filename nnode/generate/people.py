@@ -1,4 +1,4 @@
-"""The noise of people: an Ornstein-Uhlenbeck process of two components, and who differ in pace."""
+"""The noise of people: an Ornstein-Uhlenbeck process of two components, and preferred speeds."""
 
 from __future__ import annotations
 
@@ -16,15 +16,18 @@ from nnode.model.system import Crowd
 from nnode.simulation.base import Trajectory, check_finite, substeps
 from nnode.simulation.ode import Rates, whole_steps
 
-#: The least preferred speed that is drawn, of the measured one.
+#: Smallest random factor on a measured preferred speed.
 SLOWEST = 0.1
 
 
-def takes_paces(system: Crowd, batch: Batch) -> bool:
-    """Whether a model asks for preferred speeds: with others, it says other rates."""
+def depends_on_preferred_speed(system: Crowd, batch: Batch) -> bool:
+    """Whether the rates of a model depend on preferred speeds."""
     scene = system.scene(batch)
     y = system.initial(batch)
-    rates = [system(torch.zeros(()), y, one) for one in (scene, _paced(scene, torch.tensor(1.1)))]
+    rates = [
+        system(torch.zeros(()), y, each_scene)
+        for each_scene in (scene, _with_speed_factor(scene, torch.tensor(1.1)))
+    ]
     return not torch.equal(*rates)
 
 
@@ -38,9 +41,9 @@ def sample_people(
     """Sampled motion of people in Euler's steps, see :func:`nnode.generate.noise.sample`.
 
     Args:
-        batch: every sequence so often as it is sampled.
-        noise: sigma (m/s or m/s², of each component), tau (s), spread of the paces.
-        rng: of all that is drawn.
+        batch: the sequences, repeated for every sample.
+        noise: sigma (m/s or m/s², of each component), tau (s), spread of preferred speeds.
+        rng: source of all random numbers.
         dt: step, s.
     """
     sigma, tau, spread = noise
@@ -51,9 +54,11 @@ def sample_people(
     kick = sigma * math.sqrt(1 - kept**2)
     rates = Rates(system, batch, n, system.step)
     if spread:
-        own = 1 + spread * rng.normal(size=(*batch.agent.shape, 1))
-        # after the directions of the streams are known: these are the measured ones
-        rates.scene = _paced(rates.scene, torch.from_numpy(np.maximum(own, SLOWEST)))
+        factors = 1 + spread * rng.normal(size=(*batch.agent.shape, 1))
+        # the directions of streams are already computed from the measured preferred speeds
+        rates.scene = _with_speed_factor(
+            rates.scene, torch.from_numpy(np.maximum(factors, SLOWEST))
+        )
     y = system.initial(batch, step)
     width, driven = y.shape[-1], slice(2 * (system.order - 1), 2 * system.order)
     real = batch.agent[..., None].to(y.dtype)
@@ -62,9 +67,9 @@ def sample_people(
         return real * torch.randn(*y.shape[:2], 2, generator=generator, dtype=y.dtype)
 
     def change(k: Tensor, state: Tensor) -> Tensor:
-        found, push = rates(k, state[..., :width]), state[..., width:]
-        found[..., driven] += rates.until_the_end(k, step * push)
-        return torch.cat([found, (kept - 1) * push + kick * normal()], -1)
+        rate, push = rates(k, state[..., :width]), state[..., width:]
+        rate[..., driven] += rates.until_the_end(k, step * push)
+        return torch.cat([rate, (kept - 1) * push + kick * normal()], -1)
 
     times = n * torch.arange(batch.n_samples, dtype=y.dtype)
     begin = torch.cat([y, sigma * normal()], -1)
@@ -72,6 +77,6 @@ def sample_people(
     return check_finite(Trajectory(*system.observe(states[..., :width], batch)), batch)
 
 
-def _paced(scene: Scene, factor: Tensor) -> Scene:
-    """The scene with other preferred speeds."""
+def _with_speed_factor(scene: Scene, factor: Tensor) -> Scene:
+    """The scene with preferred speeds multiplied by a factor."""
     return replace(scene, preferred=factor * scene.preferred)

@@ -1,4 +1,4 @@
-"""Scores of sampled motion: the CRPS and what bands cover."""
+"""Scores of sampled motion: the CRPS and the coverage of bands."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 from nnode.calibrate.resampling import DRAWS, group_weights
 from nnode.errors import ConfigError
 
-#: Bands that are scored.
+#: Levels of the scored bands.
 BANDS = (0.5, 0.95)
-#: With so many samples the outer band ends at sampled values.
+#: Smallest number of samples for which the outer band ends at sampled values.
 LEAST = 39
 
 
 def crps(samples: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """``(...)`` continuous ranked probability score, in the samples' unit; less is better.
+    """``(...)`` continuous ranked probability score, in the samples' unit; lower is better.
 
-    E|X - y| - E|X - X'|/2, both estimated without bias from S samples, so that scores do not
-    depend on how many were drawn. Of samples that are all alike it is the absolute error.
+    It is the unbiased estimate of E|X - y| - E|X - X'|/2 from S samples, so its expectation does
+    not depend on S. For equal samples it is the absolute error.
 
     Args:
         samples: ``(S, ...)``, S at least 2.
-        value: ``(...)`` what was measured.
+        value: ``(...)`` measured values.
 
     Source: Gneiting & Raftery 2007, equation (21); without bias: Ferro 2014.
     """
@@ -40,8 +40,8 @@ def crps(samples: np.ndarray, value: np.ndarray) -> np.ndarray:
 def band(samples: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper end ``(...)`` of the central band of samples ``(S, ...)``.
 
-    From the (S + 1) p-th smallest to the largest: it covers one more sample of the same kind with
-    probability ``level``, whatever the distribution.
+    Its ends are the (S + 1) p-th smallest samples. It covers another sample of the distribution
+    with the probability ``level``, for any continuous distribution.
     """
     ends = [(1 - level) / 2, (1 + level) / 2]
     low, high = np.quantile(samples, ends, axis=0, method="weibull")
@@ -50,35 +50,35 @@ def band(samples: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over sequences with its 95 % interval, clusters resampled."""
+    """A mean over sequences with its 95 % interval by a bootstrap of clusters."""
 
     mean: float
     low: float | None
     high: float | None
 
 
-def mean_of(total: np.ndarray, number: np.ndarray, label: np.ndarray, seed: int = 0) -> Mean:
+def mean_of(total: np.ndarray, number: np.ndarray, label: np.ndarray) -> Mean:
     """The mean over all samples of several sequences.
 
     Args:
         total, number: ``(S,)`` sums over a sequence's samples, and their numbers.
-        label: ``(S,)`` clusters; with fewer than two there is no interval.
+        label: ``(S,)`` clusters; one cluster gives no interval.
     """
     mean = float(total.sum() / number.sum())
     _, label = np.unique(label, return_inverse=True)
     if label.max() < 1:
         return Mean(mean, None, None)
-    weights = group_weights(label, DRAWS, np.random.default_rng(seed))
+    weights = group_weights(label, DRAWS, np.random.default_rng(0))
     low, high = np.quantile((weights @ total) / (weights @ number), [0.025, 0.975])
     return Mean(mean, float(low), float(high))
 
 
-#: Times after the start, s, at which scores are shown.
+#: Times after the start, s, for scores by horizon.
 HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
 
 
 def nearest(x: np.ndarray) -> np.ndarray:
-    """``(K, N)`` distance of everybody's nearest other person, m; ``(K, 0)`` of a single person.
+    """``(K, N)`` distance to each person's nearest neighbour, m; ``(K, 0)`` for a single person.
 
     Args:
         x: ``(K, N, 2)`` m.
@@ -91,7 +91,7 @@ def nearest(x: np.ndarray) -> np.ndarray:
 
 
 class Scores:
-    """Scores of one way of sampling, gathered sequence by sequence.
+    """Scores of a sampled model, collected sequence by sequence.
 
     Args:
         dt: sampling interval, s.
@@ -106,30 +106,36 @@ class Scores:
         """Score one sequence.
 
         Args:
-            name: of the sequence.
-            samples: ``(S, K, N, D)`` m, of places. In a lane the last vehicle leads and is not
-                scored; of people each component is scored by itself, and in place of gaps how far
-                the nearest other person is.
-            measured: ``(K, N, D)`` m.
-            error: ``(S, K, N, D)`` m, of measurement, which is added to what is scored.
+            name: name of the sequence.
+            samples: ``(S, K, N, D)`` sampled positions, m. The last vehicle in a lane leads and is
+                not scored. For people each component is scored separately, and the distance to the
+                nearest person replaces the gap.
+            measured: ``(K, N, D)`` measured positions, m.
+            error: ``(S, K, N, D)`` measurement errors that are added to the samples, m.
         """
         self._names.append(name)
-        seen = samples + error
+        observed = samples + error
         if measured.shape[2] == 1:
-            seen, measured = seen[..., 0], measured[..., 0]
-            seen[:, :, -1] = measured[:, -1]
-            place, known = seen[:, 1:, :-1], measured[1:, :-1]
+            observed, measured = observed[..., 0], measured[..., 0]
+            observed[:, :, -1] = measured[:, -1]
+            place, measured_positions = observed[:, 1:, :-1], measured[1:, :-1]
             apart = "gap"
-            gap, known_gap = np.diff(seen[:, 1:], axis=2), np.diff(measured[1:], axis=1)
+            gap, measured_gap = np.diff(observed[:, 1:], axis=2), np.diff(measured[1:], axis=1)
         else:
-            place, known = seen[:, 1:], measured[1:]
+            place, measured_positions = observed[:, 1:], measured[1:]
             apart = "nearest"
-            gap, known_gap = np.stack([nearest(one) for one in place]), nearest(known)
-        scored = crps(place, known)
+            gap, measured_gap = (
+                np.stack([nearest(positions) for positions in place]),
+                nearest(measured_positions),
+            )
+        scored = crps(place, measured_positions)
         self._put("crps_position_m", scored)
-        self._put(f"crps_{apart}_m", crps(gap, known_gap))
+        self._put(f"crps_{apart}_m", crps(gap, measured_gap))
         for level in BANDS:
-            for what, drawn, value in (("position", place, known), (apart, gap, known_gap)):
+            for what, drawn, value in (
+                ("position", place, measured_positions),
+                (apart, gap, measured_gap),
+            ):
                 low, high = band(drawn, level)
                 inside = (low <= value) & (value <= high)
                 self._put(f"coverage_{what}_{100 * level:g}", inside)
@@ -137,22 +143,22 @@ class Scores:
                     self._at_horizons(f"coverage_{what}_{100 * level:g}", inside)
         self._at_horizons("crps_position_m", scored)
 
-    def sequence_means(self, what: str = "crps_position_m") -> np.ndarray:
-        """``(S,)`` means of sequences, in the order in which they were added."""
-        return np.array([total / number for total, number in self._parts[what]])
+    def sequence_means(self) -> np.ndarray:
+        """``(S,)`` CRPS of positions (m) by sequence, in the order of :meth:`add`."""
+        return np.array([total / number for total, number in self._parts["crps_position_m"]])
 
     def means(self, label: np.ndarray) -> dict[str, Mean]:
-        """Score to its mean over all samples; ``score@T`` is that T s after the start.
+        """Score to its mean over all samples; ``score@T`` is the score T s after the start.
 
         Args:
             label: ``(S,)`` clusters.
         """
-        found = {}
+        means = {}
         for name, parts in sorted(self._parts.items()):
             total, number = np.array(parts, float).T
             if number.sum():
-                found[name] = mean_of(total[number > 0], number[number > 0], label[number > 0])
-        return found
+                means[name] = mean_of(total[number > 0], number[number > 0], label[number > 0])
+        return means
 
     def _at_horizons(self, name: str, values: np.ndarray) -> None:
         for horizon in HORIZONS:

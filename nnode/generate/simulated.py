@@ -1,4 +1,4 @@
-"""Sampled motion of measured sequences with its scores, as an object."""
+"""Sampled motion of measured sequences and its scores as an object."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from nnode.generate.noise import Noise, numbered, sample
 from nnode.generate.scores import BANDS, Mean, Scores, band
 from nnode.model import System
 
-#: At most so many vehicles or people, samples counted, move at once.
+#: Largest number of agents, counted per sample, that are simulated at once.
 _AT_ONCE = 4000
-#: Sequences in the picture.
+#: Number of sequences in the figure.
 _SHOWN = 6
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way to move: a model, its noise, and ``dt`` and ``method`` of its steps."""
+class SampledModel:
+    """A model, its noise, and ``dt`` and ``method`` of its steps."""
 
     system: System
     noise: Noise
@@ -41,13 +41,13 @@ class Way:
 
 @dataclass(frozen=True)
 class Sampling:
-    """What is sampled.
+    """The sampled sequences.
 
     Attributes:
-        store: of sequences.
-        indices: of those that are sampled.
-        samples: S, of each.
-        seed: of all draws: the same ones come again.
+        store: store of sequences.
+        indices: indices of the sampled sequences.
+        samples: S, the number of samples of each sequence.
+        seed: seed of all random numbers; repeated calls give the same samples.
     """
 
     store: Source
@@ -56,35 +56,40 @@ class Sampling:
     seed: int
 
     def moved(
-        self, way: Way, indices: list[int] | None = None
+        self, sampled_model: SampledModel, indices: list[int] | None = None
     ) -> Iterator[tuple[Sequence, np.ndarray, np.ndarray | None]]:
-        """Every sequence with places and speeds ``(S, K, N, D)``, m and m/s."""
+        """Every sequence with sampled positions and speeds ``(S, K, N, D)``, m and m/s."""
         places = self.indices if indices is None else indices
         for i, (batch, sequences) in enumerate(batches(self.store, places, self.samples)):
-            found = sample(
-                way.system, batch, way.noise, self.samples, seed=(self.seed, i), **way.steps
+            trajectory = sample(
+                sampled_model.system,
+                batch,
+                sampled_model.noise,
+                self.samples,
+                seed=(self.seed, i),
+                **sampled_model.steps,
             )
             apart = (self.samples, len(batch))
-            x = found.x.unflatten(1, apart).numpy()
-            v = None if found.v is None else found.v.unflatten(1, apart).numpy()
+            x = trajectory.x.unflatten(1, apart).numpy()
+            v = None if trajectory.v is None else trajectory.v.unflatten(1, apart).numpy()
             for b, s in enumerate(sequences):
                 part = (slice(s.n_samples), slice(None), b, slice(s.n_agents))
-                own = None if v is None else v[part].swapaxes(0, 1)
-                yield s, x[part].swapaxes(0, 1), own
+                speeds = None if v is None else v[part].swapaxes(0, 1)
+                yield s, x[part].swapaxes(0, 1), speeds
 
-    def scored(self, way: Way) -> Scores:
-        """Scores, sequence by sequence."""
+    def scored(self, sampled_model: SampledModel) -> Scores:
+        """Scores of a sampled model on all sequences."""
         rng = np.random.default_rng(self.seed)
-        found = Scores(self.store[self.indices[0]].dt)
-        for s, x, _ in self.moved(way):
-            error = way.noise.measurement**0.5 * rng.normal(size=x.shape)
-            found.add(s.name, x, s.x, error)
-        return found
+        scores = Scores(self.store[self.indices[0]].dt)
+        for s, x, _ in self.moved(sampled_model):
+            error = sampled_model.noise.measurement**0.5 * rng.normal(size=x.shape)
+            scores.add(s.name, x, s.x, error)
+        return scores
 
-    def sampled(self, way: Way) -> Iterator[Sequence]:
-        """Sequences ``NAME~1``, ``NAME~2``, ... of each."""
-        for s, x, v in self.moved(way):
-            if s.x.shape[2] > 1 and s.destination is None:  # what the simulation was told
+    def sampled(self, sampled_model: SampledModel) -> Iterator[Sequence]:
+        """The samples ``NAME~1``, ``NAME~2``, ... of each sequence."""
+        for s, x, v in self.moved(sampled_model):
+            if s.x.shape[2] > 1 and s.destination is None:  # the simulation's destination
                 s = replace(s, destination=s.x[-1])
             for i, name in enumerate(numbered((s.name,), self.samples)):
                 yield replace(s, name=name, x=x[i], v=None if v is None else v[i])
@@ -92,21 +97,21 @@ class Sampling:
 
 @dataclass(frozen=True, repr=False)
 class Simulated:
-    """Motion sampled from a calibrated model, scored on what was measured.
+    """Motion sampled from a calibrated model, scored on measurements.
 
     Attributes:
-        run: folder or checkpoint that the model is of; empty where it is of none.
-        model: its name.
-        data, part: what is sampled; trained_on: sequences of it that the model was calibrated to,
-            None where that cannot be told.
-        clusters: their number.
-        noise: of the model and of ``constant_speed``, with intervals and moments.
-        means: by model, by score: mean and 95 % interval. Scores are ``crps_position_m``,
-            ``crps_gap_m`` (of people ``crps_nearest_m``, of how far the nearest other is),
-            ``coverage_position_50``, ..., and ``SCORE@10s`` that 10 s after the start.
-        minus: the model's CRPS of places minus another one's, m, by sequence.
-        sampling: what is sampled.
-        way: how the model itself moves.
+        run: folder or checkpoint of the model; empty without one.
+        model: name of the model.
+        data, part: the sampled data and their part.
+        trained_on: number of the sampled sequences in the model's calibration; None if unknown.
+        clusters: number of clusters.
+        noise: noise of the model and of ``constant_speed``, with intervals and moments.
+        means: model to score to its mean and 95 % interval. Scores are ``crps_position_m``,
+            ``crps_gap_m`` (for people ``crps_nearest_m``, of the distance to the nearest person),
+            ``coverage_position_50``, ..., and ``SCORE@10s``, the score 10 s after the start.
+        minus: the model's CRPS of positions minus that of another model, m, paired by sequence.
+        sampling: the sampled sequences.
+        sampled_model: the calibrated model with its noise.
     """
 
     run: str
@@ -119,48 +124,54 @@ class Simulated:
     means: dict[str, dict[str, Mean]]
     minus: dict[str, Paired]
     sampling: Sampling
-    way: Way
+    sampled_model: SampledModel
 
     @property
     def crps(self) -> Mean:
-        """CRPS of the model's places, m."""
+        """CRPS of the model's positions, m."""
         return self.means[self.model]["crps_position_m"]
 
     @property
     def coverage(self) -> dict[float, Mean]:
-        """Band (0.5, 0.95) to the share of measured places that it holds."""
-        own = self.means[self.model]
-        return {level: own[f"coverage_position_{100 * level:g}"] for level in BANDS}
+        """Level of a band (0.5, 0.95) to the share of measured positions in it."""
+        means = self.means[self.model]
+        return {level: means[f"coverage_position_{100 * level:g}"] for level in BANDS}
 
     @property
     def scores(self) -> pd.DataFrame:
-        """``mean``, ``low``, ``high``, with a row per model and score."""
-        rows = {(m, k): asdict(mean) for m, own in self.means.items() for k, mean in own.items()}
+        """A row per model and score with ``mean``, ``low`` and ``high``."""
+        rows = {
+            (m, k): asdict(mean)
+            for m, by_score in self.means.items()
+            for k, mean in by_score.items()
+        }
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis(["model", "score"])
 
     @cached_property
     def trajectories(self) -> Sequences:
-        """The samples, sequences ``NAME~1``, ``NAME~2``, ... of each; those that were scored."""
-        return Sequences(self.sampling.sampled(self.way))
+        """The scored samples, ``NAME~1``, ``NAME~2``, ... of each sequence."""
+        return Sequences(self.sampling.sampled(self.sampled_model))
 
     def to_dataframe(self) -> pd.DataFrame:
         """The samples as a tidy table, one row per sequence, time and agent, m, s and m/s."""
         return self.trajectories.to_dataframe()
 
     def plot(self) -> Figure:
-        """Gaps of six sequences, or how far ahead of their measured places people are: measured,
-        and bands of the samples."""
+        """Measured values and bands of the samples for six sequences: gaps of vehicles, or the
+        distance of people ahead of their measured positions."""
         from nnode.plots.bands import Bands, band_panels  # loads Matplotlib, which takes a second
 
         indices = self.sampling.indices
         chosen = indices[:: max(1, len(indices) // _SHOWN)][:_SHOWN]
         shown = []
-        for s, x, _ in self.sampling.moved(self.way, chosen):
+        for s, x, _ in self.sampling.moved(self.sampled_model, chosen):
             if s.x.shape[2] == 1:
                 measured, gap = s.x[:, -1, 0] - s.x[:, -2, 0], x[:, :, -1, 0] - x[:, :, -2, 0]
-            else:  # along the way of the first person
-                way = s.x[-1, 0] - s.x[0, 0]
-                gap = (x[:, :, 0] - s.x[:, 0]) @ (way / max(float(np.linalg.norm(way)), 1e-9))
+            else:  # along the path of the first person
+                direction = s.x[-1, 0] - s.x[0, 0]
+                gap = (x[:, :, 0] - s.x[:, 0]) @ (
+                    direction / max(float(np.linalg.norm(direction)), 1e-9)
+                )
                 measured = np.zeros(s.n_samples)
             shown.append(
                 Bands(
@@ -171,7 +182,7 @@ class Simulated:
                     bands={level: band(gap, level) for level in BANDS},
                 )
             )
-        crowd = self.way.system.domain == "crowd"
+        crowd = self.sampled_model.system.domain == "crowd"
         return band_panels(shown, "ahead (m)" if crowd else "gap (m)")
 
     def plain(self) -> dict[str, Any]:
@@ -187,26 +198,28 @@ class Simulated:
             "clusters": self.clusters,
             "samples": job.samples,
             "seed": job.seed,
-            "noise": {key: asdict(one) for key, one in self.noise.items()},
-            "scores": {k: {n: asdict(m) for n, m in own.items()} for k, own in self.means.items()},
-            "crps_position_minus": {key: asdict(one) for key, one in self.minus.items()},
+            "noise": {key: asdict(entry) for key, entry in self.noise.items()},
+            "scores": {
+                k: {n: asdict(m) for n, m in by_score.items()} for k, by_score in self.means.items()
+            },
+            "crps_position_minus": {key: asdict(entry) for key, entry in self.minus.items()},
         }
 
     def write(self, folder: str | Path, *, format: str | None = "parquet") -> list[Path]:
         """Write ``scores.json``, ``bands.png`` and the samples, see ``docs/sampling.md``.
 
         Args:
-            folder: made where it is missing.
-            format: of the samples, ``parquet`` or ``csv`` (with ``walls.csv`` of people, where all
-                sequences have the same ones), ``pedpy`` (people) or ``fcd`` (vehicles); None: no
-                samples.
+            folder: folder, created if it is missing.
+            format: format of the samples, ``parquet`` or ``csv`` (for people with ``walls.csv``, if
+                all sequences have the same walls), ``pedpy`` (people) or ``fcd`` (vehicles); None
+                writes no samples.
 
         Raises:
-            ConfigError: no such format, or one that is not for the model's vehicles or people.
+            ConfigError: the format is unknown, or does not support the model's domain.
         """
         from nnode.plots.style import save
 
-        system = self.way.system
+        system = self.sampled_model.system
         if format is not None:
             check_format("format", format, system.domain)
         place = Path(folder)
@@ -215,7 +228,7 @@ class Simulated:
         write_json(paths[0], self.plain())
         save(self.plot(), paths[1])
         if format is not None:
-            samples = self.sampling.sampled(self.way)
+            samples = self.sampling.sampled(self.sampled_model)
             paths += write_trajectories(place, "samples", format, samples, system.dim)
         if format in ("parquet", "csv"):
             measured = (self.sampling.store[i] for i in self.sampling.indices)
@@ -224,19 +237,22 @@ class Simulated:
         return paths
 
     def _head(self) -> list[str]:
-        noise = [_told(name, one, self.way.system) for name, one in self.noise.items()]
+        noise = [
+            _noise_text(name, fitted, self.sampled_model.system)
+            for name, fitted in self.noise.items()
+        ]
         job = self.sampling
         number = f"{len(job.indices)} sequences, {job.samples} samples"
         return [*noise, f"{self.data}, {self.part}: {number}"]
 
     def _table(self) -> pd.DataFrame:
         heads = {"crps_position_m": "CRPS place (m)"}
-        crowd = self.way.system.domain == "crowd"
+        crowd = self.sampled_model.system.domain == "crowd"
         heads |= {"crps_nearest_m": "CRPS nearest (m)"} if crowd else {"crps_gap_m": "CRPS gap (m)"}
         heads |= {f"coverage_position_{100 * p:g}": f"in {100 * p:g} % band" for p in BANDS}
         rows = {
-            model: {head: _cell(own[name]) for name, head in heads.items() if name in own}
-            for model, own in self.means.items()
+            model: {head: _cell(by_score[name]) for name, head in heads.items() if name in by_score}
+            for model, by_score in self.means.items()
         }
         return pd.DataFrame.from_dict(rows, orient="index")
 
@@ -251,10 +267,10 @@ class Simulated:
 def batches(
     store: Source, indices: list[int], samples: int
 ) -> Iterator[tuple[Batch, list[Sequence]]]:
-    """Sequences in batches of at most so many vehicles with all their samples."""
+    """Sequences in batches that limit the number of agents with all their samples."""
     group: list[Sequence] = []
     for s in (store[i] for i in indices):
-        widest = max(one.n_agents for one in [*group, s])
+        widest = max(sequence.n_agents for sequence in [*group, s])
         if group and (len(group) + 1) * widest * samples > _AT_ONCE:
             yield collate(group), group
             group = []
@@ -262,9 +278,9 @@ def batches(
     yield collate(group), group
 
 
-def _told(name: str, fitted: FittedNoise, system: System) -> str:
+def _noise_text(name: str, fitted: FittedNoise, system: System) -> str:
     noise = fitted.noise
-    order = 2 if name == "constant_speed" else system.order  # whatever the model's own
+    order = 2 if name == "constant_speed" else system.order
     unit = "m/s" if order == 1 else "m/s²"
 
     def interval(ends: tuple[float, float] | None) -> str:

@@ -1,4 +1,4 @@
-"""Terms, and the systems that sum them."""
+"""Terms, and the models that are sums of terms."""
 
 from nnode.model.build import build_model
 from nnode.model.laws import FollowTheLeader, InteractionForce, Law, make_law

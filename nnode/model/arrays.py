@@ -1,7 +1,7 @@
-"""Formulas computed with NumPy or PyTorch: straight-line code, every part computed once.
+"""Formulas evaluated with NumPy or PyTorch by straight-line code that computes every node once.
 
-Such code takes milliseconds to make, and a call of it one call of the library a node: what a
-search over many models needs, each of which is simulated a few times only.
+Generating the code takes milliseconds, and a call of it makes one library call per node. This
+suits searches over many models, each of which is simulated only a few times.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from torch import Tensor
 from nnode.model.expression import Expr, topological
 from nnode.model.operations import LIBRARIES, OPERATIONS
 
-#: Of symbols' values, and of those of nodes that are known, the outputs' values: arrays, or
-#: numbers where an output depends on nothing else.
+#: Maps the symbols' values and the values of precomputed nodes to the outputs' values. An output
+#: that depends on no symbol is a number.
 NumpyFunction = Callable[[Mapping[str, Any], tuple[Any, ...]], list[Any]]
-#: What a call in a formula stands for.
+#: A function that a formula calls by its name.
 Code = Callable[..., Tensor]
 
 
 @lru_cache(maxsize=1024)
 def _straight_line(
-    outputs: tuple[Expr, ...], known: tuple[Expr, ...], library: str
+    outputs: tuple[Expr, ...], precomputed: tuple[Expr, ...], library: str
 ) -> tuple[Callable[..., list[Any]], list[float]]:
-    """A function of numbers, values of symbols, values of known nodes and code; and its numbers."""
-    label = {node: f"k[{i}]" for i, node in enumerate(known)}
+    """A function of constants, symbol values, precomputed values and code; and the constants."""
+    label = {node: f"k[{i}]" for i, node in enumerate(precomputed)}
     numbers: dict[str, float] = {}
     lines: list[str] = []
     for node in topological(outputs, label):
@@ -44,40 +44,41 @@ def _straight_line(
             lines.append(f"{label[node]} = code[{node.value!r}]({', '.join(args)})")
         else:
             lines.append(f"{label[node]} = {OPERATIONS[node.op].code.format(*args)}")
-    given = [f"{', '.join(numbers)}, = c"] if numbers else []
+    unpacking = [f"{', '.join(numbers)}, = c"] if numbers else []
     results = ", ".join(label[node] for node in outputs)
-    body = "".join(f"    {line}\n" for line in [*given, *lines, f"return [{results}]"])
+    body = "".join(f"    {line}\n" for line in [*unpacking, *lines, f"return [{results}]"])
     names = dict(LIBRARIES[library])
     exec(f"def run(c, g, k, code=None):\n{body}", names)
     return names["run"], list(numbers.values())
 
 
-def numpy_function(outputs: tuple[Expr, ...], known: tuple[Expr, ...] = ()) -> NumpyFunction:
-    """A function of symbols and of known nodes.
+def numpy_function(outputs: tuple[Expr, ...], precomputed: tuple[Expr, ...] = ()) -> NumpyFunction:
+    """A NumPy function of the symbols and the precomputed nodes.
 
     Args:
         outputs: formulas without calls of code.
-        known: nodes that are computed already.
+        precomputed: nodes whose values are arguments of the function.
     """
-    run, numbers = _straight_line(outputs, known, "array")
-    # Python's own numbers would raise where one is divided by zero
+    run, numbers = _straight_line(outputs, precomputed, "array")
+    # Python floats would raise an error in a division by zero
     return partial(run, tuple(map(np.float64, numbers)))
 
 
 def computed(
     outputs: Sequence[Expr],
     values: Mapping[str, Tensor],
-    known: Mapping[Expr, Tensor] | None = None,
+    precomputed: Mapping[Expr, Tensor] | None = None,
     code: Mapping[str, Code] | None = None,
 ) -> list[Tensor]:
-    """Formulas from the values of their symbols with PyTorch, differentiable as PyTorch is.
+    """The values of formulas by PyTorch, differentiable by its automatic differentiation.
 
     Args:
-        known: values of nodes that are computed already.
-        code: what calls stand for.
+        values: symbol to value.
+        precomputed: node to value.
+        code: name to the function that calls of this name evaluate.
     """
-    known = known or {}
-    run, numbers = _straight_line(tuple(outputs), tuple(known), "tensor")
+    precomputed = precomputed or {}
+    run, numbers = _straight_line(tuple(outputs), tuple(precomputed), "tensor")
     like = next(iter(values.values()))
     constants = [torch.tensor(c, dtype=like.dtype, device=like.device) for c in numbers]
-    return run(constants, values, tuple(known.values()), code)
+    return run(constants, values, tuple(precomputed.values()), code)

@@ -1,16 +1,15 @@
-"""From options to a model."""
+"""Builds models from their options."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any, cast
 
 import torch
 
 from nnode.data.sequence import Domain
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, suggestion
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.base import Effect
 from nnode.model.effects.own import VARIABLE, load_own
@@ -21,48 +20,50 @@ Options = Mapping[str, Any]
 
 
 def _laws(options: Options, generator: torch.Generator) -> list[Law]:
-    """A user's own law, or those of the package's entries with their options."""
+    """The laws of a model: a user-defined one, or package entries with their options."""
     if options["term"] == "formula":
         network, box = options.get("network"), options.get("box")
-        own = law_from(
+        law = law_from(
             str(options["name"]), options["law"], network=network, box=box, generator=generator
         )
-        return [own]
+        return [law]
     v0 = options.get("v0", 1.0)
     if not (math.isfinite(v0) and v0 > 0):
         raise ConfigError(f"model.v0={v0} must be a positive speed in m/s")
     # checkpoints from before there was an option do not name it
-    given, every = {**options, "preferred": _desired(options) != "last"}, entries()
+    law_options, catalogue = {**options, "preferred": _desired(options) != "last"}, entries()
     return [
         make_law(
-            name, generator=generator, **{k: given[k] for k in every[name]["options"] if k in given}
+            name,
+            generator=generator,
+            **{k: law_options[k] for k in catalogue[name]["options"] if k in law_options},
         )
-        for name in every[str(options["term"])]["model"]
+        for name in catalogue[str(options["term"])]["model"]
     ]
 
 
-def _lane(found: Law, options: Options) -> Traffic:
+def _lane(law: Law, options: Options) -> Traffic:
     leader = str(getattr(options["leader"], "value", options["leader"]))
-    if leader == "constant" and found.order == 1 and "v0" not in found.scalars:
+    if leader == "constant" and law.order == 1 and "v0" not in law.scalars:
         raise ConfigError(
             "model.leader=constant needs a law with a parameter v0, the speed of the first "
             "vehicle; name one, or take model.leader=measured"
         )
-    if found.entry and leader == "measured" and not found.names("v0"):
-        found.idle("v0")
-    return Traffic([found], leader=leader)
+    if law.entry and leader == "measured" and not law.names("v0"):
+        law.idle("v0")
+    return Traffic([law], leader=leader)
 
 
 def _desired(options: Options) -> str:
     # checkpoints from before there was this option do not name it
-    found = options.get("desired", "last")
-    return str(getattr(found, "value", found))
+    desired = options.get("desired", "last")
+    return str(getattr(desired, "value", desired))
 
 
 def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.float64) -> System:
-    """The model that ``options`` describe (see :mod:`nnode.model.options`).
+    """Build the model that ``options`` describe (see :mod:`nnode.model.options`).
 
-    Random start values depend on ``seed`` alone, in every precision.
+    Random start values depend only on ``seed``, not on the precision.
 
     Raises:
         ConfigError: an unknown term, or a value outside what the model allows.
@@ -70,9 +71,10 @@ def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.floa
     term, generator = str(options["term"]), torch.Generator().manual_seed(seed)
     terms = [name for name, entry in entries().items() if entry.get("model")] + ["formula"]
     if term not in terms:
-        near = get_close_matches(term, terms, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(terms)}{hint}")
+        raise ConfigError(
+            f"model.term={term} is unknown, expected one of {', '.join(terms)}"
+            f"{suggestion(term, terms)}"
+        )
     try:
         laws = _laws(options, generator)
         model: System
@@ -89,14 +91,14 @@ def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.floa
 
 
 def add_effects(model: System, chosen: Sequence[str | Options]) -> None:
-    """Give a model effects of the catalogue, each in its place in the sum.
+    """Add effects of the catalogue to a model, in the order of their ranks.
 
     Args:
-        chosen: per effect its ``name`` and any of its parameters, or the name alone.
+        chosen: per effect its ``name`` and any of its parameters, or only the name.
 
     Raises:
-        ConfigError: an effect that the catalogue or the model's domain does not have, or a
-            parameter that the effect does not have.
+        ConfigError: the catalogue has no such effect for the model's domain, or the effect has no
+            such parameter.
     """
     if chosen:
         load_own()
@@ -108,13 +110,12 @@ def add_effects(model: System, chosen: Sequence[str | Options]) -> None:
     added = []
     for entry in chosen:
         name, values = _entry(entry)
-        known = [effect.name for effect in CATALOGUE.of(cast(Domain, model.domain), every=True)]
-        if name not in known:
-            near = get_close_matches(name, known, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
+        names = [effect.name for effect in CATALOGUE.of(cast(Domain, model.domain), every=True)]
+        if name not in names:
             raise ConfigError(
                 f"model.effects: there is no {model.domain} effect {name}, expected one of "
-                f"{', '.join(known)}{hint}; files with effects of your own are named in {VARIABLE}"
+                f"{', '.join(names)}{suggestion(name, names)}; files with effects of your own are "
+                f"named in {VARIABLE}"
             )
         try:
             added.append(CATALOGUE.effects[name](**values))
@@ -125,13 +126,13 @@ def add_effects(model: System, chosen: Sequence[str | Options]) -> None:
         model.terms.append(effect)
         if model.domain == "traffic" and model.order > 1:
             try:
-                model.formula  # noqa: B018 - says what the law does not have
+                model.formula  # noqa: B018 - raises the error
             except ConfigError as error:
                 raise ConfigError(f"model.effects: {effect.name} cannot act: {error}") from error
 
 
 def _entry(entry: Any) -> tuple[str, dict[str, Any]]:
-    """An effect's name and parameters, in any of the ways to write them."""
+    """An effect's name and parameters, from any of the three accepted forms."""
     if isinstance(entry, str):
         return entry, {}
     if isinstance(entry, Mapping) and "name" in entry:
@@ -147,16 +148,20 @@ def _entry(entry: Any) -> tuple[str, dict[str, Any]]:
 
 
 def _check_order(model: System, effect: Effect) -> None:
-    """Refuse an effect that is not known for speeds, or for accelerations."""
+    """Refuse a lane effect that is not defined for the order of the model.
+
+    Raises:
+        ConfigError: the effect changes a speed and the law an acceleration, or conversely.
+    """
     if model.domain != "traffic":
         return
     if model.order in effect.rules or not (effect.rules or model.order > 1):
         return
     if model.order > 1:
-        known = [e.name for e in CATALOGUE.of("traffic", every=True) if 2 in e.rules]
+        names = [e.name for e in CATALOGUE.of("traffic", every=True) if 2 in e.rules]
         raise ConfigError(
             f"model.effects: {effect.name} changes a speed, and this law says an acceleration; "
-            f"for those there are {', '.join(known)}"
+            f"for those there are {', '.join(names)}"
         )
     raise ConfigError(
         f"model.effects: {effect.name} changes an acceleration, and this law says a speed; "

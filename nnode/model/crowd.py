@@ -1,4 +1,4 @@
-"""Vectors of the plane."""
+"""Vectors in the plane."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The right-hand side of a crowd, from the formula of its model."""
+"""The right-hand side of a crowd model, evaluated from its formula."""
 
 from __future__ import annotations
 
@@ -20,37 +20,38 @@ from nnode.model.terms import (
     SMALLEST,
     WALLS,
     CrowdDynamics,
-    own_values,
-    values_of,
+    parameter_values,
 )
 
 
 def settings_of(terms: Sequence[Any], law: CrowdDynamics) -> dict[str, float]:
-    """Symbol to value of what terms have fixed."""
+    """Symbol to value of the terms' fixed settings."""
     return {name: float(getattr(terms[i], part)) for name, (i, part) in law.settings.items()}
 
 
 def people_of(terms: Sequence[Any], law: CrowdDynamics, scene: Scene) -> dict[str, Tensor]:
-    """Symbol to ``(B, N)`` or ``(B, 1)`` values of what people have from the data."""
-    found = {name: terms[i].inputs(scene)[part] for name, (i, part) in law.inputs.items()}
-    found["people"], found["points"] = scene.count[:, 0], scene.wall_count[:, 0]
-    found["start"], found["pace"] = scene.start[:, None], scene.pace
-    return {name: value.to(scene.destination.dtype) for name, value in found.items()}
+    """Symbol to the values ``(B, N)`` or ``(B, 1)`` of people's properties from the data."""
+    values = {name: terms[i].inputs(scene)[part] for name, (i, part) in law.inputs.items()}
+    values["people"], values["points"] = scene.count[:, 0], scene.wall_count[:, 0]
+    values["start"], values["pace"] = scene.start[:, None], scene.pace
+    values["goal_x"], values["goal_y"] = scene.destination.unbind(-1)
+    return {name: value.to(scene.destination.dtype) for name, value in values.items()}
 
 
 class CrowdRates:
     """The right-hand side of a crowd's formula, by PyTorch or NumPy.
 
-    Arrays of people are ``(B, N)``, those of what people see ``(M, B, N)``: M others, wall points
-    or walls. An axis has length 1 where all values along it are the same.
+    Arrays of people have the shape ``(B, N)``. Arrays of neighbours have the shape ``(M, B, N)``,
+    where the M neighbours are people, wall points or walls. An axis has length 1 where all values
+    along it are equal.
 
     Args:
-        terms: of the model.
-        law: their formula.
+        terms: the model's terms.
+        law: the formula of the terms.
         scene: surroundings of the B simulations.
-        parameters: by name; None: those of the terms.
-        code: what calls stand for.
-        numpy: whether to compute by NumPy; a formula with code cannot be.
+        parameters: name to value; None takes the terms' parameters.
+        code: name to the function that calls of this name evaluate.
+        numpy: whether to compute by NumPy, which excludes formulas with code.
     """
 
     def __init__(
@@ -63,13 +64,13 @@ class CrowdRates:
         numpy: bool = False,
     ) -> None:
         self.law, self._code, self._numpy = law, code, numpy
-        values = values_of(law, {**own_values(terms, law), **(parameters or {})})
-        known = dict(zip(law.owned, values, strict=True))
+        symbol_values = parameter_values(terms, law, parameters)
         like = scene.destination
-        known |= {name: like.new_tensor(value) for name, value in settings_of(terms, law).items()}
-        known |= dict(zip(("goal_x", "goal_y"), like.unbind(-1), strict=True))
-        known |= people_of(terms, law, scene)
-        self._known = self._arrays(known)
+        symbol_values |= {
+            name: like.new_tensor(value) for name, value in settings_of(terms, law).items()
+        }
+        symbol_values |= people_of(terms, law, scene)
+        self._known = self._arrays(symbol_values)
         self._places: dict[str, dict[str, Any]] = {}
         self._real: dict[str, Any] = {}
         for over, sums in law.sums.items():
@@ -84,27 +85,29 @@ class CrowdRates:
         Args:
             t: s, a number or ``(B, 1)``.
             states: ``(4, B, N)`` positions and velocities.
-            others: ``(4, B, N)`` of those whom people see.
-            part: of the simulations, whose states these are.
+            others: ``(4, B, N)`` positions and velocities of the others.
+            part: the simulations that the states belong to.
         """
-        own = dict(zip(("x", "y", "vx", "vy"), states, strict=True)) | {"t": t}
-        own |= {name: value[part] if value.ndim else value for name, value in self._known.items()}
+        person = dict(zip(("x", "y", "vx", "vy"), states, strict=True)) | {"t": t}
+        person |= {
+            name: value[part] if value.ndim else value for name, value in self._known.items()
+        }
         sums: dict[str, Any] = {}
-        for over, found in self.law.sums.items():
-            if not found:
+        for over, summands in self.law.sums.items():
+            if not summands:
                 continue
-            places, seen = {k: v[:, part] for k, v in self._places[over].items()}, {}
+            places, relative = {k: v[:, part] for k, v in self._places[over].items()}, {}
             if over in (OTHERS, SMALLEST):
                 places = dict(zip(("x", "y", "vx", "vy"), map(_of_each, others), strict=True))
-                seen = {f"{name}_j": _of_each(own[name]) for name in self.law.inputs}
+                relative = {f"{name}_j": _of_each(person[name]) for name in self.law.inputs}
             for name, value in places.items():
-                seen |= {f"d{name}": own[name] - value} if name in own else {name: value}
-            known = own | sums if over == SMALLEST else own
-            each = self._computed(found.values(), known | seen)
+                relative |= {f"d{name}": person[name] - value} if name in person else {name: value}
+            context = person | sums if over == SMALLEST else person
+            terms = self._computed(summands.values(), context | relative)
             real = self._real[over][:, part]
-            for name, value in zip(found, each, strict=True):
+            for name, value in zip(summands, terms, strict=True):
                 sums[name] = _smallest(value, real) if over == SMALLEST else (value * real).sum(0)
-        return self._computed(self.law.rate, own | sums)
+        return self._computed(self.law.rate, person | sums)
 
     def _computed(self, formulas: Iterable[Expr], values: Mapping[str, Any]) -> list[Any]:
         if self._numpy:
@@ -120,25 +123,25 @@ class CrowdRates:
 def rates_of(
     terms: Sequence[Term], law: CrowdDynamics, state: State, code: Mapping[str, Code] | None = None
 ) -> Tensor:
-    """``(B, N, 2)`` m/s² of a crowd's formula, m/s where it is of first order."""
+    """``(B, N, 2)`` rates of a crowd's formula, m/s², or m/s for a law of first order."""
     x, v = state.x, state.v
     if v is None:
         v = torch.zeros_like(x) if law.order == 1 else state.others[1]
     states = torch.cat([x, v], -1)
-    others = states if state.seen is None else torch.cat(state.seen, -1)
-    found = CrowdRates(terms, law, state.scene, code=code)(
+    others = states if state.measured_others is None else torch.cat(state.measured_others, -1)
+    components = CrowdRates(terms, law, state.scene, code=code)(
         state.t.to(x.dtype).reshape(-1, 1), states.movedim(-1, 0), others.movedim(-1, 0)
     )
-    return torch.stack([part.expand(x.shape[:2]) for part in found], -1)
+    return torch.stack([part.expand(x.shape[:2]) for part in components], -1)
 
 
 def _of_each(values: Any) -> Any:
-    """``(M, B, 1)`` of the values ``(B, M)`` of others."""
+    """Reshape the values ``(B, M)`` of others to ``(M, B, 1)``."""
     return values.T[..., None]
 
 
 def _smallest(value: Any, real: Any) -> Any:
-    """Over the first axis, of what exists; the slope is that of the first of them."""
+    """The minimum over the first axis where ``real``; its gradient is that of the first minimum."""
     if isinstance(value, np.ndarray):
         return np.where(real > 0, value, NOBODY).min(0, initial=NOBODY)
     value = torch.where(real > 0, value, NOBODY)
@@ -150,7 +153,7 @@ _Places = tuple[dict[str, Tensor], Tensor]
 
 
 def _others(scene: Scene) -> _Places:
-    """Nothing that is fixed, and ``(N, B, N)`` whom (first axis) a person (third) sees."""
+    """No fixed values; and ``(N, B, N)`` True where the first axis' person is another person."""
     apart = ~torch.eye(scene.agent.shape[1], dtype=torch.bool, device=scene.agent.device)
     return {}, (scene.agent[:, None, :] & apart).movedim(2, 0)
 
@@ -168,8 +171,8 @@ def _walls(scene: Scene) -> _Places:
 
 
 def walls_of(scene: Scene) -> tuple[Tensor, Tensor]:
-    """``(B, W, 4)`` first ends of walls and the way to their second ends, m; ``(B, W)`` whether
-    there is a wall."""
+    """``(B, W, 4)`` first ends of walls and vectors to their second ends, m; ``(B, W)`` True for
+    real walls."""
     real = ~scene.segment.isnan().any(-1)
     ends = torch.where(real[..., None], scene.segment, 0.0)
     return torch.cat([ends[..., :2], ends[..., 2:] - ends[..., :2]], -1), real

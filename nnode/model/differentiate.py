@@ -1,4 +1,4 @@
-"""Derivatives of formulas, on their own nodes."""
+"""Symbolic derivatives of formulas."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ _SLOPES = {
 
 
 def slopes(node: Expr) -> list[Expr]:
-    """The derivative of an operation by each of what it is applied to."""
+    """The derivatives of an operation by each of its arguments."""
     if node.op not in _SLOPES:
         raise ValueError(f"there is no derivative of {node.op}")
     return [as_expr(slope) for slope in _SLOPES[node.op](node, *node.args)]
 
 
 def _weighted(weight: Expr, slope: Expr) -> Expr:
-    """A product that is 0 where a chosen slope is, whatever the weight."""
+    """The product of a weight and a slope. It is 0 where a ``choose`` of constants selects the
+    slope 0, even if the weight is infinite."""
     if slope.op == "choose" and slope.args[1].op == slope.args[2].op == "const":
         condition, b, c = slope.args
         return apply("choose", condition, weight * b, weight * c)
@@ -32,11 +33,11 @@ def _weighted(weight: Expr, slope: Expr) -> Expr:
 
 
 def vjp(seeds: Mapping[Expr, Expr], ends: Callable[[Expr], bool]) -> dict[Expr, Expr]:
-    """Reverse mode: adjoints of the nodes where ``ends`` says so, and of symbols.
+    """Reverse-mode differentiation: the adjoints of symbols and of the nodes where it ends.
 
     Args:
-        seeds: weights of the outputs.
-        ends: nodes that are not followed further.
+        seeds: output to its weight.
+        ends: whether a node is treated as a leaf.
     """
     bar, adjoints = dict(seeds), {}
     for node in reversed(topological(seeds)):
@@ -54,16 +55,16 @@ def vjp(seeds: Mapping[Expr, Expr], ends: Callable[[Expr], bool]) -> dict[Expr, 
 
 
 def derivatives(node: Expr, names: list[str]) -> dict[str, Expr]:
-    """Of one formula by symbols; those that it does not contain are left out."""
+    """The derivatives of one formula by symbols, without those that it does not contain."""
     adjoints = vjp({node: _ONE}, lambda part: False)
     gradient = {part.value: bar for part, bar in adjoints.items() if not bar.is_number(0)}
     return {name: gradient[name] for name in names if name in gradient}
 
 
 def shift_slopes(outputs: Sequence[Expr], moved: Collection[str]) -> list[Expr]:
-    """Forward mode: derivatives of formulas by an amount that is added to several symbols at once.
+    """Forward-mode derivatives of formulas by an amount that is added to several symbols.
 
-    What depends on differences of these symbols alone has the number 0.
+    The derivative is the number 0 for a formula that depends only on differences of the symbols.
     """
     shifted: dict[Expr, Expr] = {}
     for node in topological(outputs):

@@ -1,8 +1,8 @@
 """A formula is a directed acyclic graph; equal subexpressions share one node.
 
 A node is a number, a symbol, a call of code by its name, or an operation on nodes
-(:mod:`nnode.model.operations`). Building an expression twice gives the same object, so that what a
-formula names or repeats is computed once.
+(:mod:`nnode.model.operations`). Building an expression twice gives the same object, so repeated
+parts are computed once.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Expr:
 
     Attributes:
         op: ``const``, ``symbol``, ``call``, or the name of an operation.
-        args: what it is applied to.
+        args: arguments of the operation.
         value: the number, or the symbol's or the code's name.
         key: a digest of the whole formula below, the same in every process.
     """
@@ -131,7 +131,7 @@ def _folded(op: str, *args: Expr) -> Expr:
             value = _NUMBERS[op](*(a.value for a in args))
             if math.isfinite(value) or not all(math.isfinite(a.value) for a in args):
                 return const(value)
-        # An overflow of finite numbers stays an operation, and says so when it is computed.
+        # An overflow of finite numbers stays an operation, so that its evaluation reports it.
     return _made(op, args)
 
 
@@ -141,7 +141,7 @@ def const(value: float) -> Expr:
 
 
 def symbol(name: str) -> Expr:
-    """A quantity by its name."""
+    """A quantity with a name."""
     return _made("symbol", (), name)
 
 
@@ -183,7 +183,7 @@ def _chosen(a: Expr, b: Expr, c: Expr) -> Expr:
     return b if b is c else _made("choose", (a, b, c))
 
 
-#: Operations that simplify what they are applied to.
+#: Operations that simplify their result.
 _SIMPLIFIED: dict[str, Callable[..., Expr]] = {
     "add": Expr.__add__,
     "sub": Expr.__sub__,
@@ -195,7 +195,7 @@ _SIMPLIFIED: dict[str, Callable[..., Expr]] = {
 
 
 def apply(name: str, *args: Expr | float) -> Expr:
-    """An operation by its name."""
+    """The operation of a name, applied to arguments."""
     if name not in OPERATIONS:
         raise ValueError(f"there is no operation {name}")
     nodes = map(as_expr, args)
@@ -203,21 +203,21 @@ def apply(name: str, *args: Expr | float) -> Expr:
 
 
 def call(name: str, *args: Expr) -> Expr:
-    """Code that is no formula, by a name under which it is given when it is computed."""
+    """A call of code that is not a formula. Evaluation takes the code by its name."""
     return _made("call", args, name)
 
 
-def topological(outputs: Iterable[Expr], known: Container[Expr] = ()) -> list[Expr]:
-    """All nodes of formulas, each after what it is made of; in the same order every time.
+def topological(outputs: Iterable[Expr], excluded: Container[Expr] = ()) -> list[Expr]:
+    """All nodes of formulas in a deterministic order, each after its arguments.
 
     Args:
-        known: nodes that are left out, with what only they are made of.
+        excluded: nodes that are left out, as well as the nodes that only they depend on.
     """
     ordered: dict[Expr, None] = {}
     stack = [(node, False) for node in reversed(list(outputs))]
     while stack:
         node, done = stack.pop()
-        if node in ordered or node in known:
+        if node in ordered or node in excluded:
             continue
         if done:
             ordered[node] = None
@@ -233,7 +233,7 @@ def symbols(outputs: Iterable[Expr]) -> list[str]:
 
 
 def substitute(node: Expr, values: Mapping[str, Expr]) -> Expr:
-    """A formula with other ones in place of symbols, all at once."""
+    """A formula in which other formulas simultaneously replace symbols."""
     done: dict[Expr, Expr] = {}
     for part in topological([node]):
         args = tuple(done[a] for a in part.args)

@@ -1,4 +1,4 @@
-"""A model with one more effect, or without one."""
+"""Copies of models with an additional effect, or without some effects."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from nnode.model.system import System
 
 
 def extended(system: System, effect: Effect) -> tuple[System, int]:
-    """A copy of a model with one more effect, and the effect's place among the terms.
+    """A copy of a model with an additional effect, and the effect's index among the terms.
 
-    It stands after the law, among the effects in the order of their ranks.
+    The effect is inserted in the order of the ranks.
     """
-    found = copy.deepcopy(system)
-    place = len(found.terms)
-    for i, term in enumerate(found.terms):
+    model = copy.deepcopy(system)
+    place = len(model.terms)
+    for i, term in enumerate(model.terms):
         if isinstance(term, Effect) and term.rank > effect.rank:
             place = i
             break
-    found.terms.insert(place, effect)
-    return found, place
+    model.terms.insert(place, effect)
+    return model, place
 
 
 def without(system: System, *names: str) -> System:
-    """A copy of a model without the effects of some names."""
-    found = copy.deepcopy(system)
+    """A copy of a model without the named effects."""
+    model = copy.deepcopy(system)
     for name in names:
-        del found.terms[place_of(found, name)]
-    return found
+        del model.terms[place_of(model, name)]
+    return model
 
 
 def place_of(system: System, name: str) -> int:
-    """Of the effect of a name among the model's terms.
+    """The index of the named effect among the model's terms.
 
     Raises:
         ValueError: the model has no such effect.
@@ -44,11 +44,11 @@ def place_of(system: System, name: str) -> int:
 
 
 def effects_of(system: System) -> list[Effect]:
-    """The effects of a model, in their order."""
+    """The effects of a model, in the order of its terms."""
     return [term for term in system.terms if isinstance(term, Effect)]
 
 
-def beside(system: System) -> str:
-    """What a figure of a model's law or force alone leaves out, in words; empty: nothing."""
+def omitted_effects(system: System) -> str:
+    """The caption's note on the effects that a figure of a model's law omits; empty for none."""
     names = [effect.name for effect in effects_of(system)]
     return f"without its effects {', '.join(names)}" if names else ""

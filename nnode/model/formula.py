@@ -1,4 +1,4 @@
-"""The formula of a model, made from what its terms say of themselves."""
+"""The formula of a model, composed from the rules of its terms."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from nnode.model.names import check_names
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
 from nnode.model.term import State, Term, numbered
-from nnode.model.terms import CrowdDynamics, LaneDynamics, add_term, own_values, values_of
+from nnode.model.terms import CrowdDynamics, LaneDynamics, add_term, parameter_values
 
-#: What terms say of their formulas to the formula of all.
-_KNOWN: dict[tuple[Any, ...], Any] = {}
+#: The terms' shapes to the composed formula.
+_FORMULAS: dict[tuple[Any, ...], Any] = {}
 
 
 def lane_of(terms: Sequence[Term]) -> LaneDynamics | None:
@@ -33,13 +33,13 @@ def lane_of(terms: Sequence[Term]) -> LaneDynamics | None:
     if any(isinstance(e, Law) or e.rule_for(order) is None for e in terms[1:]):
         return None
     key = tuple(term.shape for term in terms)
-    if key not in _KNOWN:
+    if key not in _FORMULAS:
         lane = LaneDynamics(order=order)
         for place, (term, owner) in enumerate(zip(terms, owners(terms), strict=True)):
             lane = with_term(lane, term, owner, place)
-        _KNOWN[key] = lane.flat()
-    found: LaneDynamics = _KNOWN[key]
-    return found
+        _FORMULAS[key] = lane.flat()
+    lane_formula: LaneDynamics = _FORMULAS[key]
+    return lane_formula
 
 
 def crowd_of(terms: Sequence[Term]) -> CrowdDynamics | None:
@@ -47,23 +47,23 @@ def crowd_of(terms: Sequence[Term]) -> CrowdDynamics | None:
     if any(term.rule_for(2) is None for term in terms):
         return None
     key = tuple(term.shape for term in terms)
-    if key not in _KNOWN:
+    if key not in _FORMULAS:
         law, names = CrowdDynamics(), owners(terms)
-        # a law is known to effects wherever it stands
+        # laws come first, so that effects can use them whatever the order of the terms
         for i, term in sorted(enumerate(terms), key=lambda it: not isinstance(it[1], Law)):
             law = with_term(law, term, names[i], i)
-        _KNOWN[key] = law.flat() if law.is_formula else None
-    found: CrowdDynamics | None = _KNOWN[key]
-    return found
+        _FORMULAS[key] = law.flat() if law.is_formula else None
+    crowd_formula: CrowdDynamics | None = _FORMULAS[key]
+    return crowd_formula
 
 
 def with_term(model: Any, term: Term, owner: str, place: int, called: bool = False) -> Any:
-    """The formulas of a model with those of one term more.
+    """The formulas of a model with an additional term.
 
     Args:
-        owner: name of the term in the model; symbols begin with it.
-        place: of the term in the model.
-        called: whether networks of laws stay functions.
+        owner: name of the term in the model; prefix of its symbols.
+        place: index of the term in the model.
+        called: whether networks of laws stay calls; otherwise they are written out.
     """
     if isinstance(term, Law):
         return term.written(model, owner, place, called=called)
@@ -74,24 +74,25 @@ def with_term(model: Any, term: Term, owner: str, place: int, called: bool = Fal
 
 
 def inputs_of(terms: Sequence[Any], lane: LaneDynamics, scene: Scene) -> dict[str, Tensor]:
-    """Symbol to ``(B, N)`` values of what vehicles have from the data, for a lane's formula."""
-    found = {"length_1": _length_ahead(scene)} if "length_1" in lane.symbols else {}
+    """Symbol to the values ``(B, N)`` of vehicles' properties from the data."""
+    inputs = {"length_1": _length_ahead(scene)} if "length_1" in lane.symbols else {}
     for name, (place, part) in lane.inputs.items():
-        found[name] = terms[place].inputs(scene)[part]
-    return found
+        inputs[name] = terms[place].inputs(scene)[part]
+    return inputs
 
 
 def _length_ahead(scene: Scene) -> Tensor:
-    """``(B, N)`` m; the mean of those that are known where it is not, 0 where none is."""
+    """``(B, N)`` length of the vehicle ahead, m. The mean of the known lengths replaces an unknown
+    one; without any known length it is 0."""
     length = torch.where(torch.isfinite(scene.length), scene.length, scene.mean_length)
     return torch.cat([length[:, 1:], torch.zeros_like(length[:, :1])], 1)
 
 
 def owners(terms: Sequence[Term]) -> list[str]:
-    """The name of each term; of several of one name the second is numbered.
+    """The name of each term; repeated names are numbered from the second on.
 
     Raises:
-        ConfigError: a name that cannot stand in a formula.
+        ConfigError: a name that a formula cannot contain.
     """
     names = [term.name for term in terms]
     check_names("terms", names)
@@ -104,15 +105,13 @@ def symbols_of(
     scene: Scene,
     parameters: Mapping[str, Tensor] | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Values of a lane's symbols that do not change: those that are the same for all vehicles,
-    and ``(N, B)`` of what vehicles have from the data.
+    """Values of a lane's constant symbols: those that all vehicles share, and ``(N, B)`` vehicles'
+    properties from the data.
 
     Args:
-        parameters: by their symbols; None: the terms' own.
+        parameters: symbol to value; None takes the terms' parameters.
     """
-    values = dict(parameters or {})
-    if parameters is None:
-        values = dict(zip(lane.owned, values_of(lane, own_values(terms, lane)), strict=True))
+    values = parameter_values(terms, lane) if parameters is None else dict(parameters)
     values |= {"start": scene.start, "dt": scene.start.new_tensor(scene.step)}
     return values, {name: value.T for name, value in inputs_of(terms, lane, scene).items()}
 
@@ -124,18 +123,18 @@ def rates_of(
     t: Tensor,
     scene: Scene,
     measured: bool,
-    more: Mapping[str, Tensor] | None = None,
+    extra_inputs: Mapping[str, Tensor] | None = None,
     parameters: Mapping[str, Tensor] | None = None,
 ) -> Tensor:
     """``(B, N, M)`` rates of a lane's states, by PyTorch.
 
     Args:
-        measured: whether leaders drive as they were measured.
-        more: further symbols' values ``(B, N)``.
+        measured: whether leaders follow their measured paths.
+        extra_inputs: additional symbols to their values ``(B, N)``.
         parameters: see :func:`symbols_of`.
     """
     values, inputs = symbols_of(terms, lane, scene, parameters)
-    inputs |= {name: value.T for name, value in (more or {}).items()}
+    inputs |= {name: value.T for name, value in (extra_inputs or {}).items()}
     code = terms[0].code() if isinstance(terms[0], Law) else None
     law, masks = stepped(lane, scene.method), (scene.follower.T, scene.leader.T)
     rates, states = LaneRates(law, values, inputs, *masks, code), y.movedim((-1, 1), (0, 1))
@@ -143,19 +142,20 @@ def rates_of(
     if measured or "measured" in lane.symbols:
         lead = scene.measured_rate_at(t)[..., 0].T
     symbols = rates.symbols(t, states, lead)
-    found: Tensor = rates(states, symbols, lead if measured else None)
-    return found.movedim((0, 1), (-1, 1))
+    values_by_state: Tensor = rates(states, symbols, lead if measured else None)
+    return values_by_state.movedim((0, 1), (-1, 1))
 
 
 def effect_alone(law: Term, term: Term) -> LaneDynamics:
-    """The formula of one effect beside a law, where other terms are code: ``before`` is the sum of
-    the terms before it.
+    """The formula of a law and one effect, for models with other terms that are code.
+
+    The symbol ``before`` is the sum of the terms before the effect.
 
     Raises:
         ConfigError: the effect changes a law of the gap, and the model has none.
     """
     key = ("increment", law.shape, term.shape)
-    if key not in _KNOWN:
+    if key not in _FORMULAS:
         alone, before = LaneDynamics(order=1), symbol("before")
         if isinstance(law, Law) and law.rule is not None:
             alone = with_term(LaneDynamics(order=law.order), law, law.name, 0)
@@ -166,46 +166,46 @@ def effect_alone(law: Term, term: Term) -> LaneDynamics:
             )
         units = {**alone.units, "before": "m/s"}
         alone = replace(alone, rates={"x": before}, leader=before, units=units)
-        _KNOWN[key] = with_term(alone, term, term.name, 1).flat()
-    found: LaneDynamics = _KNOWN[key]
-    return found
+        _FORMULAS[key] = with_term(alone, term, term.name, 1).flat()
+    formula: LaneDynamics = _FORMULAS[key]
+    return formula
 
 
 def effect_increment(term: Term, state: State) -> Tensor:
-    """``(B, N, 1 + M)`` what one effect changes of the sum of the terms before it, and the rates
-    of its states: for models with other terms that are code."""
+    """``(B, N, 1 + M)``: one effect's change of the sum of the terms before it, then the rates of
+    its states; for models with other terms that are code."""
     before = torch.zeros_like(state.x) if state.rate is None else state.rate
     law = state.terms[0]
     y = state.x if state.memory is None else torch.cat([state.x, state.memory], -1)
-    more, lane = {"before": before[..., 0]}, effect_alone(law, term)
-    found = rates_of([law, term], lane, y, state.t, state.scene, False, more)
+    extra_inputs, lane = {"before": before[..., 0]}, effect_alone(law, term)
+    rates = rates_of([law, term], lane, y, state.t, state.scene, False, extra_inputs)
     followers = state.scene.follower | state.scene.leader
-    change = torch.where(followers, found[..., 0] - before[..., 0], 0.0)
-    return torch.cat([change[..., None], found[..., 1:]], -1)
+    change = torch.where(followers, rates[..., 0] - before[..., 0], 0.0)
+    return torch.cat([change[..., None], rates[..., 1:]], -1)
 
 
 def added_to(laws: Sequence[Term], effects: Sequence[Term], called: bool = False) -> CrowdDynamics:
-    """The formula of what effects add to a crowd's laws.
+    """The formula of the accelerations that effects add to a crowd's laws.
 
     Args:
-        called: whether networks of laws stay functions.
+        called: whether networks of laws stay calls; otherwise they are written out.
     """
     terms = [*laws, *effects]
     key = ("added", len(laws), called, *(t.shape for t in terms))
-    if key not in _KNOWN:
+    if key not in _FORMULAS:
         model, names = CrowdDynamics(), owners(terms)
         for i, law in enumerate(laws):
             model = with_term(model, law, names[i], i, called)
         model = replace(model, rate=(const(0), const(0)))
         for i, effect in enumerate(effects, start=len(laws)):
             model = with_term(model, effect, names[i], i)
-        _KNOWN[key] = model.flat()
-    found: CrowdDynamics = _KNOWN[key]
-    return found
+        _FORMULAS[key] = model.flat()
+    formula: CrowdDynamics = _FORMULAS[key]
+    return formula
 
 
 def contribution(term: Term, state: State) -> Tensor:
-    """``(B, N, 2)`` m/s²: what one effect adds to the accelerations, by its rule."""
+    """``(B, N, 2)`` m/s²: the acceleration that one effect adds by its rule."""
     laws = [t for t in state.terms if isinstance(t, Law)]
     code = {name: call for law in laws for name, call in law.code().items()}
     return crowd_rates([*laws, term], added_to(laws, [term], called=True), state, code)
@@ -219,22 +219,22 @@ def starts_of(
     scene: Scene,
     parameters: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Tensor]:
-    """``(B, N)`` values at the start of a lane's added states.
+    """Added state to its values ``(B, N)`` at the start.
 
     Args:
-        x, v: ``(B, N, 1)`` measured at the start.
-        parameters: by their symbols; None: the terms' own.
+        x, v: ``(B, N, 1)`` measured positions, m, and speeds, m/s, at the start.
+        parameters: symbol to value; None takes the terms' parameters.
     """
     if not lane.starts:
         return {}
     y = torch.cat([x, v, x.new_zeros(*x.shape[:2], len(lane.starts))], -1)
     zero = y.new_tensor(0.0)
-    found = rates_of(terms, _starts(lane), y, zero, scene, False, parameters=parameters)
-    return {name: found[..., i] for i, name in enumerate(lane.starts, start=2)}
+    starts = rates_of(terms, _starts(lane), y, zero, scene, False, parameters=parameters)
+    return {name: starts[..., i] for i, name in enumerate(lane.starts, start=2)}
 
 
 @cache
 def _starts(lane: LaneDynamics) -> LaneDynamics:
-    """Starts in the place of rates, also those of leaders; positions and speeds are measured."""
+    """A lane whose rates are the start values of added states, for leaders as well."""
     rates = {"x": const(0), "v": const(0), **lane.starts}
-    return replace(lane, rates=rates, leader=const(0), leads={}, chained={})
+    return replace(lane, rates=rates, leader=const(0), leader_rates={}, chained={})

@@ -1,7 +1,7 @@
 """The right-hand side of a lane from its formula, with PyTorch or with NumPy.
 
-Arrays have vehicles first, so that the vehicles ahead are the next rows, and sequences last:
-``(N, ..., B)``. What is written ``Array`` is a tensor or an array of NumPy.
+The first axis of arrays is the vehicle, the last is the sequence: ``(N, ..., B)``. The vehicle
+ahead is the next row. ``Array`` stands for a tensor or a NumPy array.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from nnode.model.terms import LaneDynamics
 Array = Any
 #: Values of a formula's symbols.
 Values = dict[str, Any]
-#: Gap that stands in for that of vehicles behind nobody, m.
+#: Gap of vehicles without a vehicle ahead, m. It keeps their unused rates finite.
 SAFE = 20.0
 
 
 class Formulas:
-    """Formulas as a function of their symbols' values, tensors or arrays.
+    """Formulas as a function of their symbols' values, which are tensors or arrays.
 
     Args:
         outputs: the formulas.
-        given: parts of them whose values are given with those of the symbols.
+        given: nodes of the formulas whose values are arguments.
     """
 
     def __init__(self, outputs: Sequence[Expr], given: Sequence[Expr] = ()) -> None:
@@ -43,17 +43,19 @@ class Formulas:
     def __call__(
         self,
         values: Mapping[str, Array],
-        known: Sequence[Array] = (),
+        given: Sequence[Array] = (),
         code: Mapping[str, Code] | None = None,
     ) -> list[Array]:
-        """Their values.
+        """The formulas' values.
 
         Args:
-            known: values of the given parts. code: what calls stand for, of tensors alone.
+            values: symbol to value.
+            given: values of the given nodes.
+            code: name to the function that calls of this name evaluate; only for tensors.
         """
         if isinstance(next(iter(values.values())), Tensor):
-            return computed(self.outputs, values, dict(zip(self.given, known, strict=True)), code)
-        return self._numpy(values, tuple(known))
+            return computed(self.outputs, values, dict(zip(self.given, given, strict=True)), code)
+        return self._numpy(values, tuple(given))
 
 
 class Rates:
@@ -64,10 +66,10 @@ class Rates:
         given: see :class:`Formulas`.
 
     Attributes:
-        chained: whether a vehicle's rates depend on ``dx_1``, so that they are computed after
-            those of the vehicle ahead.
-        at_once: the rates of all vehicles; of chained ones the parts that ``after`` needs.
-        after: chained rates from ``dx_1`` and these parts.
+        chained: whether a vehicle's rates depend on ``dx_1``. They are then computed after the
+            rates of the vehicle ahead.
+        at_once: the rates of all vehicles, or for chained rates the nodes that ``after`` needs.
+        after: chained rates from ``dx_1`` and these nodes.
     """
 
     def __init__(self, outputs: Sequence[Expr], given: Sequence[Expr] = ()) -> None:
@@ -85,7 +87,7 @@ class Rates:
 
 @cache
 def _formulas(lane: LaneDynamics) -> tuple[Rates, Formulas]:
-    """Those of followers, and of a leader that drives by itself."""
+    """The rates of followers, and the speed of a leader that drives by the law."""
     return Rates(list(lane.rates.values())), Formulas([lane.leader])
 
 
@@ -93,12 +95,12 @@ class LaneRates:
     """The right-hand side of a lane in its surroundings.
 
     Args:
-        lane: flat.
-        values: of symbols that are the same for all vehicles.
-        inputs: ``(N, ..., B)`` of what vehicles have from the data.
-        follower: ``(N, ..., B)`` True for vehicles behind another one.
-        leader: ``(N, ..., B)`` True for those in front.
-        code: what calls stand for.
+        lane: the flat formula.
+        values: values of symbols that all vehicles share.
+        inputs: symbol to the values ``(N, ..., B)`` of vehicles' properties from the data.
+        follower: ``(N, ..., B)`` True for vehicles behind another vehicle.
+        leader: ``(N, ..., B)`` True for the first vehicles.
+        code: name to the function that calls of this name evaluate.
     """
 
     def __init__(
@@ -120,28 +122,28 @@ class LaneRates:
         self._all_follow = self._library is np and bool(self.follows.all())
 
     def symbols(self, t: Array, y: Array, measured: Array) -> Values:
-        """Values ``(N - 1, ..., B)`` of what formulas of followers name, but for ``dx_1``.
+        """Values ``(N - 1, ..., B)`` of the symbols in followers' formulas except ``dx_1``.
 
         Args:
             t: s. y: ``(M, N, ..., B)`` states.
             measured: speeds of leaders, m/s.
         """
         library, states = self._library, dict(zip(self.lane.rates, y, strict=True))
-        found = {**self._fixed, "t": t, "measured": measured}
+        values = {**self._fixed, "t": t, "measured": measured}
         for name, every in states.items():
-            found[name] = every[:-1]
+            values[name] = every[:-1]
         for name, ahead in self.lane.ahead:
             value, safe = states[name][1:], SAFE if name == "x" else 0.0
             if ahead == 2:
                 value = library.concatenate([states[name][2:], states[name][-1:]])
-                value = library.where(self.second, value, found[f"{name}_1"] + safe)
-            elif library is torch:  # derivatives of what nobody reads have to be finite
-                value = library.where(self.follows, value, found[name] + safe)
-            found[f"{name}_{ahead}"] = value
-        return found
+                value = library.where(self.second, value, values[f"{name}_1"] + safe)
+            elif library is torch:  # unused rates need finite derivatives
+                value = library.where(self.follows, value, values[name] + safe)
+            values[f"{name}_{ahead}"] = value
+        return values
 
     def of_leaders(self, formulas: Formulas, y: Array, symbols: Values) -> list[Array]:
-        """Formulas of leaders, who have nobody ahead, from the values of followers' symbols."""
+        """The values of leaders' formulas, with vehicles ahead at the gap ``SAFE``."""
         states = dict(zip(self.lane.rates, y, strict=True))
         every = {**symbols, **self.inputs, **states, "second": 0.0}
         for name, ahead in self.lane.ahead:
@@ -152,16 +154,16 @@ class LaneRates:
         """``(M, N, ..., B)`` rates of the states.
 
         Args:
-            y: their values. symbols: see :meth:`symbols`.
-            lead: speeds of leaders; None: the formula tells them.
+            y: ``(M, N, ..., B)`` states. symbols: see :meth:`symbols`.
+            lead: speeds of leaders, m/s; None computes them by the formula.
         """
         library = self._library
         if lead is None:
             (lead,) = self.of_leaders(self._lead, y, symbols)
         if library is np:
-            found = np.zeros_like(y)
-            np.copyto(found[0], lead, where=self.leader)
-            lead = found[0]
+            result = np.zeros_like(y)
+            np.copyto(result[0], lead, where=self.leader)
+            lead = result[0]
         else:
             lead = torch.where(self.leader, lead, 0.0).expand_as(y[0])
         rates = self._formulas.at_once(symbols, code=self._code)
@@ -169,20 +171,20 @@ class LaneRates:
             wide = [getattr(part, "ndim", 0) == y.ndim - 1 for part in rates]
             rows, ahead = [], lead[-1]
             for i in range(len(self.follows) - 1, -1, -1):
-                here = [part[i] if w else part for part, w in zip(rates, wide, strict=True)]
-                rows.append(self._formulas.after({"dx_1": ahead}, here, self._code))
+                row_parts = [part[i] if w else part for part, w in zip(rates, wide, strict=True)]
+                rows.append(self._formulas.after({"dx_1": ahead}, row_parts, self._code))
                 ahead = rows[-1][0]
                 if not self._all_follow:
                     ahead = library.where(self.follows[i], ahead, lead[i])
             rates = [library.stack(row) for row in zip(*rows[::-1], strict=True)]
         if library is np:
-            for own, rate in zip(found[:, :-1], rates, strict=True):
+            for target, rate in zip(result[:, :-1], rates, strict=True):
                 if self._all_follow:
-                    own[...] = rate
+                    target[...] = rate
                 else:
-                    np.copyto(own, rate, where=self.follows)
-            return found
-        whole = []
+                    np.copyto(target, rate, where=self.follows)
+            return result
+        columns = []
         for rate, other in zip(rates, [lead, *[0.0 * lead] * (len(y) - 1)], strict=True):
-            whole.append(torch.cat([torch.where(self.follows, rate, other[:-1]), other[-1:]]))
-        return torch.stack(whole)
+            columns.append(torch.cat([torch.where(self.follows, rate, other[:-1]), other[-1:]]))
+        return torch.stack(columns)

@@ -1,4 +1,4 @@
-"""Names in formulas. They become names in generated source, so none is taken unchecked."""
+"""Checks of names in formulas, which become names in generated source."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from collections.abc import Iterable
 from nnode.errors import ConfigError
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*")
-#: Symbols are made of names, of their owners' names, and of numbers.
+#: A symbol consists of an owner's name, a name and numbers.
 _SYMBOL = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-#: Most entries of a kind, such as ``where``: the package's laws have 30 at most. A law with 100
-#: of each kind is built, or refused, within seconds.
+#: Largest number of entries of a kind, such as ``where``. The package's laws have at most 30. A
+#: law with 100 entries of each kind is built or refused within seconds.
 ENTRIES = 100
-#: Characters of a name that an error shows.
+#: Largest number of characters of a name in an error message.
 _SHOWN = 80
 
 
 def check_names(what: str, names: Iterable[object], *, in_code: bool = False) -> None:
-    """Check that names can stand in formulas and in generated source.
+    """Check that formulas and generated source can contain names.
 
     Args:
-        what: the kind of the names, for the error.
-        in_code: whether they stand in Python code, where a name such as ``lambda_`` ends with an
-            underscore because it would be a keyword without it.
+        what: the kind of the names, for the error message.
+        in_code: whether the names are Python attributes. A name such as ``lambda_`` may then end
+            with an underscore, because it would be a keyword without it.
 
     Raises:
         ConfigError: too many names, a name with other characters, or a keyword of Python.
@@ -43,13 +43,13 @@ def check_names(what: str, names: Iterable[object], *, in_code: bool = False) ->
 
 
 def check_symbols(names: Iterable[str]) -> None:
-    """Check the names that a generated module is about to contain.
+    """Check the symbols of a generated module.
 
-    Names are checked where they enter a model; this is the second check, directly before they
-    become source.
+    Names are also checked where they enter a model. This second check comes directly before the
+    source is generated.
 
     Raises:
-        ConfigError: a name that is no symbol.
+        ConfigError: a name that is not a valid symbol.
     """
     for name in names:
         if not _SYMBOL.fullmatch(name) or keyword.iskeyword(name):

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from nnode.errors import ConfigError
 from nnode.model.expression import Expr, apply, symbol
 
-#: Most neurons of a layer. The paper's networks have 10; formulas write every neuron out.
+#: Largest number of neurons of a layer. The paper's networks have 10. Formulas contain every
+#: neuron.
 NEURONS = 1000
 
 
@@ -25,7 +26,7 @@ class FeedForward(nn.Module):
 
     Args:
         sizes: neurons per layer without bias units, input first, e.g. ``(4, 4, 2)``.
-        generator: source of the initial weights; None draws from torch's global one.
+        generator: source of the initial weights; None takes torch's global generator.
 
     Shapes:
         ``(..., sizes[0])`` to ``(..., sizes[-1])``; ``sum((n_l + 1) * n_{l+1})`` weights.
@@ -51,15 +52,15 @@ class FeedForward(nn.Module):
 
     @torch.no_grad()
     def reset_parameters(self, generator: torch.Generator | None = None) -> None:
-        """Draw all weights anew, uniform on [-1, 1]."""
+        """Draw all weights, uniform on [-1, 1]."""
         for weight in self.parameters():
-            # drawn in float64 so that a seed means the same start in every precision
+            # drawn in float64, so that a seed gives the same start in every precision
             draw = torch.rand(weight.shape, generator=generator, dtype=torch.float64)
             weight.copy_(2 * draw - 1)
 
     @torch.no_grad()
     def zero_output_(self) -> None:
-        """Set the last layer to 0, so that the network says 0."""
+        """Set the weights of the last layer to 0, so that the output is 0."""
         for weight in self.layers[-1].parameters():
             weight.zero_()
 
@@ -72,19 +73,21 @@ class FeedForward(nn.Module):
     def written(
         self, inputs: Sequence[Expr], label: str, path: str
     ) -> tuple[list[Expr], dict[str, Any]]:
-        """Its outputs as formulas, neuron by neuron.
+        """The outputs as formulas, neuron by neuron.
 
         Args:
-            label: what the symbols of its weights begin with.
-            path: of the network in the model's named parameters.
+            inputs: formulas of the inputs.
+            label: prefix of the symbols of weights.
+            path: prefix of the network in the model's named parameters.
 
         Returns:
-            the outputs; the weights' symbols to name, place in it, and number of its axes.
+            The outputs; and the weights' symbols to parameter name, index in the flattened
+            parameter, and number of the parameter's axes.
         """
         owned: dict[str, Any] = {}
         values = list(inputs)
         for i, (n_in, n_out) in enumerate(pairwise(self.sizes)):
-            last, found = i == len(self.layers) - 1, []
+            last, layer = i == len(self.layers) - 1, []
             for u in range(n_out):
                 total = symbol(f"{label}_b{i}_{u}")
                 owned[f"{label}_b{i}_{u}"] = (f"{path}layers.{i}.bias", u, 1)
@@ -92,6 +95,6 @@ class FeedForward(nn.Module):
                     weight = f"{label}_w{i}_{u}_{k}"
                     owned[weight] = (f"{path}layers.{i}.weight", u * n_in + k, 2)
                     total = total + symbol(weight) * values[k]
-                found.append(total if last else apply("softplus", total))
-            values = found
+                layer.append(total if last else apply("softplus", total))
+            values = layer
         return values, owned

@@ -1,8 +1,8 @@
-"""The operations of formulas: one row each, which everything else reads.
+"""The table of the operations of formulas.
 
-A row gives the value for numbers of Python, arrays of NumPy, tensors of PyTorch and compiled code,
-the derivative, the rule for the unit, and the notation. Compiled code takes the functions that a
-row names from :mod:`nnode.simulation.kernels.functions`.
+A row defines the value for Python numbers, NumPy arrays, PyTorch tensors and compiled code, the
+derivative, the rule for the unit, and the notation. Compiled code takes the named functions from
+:mod:`nnode.simulation.kernels.functions`.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import torch
 from scipy.special import expit
 from torch.nn.functional import softplus
 
-#: A text with a field for every argument, and how tightly it binds: 1 a sum, 2 a product, 3 a sign,
-#: 4 a power, 5 what never needs brackets. An argument that binds less tightly than the number in
-#: its field stands in brackets.
+#: A text with a field for every argument, and the precedence: 1 for a sum, 2 a product, 3 a sign,
+#: 4 a power, 5 for text that never needs brackets. An argument is written in brackets if its
+#: precedence is below the number in its field.
 Notation = tuple[str, int]
 
 
@@ -29,19 +29,19 @@ class Operation:
     """An operation of one to three arguments.
 
     Attributes:
-        name: of the operation; formulas of users call it by this name.
+        name: name of the operation, by which users' formulas call it.
         code: Python code of the value, with a field for every argument.
         slope: Python code of the derivatives by the arguments a, b, c, where f is the value.
-        number: the function of this name that ``code`` calls, for Python's numbers; it raises an
-            error where it is not defined.
-        array: that function for NumPy.
-        tensor: that function for PyTorch.
-        alike: arguments that have one unit, which is that of the value.
-        powers: exponents of the arguments' units in the value's. Without ``alike`` and ``powers``
-            arguments and value are numbers without unit.
-        plain: the notation that is read again; None for ``name(...)``, as users call it.
-        latex: the notation on pages; None for the plain one.
-        internal: whether formulas of users may not call it.
+        number: the function of this name that ``code`` calls, for Python numbers. It raises an
+            error for arguments where it is undefined.
+        array: this function for NumPy.
+        tensor: this function for PyTorch.
+        alike: indices of the arguments that must have the unit of the value.
+        powers: exponents of the arguments' units in the value's unit. Without ``alike`` and
+            ``powers``, arguments and value are dimensionless.
+        plain: the notation that the parser reads; None for ``name(...)``.
+        latex: the notation on pages; None for the plain notation.
+        internal: whether users' formulas may not call it.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Operation:
 
 
 def _everywhere(name: str, slope: str, **other: Any) -> Operation:
-    """A function that has one name in all libraries."""
+    """A function with the same name in all libraries."""
     functions = (getattr(library, name) for library in (math, np, torch))
     return Operation(name, name + "({0})", slope, *functions, **other)
 
@@ -71,9 +71,9 @@ def _logistic(a: float) -> float:
     return 1 / (1 + math.exp(-a)) if a > 0 else math.exp(a) / (1 + math.exp(a))
 
 
-#: Operations by name. The softplus is PyTorch's: a itself beyond 20. What is no number stays none
-#: in ``max`` and ``min``; where both arguments are equal, the slope is that of the first. A sum
-#: that is added stays in brackets, so that it is read as it was written.
+#: Operations by name. The softplus is PyTorch's, which is a for a > 20. ``max`` and ``min``
+#: propagate NaN; where both arguments are equal, the derivative is by the first one. A sum as the
+#: second summand is written in brackets, so that the parser restores the order of the additions.
 OPERATIONS = {
     row.name: row
     for row in (
@@ -151,11 +151,11 @@ OPERATIONS = {
     )
 }
 
-#: Numbers of arguments of the functions that formulas of users may call.
+#: Function that users' formulas may call to its number of arguments.
 FUNCTIONS = {
     name: row.arguments for name, row in OPERATIONS.items() if not (row.plain or row.internal)
 }
-#: Names that code of operations contains, in the libraries that formulas are computed with.
+#: Library to the functions that the operations' code calls.
 LIBRARIES: dict[str, dict[str, Any]] = {
     "number": {"where": lambda condition, a, b: a if condition else b},
     "array": {"where": np.where},
@@ -167,6 +167,6 @@ for _library, _names in LIBRARIES.items():
 
 
 def compiled(code: str, arguments: str, names: dict[str, Any]) -> Callable[..., Any]:
-    """Code of a row as a function of arguments such as ``"f, a, b"``."""
+    """An operation's code as a function of arguments such as ``"f, a, b"``."""
     function: Callable[..., Any] = eval(f"lambda {arguments}: {code}", dict(names))
     return function

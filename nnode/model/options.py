@@ -1,4 +1,4 @@
-"""Options of every model, as dataclasses that the configuration is checked against."""
+"""Options of the models, as dataclasses that validate the configuration."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from omegaconf import MISSING
 
 
 class Leader(str, Enum):
-    """What the first vehicle of a platoon does."""
+    """How the first vehicle of a platoon moves."""
 
     constant = "constant"
     measured = "measured"
@@ -19,10 +19,10 @@ class Leader(str, Enum):
 class Desired(str, Enum):
     """Where people want to go, and how fast.
 
-    ``last`` is the paper's: to where each was last measured, at his present speed. This hands the
-    model the end of what it predicts. ``exit``: to the destinations that the data give;
-    ``direction``: along their stream; both at the preferred speed, which is measured in the
-    seconds before the sequence (``data.history``), else at its first sample.
+    ``last``, the paper's choice: to the last measured position, at the present speed. This gives
+    the model the end of the predicted path. ``exit``: to the destinations in the data.
+    ``direction``: along their stream. The last two use the preferred speed, which is measured in
+    the seconds before the sequence (``data.history``), or else at its first sample.
     """
 
     last = "last"
@@ -32,11 +32,11 @@ class Desired(str, Enum):
 
 @dataclass
 class ModelOptions:
-    """What all models share."""
+    """Options of all models."""
 
     name: str = MISSING  # label in results and plots: lin, n4, sf, ...
     term: str = MISSING  # the law, network or force that is calibrated
-    # named effects beside it: [{name: relative_speed, kappa: 0.3}, ...]
+    # named effects in addition: [{name: relative_speed, kappa: 0.3}, ...]
     effects: list[Any] = field(default_factory=list)
 
 
@@ -47,22 +47,22 @@ class LawOptions(ModelOptions):
     leader: Leader = Leader.constant
     v0: float = 30.0  # m/s, speed on an empty road; where the search starts
     L: float = 5.0  # m, gap at which all stop; where the search starts
-    L_min: float = 2.0  # m, L stays above it
+    L_min: float = 2.0  # m, lower bound of L
 
 
 @dataclass
 class FormulaOptions(ModelOptions):
-    """IDM and others, and laws of one's own: a formula with its parameters and units."""
+    """IDM and others, and user-defined laws: a formula with its parameters and units."""
 
     leader: Leader = Leader.measured
     # {parameters: {v0: 30 m/s, ...}, where: {...}, rate: {v: "..."}, source: ...}
     law: Any = MISSING
-    # neurons of a network NN that the law's rate calls, or that stands beside it; null: none
+    # neurons of a network NN that the law's rate calls, or that is added to it; null: none
     network: int | None = None
     box: float | None = None  # its weights stay in [-box, box]; null leaves them free
-    # of people: last (hands them the end of what is predicted) | exit | direction
+    # pedestrians: last (gives them the end of the predicted path) | exit | direction
     desired: Desired = Desired.last
-    wall_spacing: float = 0.25  # m between the points that stand for a wall, of people
+    wall_spacing: float = 0.25  # m between the points that represent a wall, pedestrians
 
 
 @dataclass
@@ -77,26 +77,26 @@ class NetworkSpeedOptions(ModelOptions):
 
 @dataclass
 class CrowdOptions(ModelOptions):
-    """What crowd models share."""
+    """Options of all crowd models."""
 
     tau: float = 0.5  # s, relaxation towards the desired velocity
     mass: float = 1.0  # kg, of a person
-    walls: bool = True  # whether walls push, where the data have some
-    wall_spacing: float = 0.25  # m between the points that stand for a wall
-    # last (the paper's: hands people the end of what is predicted) | exit | direction
+    walls: bool = True  # whether walls repel, if the data have some
+    wall_spacing: float = 0.25  # m between the points that represent a wall
+    # last (the paper's: gives people the end of the predicted path) | exit | direction
     desired: Desired = Desired.last
 
 
 @dataclass
 class SocialForceOptions(CrowdOptions):
-    """SF. A, k, kappa start uniform on [0, 50] where null."""
+    """SF, the social force model."""
 
     A: float | None = None  # N, repulsion at touch; null starts uniform on [0, 50]
     k: float | None = None  # kg/s², body force of overlap; null starts uniform on [0, 50]
     kappa: float | None = None  # kg/(m s), sliding friction; null starts uniform on [0, 50]
     r: float = 0.25  # m, radius of a person
     B: float = 0.05  # m, range of the repulsion
-    # walls slow down who slides along them (Helbing et al., 2000); false: the paper's sign
+    # walls decelerate people who slide along them (Helbing et al., 2000); false: the paper's sign
     opposing_wall_friction: bool = False
 
 
@@ -106,5 +106,5 @@ class NetworkForceOptions(CrowdOptions):
 
     hidden: int = 4  # neurons in the hidden layer of each force
     box: float | None = None  # weights stay in [-box, box]; null leaves them free
-    # people's mean contains j = i, a push NN(0, 0), as the paper's formula; false leaves it out
+    # the mean over people contains j = i, a force NN(0, 0), as in the paper's formula
     self_interaction: bool = False

@@ -1,8 +1,8 @@
-"""Formulas from text: arithmetic on names and numbers, and nothing else.
+"""Parser of formulas: arithmetic on names and numbers.
 
-The text is data: it is read by Python's own grammar, but only what is listed here is taken, and
-nothing of it is ever run. ``law(gap=...)`` stands for the law itself with other quantities in
-place of its own; there may be several such names.
+Python's grammar reads the text. The parser accepts only the listed elements and never executes
+the text. ``law(gap=...)`` is the law with other quantities in place of its own; there may be
+several such names.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from nnode.model.expression import Expr, apply, const, substitute, symbol, topol
 
 #: Limits of a text's characters, of nested parts, and of exponents.
 LENGTH, DEPTH, EXPONENT = 2000, 60, 64
-#: Limit of the operations of a formula with all the parts that it names. The largest law of the
-#: package has 400. A part that is named with other quantities, as part(dx=...), is built anew, so
-#: that 30 short parts can ask for 10^9 operations. 10,000 are built in half a second; compiling
-#: 1,200 takes more than three minutes.
+#: Limit of the operations of a formula with all its parts. The largest law of the package has 400.
+#: A part with other quantities, as part(dx=...), is built again, so that 30 short parts can
+#: require 10^9 operations. Building 10,000 takes half a second; compiling 1,200 takes more than
+#: three minutes.
 OPERATIONS = 10_000
 #: Names of functions and their numbers of arguments.
 FUNCTIONS = {**operations.FUNCTIONS, "abs": 1, "clip": 3}
@@ -31,13 +31,13 @@ _BINARY: dict[type, Callable[[Expr, Expr], Expr]] = {
     ast.Div: Expr.__truediv__,
     ast.Pow: Expr.__pow__,
 }
-#: What a name that is called stands for.
+#: The meaning of a called name: a formula, or a function of the arguments' formulas.
 Part = Expr | Callable[..., Expr]
 _LISTED = "expected + - * / **, brackets, numbers, names, and the functions " + ", ".join(FUNCTIONS)
 
 
 class FormulaError(ConfigError):
-    """A text that is no formula; the message shows the place."""
+    """A text that is not a formula; the message shows the place of the problem."""
 
     def __init__(self, text: str, column: int, problem: str) -> None:
         shown, column = _around(text, column)
@@ -54,16 +54,16 @@ def _around(text: str, column: int) -> tuple[str, int]:
 def parse(
     text: str, names: Mapping[str, Expr] | None = None, laws: Mapping[str, Part] | None = None
 ) -> Expr:
-    """A formula.
+    """Parse a formula.
 
     Args:
-        text: such as ``v0*(1 - L/gap)``.
-        names: what names stand for; None takes every name as a quantity of its own.
-        laws: name to the formula that ``name(...)`` stands for, with other quantities in it; or
-            to what makes a formula of the arguments, as of a network.
+        text: text such as ``v0*(1 - L/gap)``.
+        names: name to its formula; None makes a symbol of every name.
+        laws: name to the formula that ``name(...)`` denotes with other quantities in it; or to a
+            function of the arguments' formulas, as for a network.
 
     Raises:
-        FormulaError: anything that is no formula, with its place.
+        FormulaError: the text is not a formula.
     """
     if not isinstance(text, str):
         raise FormulaError(str(text), 0, f"expected text, got {type(text).__name__}")
@@ -88,7 +88,7 @@ class _Reader:
         self.built = 0
 
     def count(self, node: ast.AST, *parts: Expr) -> None:
-        """Add the operations of what is built, and refuse more than there may be."""
+        """Count the operations of new parts, and refuse more than the limit."""
         self.built += len(topological(parts))
         if self.built > OPERATIONS:
             raise self.fail(

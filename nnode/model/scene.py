@@ -1,4 +1,4 @@
-"""What stays fixed while a batch is simulated: who leads, where walls are, who walks where."""
+"""The fixed surroundings of a simulated batch: leaders, walls and destinations."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ class Scene:
         wall_count: ``(B, 1, 1)`` number of real wall points, at least 1.
         segment: ``(B, W, 4)`` walls x1, y1, x2, y2, m; NaN in the padding.
         start: ``(B,)`` clock time of the first sample, s.
-        near: wall points, normals and mask as of :meth:`walls_of_each`, where people feel a part of
-            the points; None: they feel all.
-        step: s, of the solver; method: what becomes of a law in it, see :mod:`nnode.model.steps`.
+        near: each person's nearby wall points, as :meth:`walls_of_each` returns them; None if all
+            points act on everyone.
+        step: the solver's time step, s.
+        method: the solver's method of stepping, see :mod:`nnode.model.steps`.
         preferred: ``(B, N, D)`` velocities before the sequence, m/s; the first measured ones where
-            nothing was measured before.
-        names: of the sequences.
+            no earlier data exist.
+        names: names of the sequences.
         kind, group: per sequence the agents' class and group names, or None.
     """
 
@@ -96,8 +97,8 @@ class Scene:
         )
 
     def walls_of_each(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Wall points ``(B, N or 1, P, 2)`` that each person feels, their normals, and the mask
-        ``(B, N or 1, P)`` of real ones."""
+        """Wall points ``(B, N or 1, P, 2)`` that act on each person, their normals, and the mask
+        ``(B, N or 1, P)`` of real points."""
         if self.near is not None:
             return self.near
         return self.wall[:, None], self.wall_normal[:, None], self.wall_point[:, None]
@@ -112,9 +113,9 @@ class Scene:
 
     def _between(self, samples: Tensor, t: Tensor) -> Tensor:
         position = t / self.dt
-        # a hair of tolerance keeps whole sample numbers whole in any precision
+        # the tolerance keeps whole sample numbers whole in any precision
         k = torch.floor(position + 1e-4).long().clamp(0, samples.shape[0] - 2)
-        # an index that stays a tensor lets the equations be recorded and run in batches
+        # a tensor index allows tracing and batching of the equations
         before, after = samples.index_select(0, torch.stack([k, k + 1]))
         return torch.lerp(before, after, (position - k).clamp(0, 1).to(before.dtype))
 
@@ -125,54 +126,51 @@ class Scene:
 
     @cached_property
     def mean_length(self) -> Tensor:
-        """Of the agents whose length is known, m; 0 where none is."""
-        known = torch.isfinite(self.length)
-        return torch.where(known, self.length, 0.0).sum() / known.sum().clamp(min=1)
+        """Mean length of the agents whose length is known, m; 0 if none is."""
+        is_known = torch.isfinite(self.length)
+        return torch.where(is_known, self.length, 0.0).sum() / is_known.sum().clamp(min=1)
 
     @cached_property
     def kinds(self) -> dict[str, Tensor]:
-        """Class name to ``(B, N)`` True for its agents; empty where no class is known."""
-        return self._masks(self.kind)
-
-    @cached_property
-    def companies(self) -> Tensor:
-        """``(B, N)`` number of an agent's social group in its sequence, from 1; 0: none."""
-        found = torch.zeros(self.agent.shape, dtype=torch.float64)
-        for b, names in enumerate(self.group):
-            known = sorted({name for name in names or () if name})
-            for i, name in enumerate(names or ()):
-                found[b, i] = known.index(name) + 1 if name else 0
-        return found.to(self.agent.device)
-
-    def _masks(self, labels: tuple[tuple[str, ...] | None, ...]) -> dict[str, Tensor]:
-        known = sorted({name for names in labels for name in names or () if name})
-        masks = {name: torch.zeros(self.agent.shape, dtype=torch.bool) for name in known}
-        for b, names in enumerate(labels):
+        """Class name to ``(B, N)`` True for its agents; empty if no class is known."""
+        kind_names = sorted({name for names in self.kind for name in names or () if name})
+        masks = {name: torch.zeros(self.agent.shape, dtype=torch.bool) for name in kind_names}
+        for b, names in enumerate(self.kind):
             for i, name in enumerate(names or ()):
                 if name:
                     masks[name][b, i] = True
         return {name: mask.to(self.agent.device) for name, mask in masks.items()}
 
+    @cached_property
+    def companies(self) -> Tensor:
+        """``(B, N)`` number of an agent's social group in its sequence, from 1; 0 for none."""
+        numbers = torch.zeros(self.agent.shape, dtype=torch.float64)
+        for b, names in enumerate(self.group):
+            group_names = sorted({name for name in names or () if name})
+            for i, name in enumerate(names or ()):
+                numbers[b, i] = group_names.index(name) + 1 if name else 0
+        return numbers.to(self.agent.device)
 
-#: Where people want to go: to the end of the sequence; to destinations from the data; along
-#: their stream.
+
+#: Kinds of destinations: the end of the sequence; destinations from the data; along the stream.
 DESIRED = ("last", "exit", "direction")
-#: So far away (m) lies the destination of who wants to walk in a direction.
+#: Distance (m) of the destination of people who walk in a direction.
 FAR = 1e4
 
 
-def wanted(scene: Scene, batch: Batch, desired: str) -> Scene:
-    """The scene with the destinations that a model is to know.
+def with_destinations(scene: Scene, batch: Batch, desired: str) -> Scene:
+    """The scene with the destinations for a model.
 
     Args:
-        desired: ``last``: those of the batch, by default everybody's last measured position, which
-            hands the model the end of what it predicts; ``exit``: those of the batch, which must
-            be others; ``direction``: far ahead in the direction of a person's stream. That is
-            the mean preferred velocity of everybody in the sequence whose own is within a right
-            angle of his, measured before the sequence, or at its first sample where nothing was.
+        desired: ``last``: the batch's destinations, by default the last measured positions, which
+            give the model the end of the predicted path. ``exit``: the batch's destinations,
+            which must differ from the last measured positions. ``direction``: far ahead in the
+            direction of the person's stream. The stream is the mean preferred velocity of all
+            people in the sequence whose preferred velocity is within a right angle of the
+            person's.
 
     Raises:
-        DataError: ``exit``, and the data tell no destinations.
+        DataError: ``exit``, and the data have no destinations.
     """
     if desired == "last":
         return scene
@@ -186,12 +184,12 @@ def wanted(scene: Scene, batch: Batch, desired: str) -> Scene:
                 "model.desired=direction"
             )
         return scene
-    # constants: nothing is differentiated by what people want
-    own = scene.preferred.detach() * scene.agent[..., None]
-    with_him = (own @ own.mT > 0).to(own.dtype)
-    stream = with_him @ own
+    # destinations are constants: gradients exclude them
+    preferred = scene.preferred.detach() * scene.agent[..., None]
+    same_stream = (preferred @ preferred.mT > 0).to(preferred.dtype)
+    stream = same_stream @ preferred
     length = torch.linalg.vector_norm(stream, dim=-1, keepdim=True)
-    # who stood has no direction: he wants to stay
+    # without a preferred velocity, the destination is the present position
     ahead = scene.measured[0].detach() + FAR * stream / length.clamp(min=1e-9)
     return replace(scene, destination=torch.where(scene.agent[..., None], ahead, batch.destination))
 
@@ -214,16 +212,16 @@ def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
         points ``(B, P, 2)``, unit normals into the walkable side ``(B, P, 2)`` and the mask
         ``(B, P)`` of real points. Padding points repeat far outside.
     """
-    known: dict[bytes, tuple[Tensor, Tensor]] = {}
+    points_of: dict[bytes, tuple[Tensor, Tensor]] = {}
     rows = []
     for segments in walls.detach().cpu().double():
         # the sequences of a recording share their walls
         key = segments.numpy().tobytes()
-        if key not in known:
-            known[key] = _points(segments, spacing)
-        rows.append(known[key])
-    most = max((len(points) for points, _ in rows), default=0)
-    shape = (len(rows), most, 2)
+        if key not in points_of:
+            points_of[key] = _points(segments, spacing)
+        rows.append(points_of[key])
+    width = max((len(points) for points, _ in rows), default=0)
+    shape = (len(rows), width, 2)
     point = torch.full(shape, 1e4, dtype=torch.float64)
     normal = torch.zeros(shape, dtype=torch.float64)
     real = torch.zeros(shape[:2], dtype=torch.bool)

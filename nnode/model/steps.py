@@ -1,8 +1,8 @@
-"""What a method of stepping makes of a law of second order: a change of its formula.
+"""Stepping methods for laws of second order, expressed as changes of the law's formula.
 
-Vehicles stop and do not drive backwards: where a step would end with a negative speed, it ends
-with 0. All methods are then Euler's on the changed formula, but for ``rk4``, whose stages are
-those of the changed formula.
+Vehicles stop and do not drive backwards: a step that would end with a negative speed ends with
+speed 0. Every method is Euler's method on the changed formula, except ``rk4``, which applies the
+Runge-Kutta method to it.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from nnode.errors import ConfigError
 from nnode.model.expression import Expr, apply, const, reciprocal, symbol
 from nnode.model.terms import LaneDynamics
 
-#: Methods of compiled code: Euler's; places with the new speed (SUMO's own); places with the mean
-#: of both speeds (Treiber & Kanagaraj 2015); Runge and Kutta's of fourth order.
+#: Methods: Euler; positions by the new speed (SUMO's default); positions by the mean of old and
+#: new speed (Treiber & Kanagaraj 2015); the fourth-order Runge-Kutta method.
 METHODS = ("euler", "semi_implicit", "ballistic", "rk4")
-#: What those are in stages of Runge and Kutta's.
+#: Method to the Runge-Kutta scheme that integrates its changed formula.
 STAGES = {"euler": "euler", "semi_implicit": "euler", "ballistic": "euler", "rk4": "rk4"}
-#: m/s; keeps a quotient of two numbers that are both 0 away.
+#: Smallest denominator, m/s; avoids 0/0.
 _TINY = 1e-12
 
 
@@ -27,11 +27,11 @@ _TINY = 1e-12
 def stepped(lane: LaneDynamics, method: str) -> LaneDynamics:
     """A flat lane whose rates are those of one step of ``dt`` seconds.
 
-    A speed never falls below 0: its rate is at least -v/dt. In a ballistic step in which a
-    vehicle stops, it comes v²/(2 |a|) farther (Treiber & Kanagaraj 2015, section 3).
+    A speed never falls below 0, since its rate is at least -v/dt. In a ballistic step in which a
+    vehicle stops, it moves v²/(2 |a|) (Treiber & Kanagaraj 2015, section 3).
 
     Raises:
-        ConfigError: a law that names ``dt``, a map from step to step, with stages in between.
+        ConfigError: the law names ``dt``, and the method has intermediate stages.
     """
     if method == "rk4" and "dt" in lane.symbols:
         raise ConfigError(
@@ -41,13 +41,13 @@ def stepped(lane: LaneDynamics, method: str) -> LaneDynamics:
     if lane.order == 1:
         return lane
     v, dt = symbol("v"), symbol("dt")
-    wanted = lane.rates["v"]
-    rate = apply("max", -v * reciprocal(dt), wanted)
+    acceleration = lane.rates["v"]
+    rate = apply("max", -v * reciprocal(dt), acceleration)
     place: Expr = v
     if method == "semi_implicit":
         place = v + dt * rate
     elif method == "ballistic":
-        braked = apply("max", -dt * wanted, const(_TINY))
+        braked = apply("max", -dt * acceleration, const(_TINY))
         stops = 0.5 * v * v * reciprocal(braked)
-        place = apply("choose", v + dt * wanted, v + 0.5 * dt * wanted, stops)
+        place = apply("choose", v + dt * acceleration, v + 0.5 * dt * acceleration, stops)
     return replace(lane, rates={**lane.rates, "x": place, "v": rate})

@@ -1,4 +1,4 @@
-"""A model: a sum of terms, of first order (traffic) or of second order (crowds)."""
+"""Models: sums of terms, of first or second order."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nnode.data.sequence import Batch
 from nnode.errors import DataError
 from nnode.model.formula import crowd_of, effect_alone, lane_of, rates_of, starts_of
 from nnode.model.laws import Law
-from nnode.model.scene import DESIRED, Scene, wanted
+from nnode.model.scene import DESIRED, Scene, with_destinations
 from nnode.model.term import Interval, State, Term, physical_parameters, short_names
 from nnode.model.terms import CrowdDynamics, Dynamics, LaneDynamics
 
@@ -25,16 +25,16 @@ N = TypeVar("N", bound=nn.Module)
 class System(nn.Module):
     """The right-hand side of an ordinary differential equation as a sum of terms.
 
-    A solver sees ``dy/dt = system(t, y, scene)`` with ``y`` of shape ``(B, N, order * D + M)``:
-    positions, in second-order models velocities, and the M additional states that terms own.
-    Terms are summed in their order: each can look at the sum before it.
+    A solver integrates ``dy/dt = system(t, y, scene)`` with ``y`` of shape
+    ``(B, N, order * D + M)``: positions, velocities in second-order models, and the M additional
+    states of terms. Terms are summed in their order, and each can use the sum of those before it.
 
     Attributes:
         domain: ``traffic`` or ``crowd``.
         order: 1, y = x; or 2, y = (x, v).
         dim: D, the number of space dimensions.
         terms: the summands.
-        wall_spacing: walls become points this far apart, m.
+        wall_spacing: largest distance between the points that represent a wall, m.
     """
 
     domain: str
@@ -50,20 +50,20 @@ class System(nn.Module):
 
     @property
     def step(self) -> str:
-        """The method of stepping where none is asked for: the law's own, or ballistic for
-        accelerations of vehicles and otherwise Euler's; see :mod:`nnode.model.steps`."""
+        """The default method of stepping: the law's method if it has one, ballistic for
+        accelerations of vehicles, and Euler's otherwise; see :mod:`nnode.model.steps`."""
         return "euler"
 
     @property
     def formula(self) -> Dynamics | None:
-        """The model's formula; None where a term is code without one."""
+        """The model's formula; None if a term is code without a formula."""
         return None
 
     @property
-    def names_places(self) -> bool:
-        """Whether rates depend on where the origin of positions lies, as with a speed zone; also
-        where this is not known, since a term is code."""
-        return self.formula is None or self.formula.names_places
+    def depends_on_position(self) -> bool:
+        """Whether rates depend on the origin of positions, as with a speed zone. It is True as
+        well for models without a formula, where this is unknown."""
+        return self.formula is None or self.formula.depends_on_position
 
     def scene(self, batch: Batch) -> Scene:
         """The fixed surroundings of a batch.
@@ -79,22 +79,22 @@ class System(nn.Module):
         return Scene.of(batch, self.wall_spacing)
 
     def initial(self, batch: Batch, step: float | None = None) -> Tensor:
-        """``(B, N, order * D)``: the measured state at the first sample.
+        """``(B, N, order * D + M)``: the measured state and the terms' states at the first sample.
 
         Args:
-            step: s, of the solver, for laws whose formula names it.
+            step: the solver's time step, s, for laws whose formula names it.
         """
         start = [batch.x[0], batch.v[0]][: self.order]
         return torch.cat([*start, *self._added(batch, step)], -1)
 
     @property
     def memory(self) -> int:
-        """Number M of states that terms add to those of motion."""
-        rules = (term.rule_for(self.order) for term in self._terms())
+        """Number M of the states that terms add."""
+        rules = (term.rule_for(self.order) for term in self.term_list)
         return sum(rule.memory for rule in rules if rule is not None)
 
     def _added(self, batch: Batch, step: float | None) -> list[Tensor]:
-        """``(B, N, M)`` the states that terms add, at the start."""
+        """One array ``(B, N, M)`` of the terms' states at the start, or none."""
         return []
 
     def acceleration(self, state: State) -> Tensor:
@@ -116,27 +116,29 @@ class System(nn.Module):
         """Whether the first vehicle of every sequence follows its measured path."""
         return False
 
-    def _terms(self) -> list[Term]:
+    @property
+    def term_list(self) -> list[Term]:
+        """The terms as a list with their type."""
         return cast(list[Term], list(self.terms))
 
     def _rates(self, state: State, memory: Tensor | None = None) -> Tensor:
-        """``(B, N, D + M)`` the sum of the terms, then the rates of the states that they add."""
-        terms, total, first = self._terms(), torch.zeros_like(state.x), 0
+        """``(B, N, D + M)``: the sum of the terms, then the rates of the states that they add."""
+        terms, total, first = self.term_list, torch.zeros_like(state.x), 0
         added: list[Tensor] = []
         for term in terms:
             rule = term.rule_for(self.order)
             number = 0 if rule is None else rule.memory
-            own = None if memory is None else memory[..., first : first + number]
+            term_memory = None if memory is None else memory[..., first : first + number]
             first += number
-            found = term(replace(state, terms=terms, rate=total, memory=own))
+            rate = term(replace(state, terms=terms, rate=total, memory=term_memory))
             if number:
-                added.append(found[..., self.dim :])
-                found = found[..., : self.dim]
-            total = self._imposed(total + found, state)
+                added.append(rate[..., self.dim :])
+                rate = rate[..., : self.dim]
+            total = self._imposed(total + rate, state)
         return torch.cat([total, *added], -1) if added else total
 
     def _imposed(self, rate: Tensor, state: State) -> Tensor:
-        """The rates, where some agents' are known from elsewhere."""
+        """The rates, with prescribed values for agents that follow their measured paths."""
         return rate
 
     def find(self, kind: type[T]) -> T | None:
@@ -144,36 +146,36 @@ class System(nn.Module):
         return next((term for term in self.terms if isinstance(term, kind)), None)
 
     def find_law(self, *entries: str) -> Law | None:
-        """The first term that was made from one of these entries of the package, or None."""
+        """The first law that was made from one of these package entries, or None."""
         laws = (term for term in self.terms if isinstance(term, Law))
         return next((law for law in laws if law.entry in entries), None)
 
     def extra_repr(self) -> str:
-        """The parameters that have a physical meaning, for those who print a model."""
+        """The parameters with a physical meaning, for the printed model."""
         values = self.physical()
         short = short_names(values)
         return ", ".join(f"{short[name]}={float(x):.5g} {u}" for name, (x, u) in values.items())
 
     def physical(self) -> dict[str, tuple[Tensor, str]]:
-        """Address, as ``lin.v0``, to (value, unit) of the parameters with a physical meaning."""
+        """Address, such as ``lin.v0``, to (value, unit) of the physical parameters."""
         return physical_parameters(self)
 
     def bounds(self) -> dict[str, Interval]:
         """Admissible values by the names of ``named_parameters()``; others are free."""
         return {
             f"terms.{i}.{name}": interval
-            for i, term in enumerate(self._terms())
+            for i, term in enumerate(self.term_list)
             for name, interval in term.bounds.items()
         }
 
     def project_(self) -> None:
         """Move every parameter into its admissible set."""
-        for term in self._terms():
+        for term in self.term_list:
             term.project_()
 
 
 class Traffic(System):
-    """One lane: dx_i/dt is the sum of the terms, or dv_i/dt where the law says an acceleration.
+    """One lane: the sum of the terms is dx_i/dt, or dv_i/dt for a law of second order.
 
     Args:
         leader: ``constant``: the leader drives at its law's v0; ``measured``: it follows its
@@ -195,21 +197,21 @@ class Traffic(System):
     @property
     def step(self) -> str:
         law = self.terms[0] if len(self.terms) else None
-        own = law.step if isinstance(law, Law) else None
-        if own == "rk4" and self.formula is not None and "dt" in self.formula.symbols:
-            own = None  # an effect that remembers step by step has no stages in between
-        return own or ("ballistic" if self.order > 1 else "euler")
+        method = law.step if isinstance(law, Law) else None
+        if method == "rk4" and self.formula is not None and "dt" in self.formula.symbols:
+            method = None  # an effect that remembers step by step has no stages in between
+        return method or ("ballistic" if self.order > 1 else "euler")
 
     @property
     def formula(self) -> LaneDynamics | None:
-        return lane_of(self._terms())
+        return lane_of(self.term_list)
 
     def _added(self, batch: Batch, step: float | None) -> list[Tensor]:
         if not self.memory:
             return []
-        terms, lane, scene = self._terms(), self.formula, self.scene(batch)
+        terms, lane, scene = self.term_list, self.formula, self.scene(batch)
         scene = scene if step is None else replace(scene, step=step)
-        if lane is None:  # code that remembers nothing does not matter at the start
+        if lane is None:  # terms without states do not affect the start values
             rules = [term.rule_for(self.order) for term in terms]
             added = [
                 term
@@ -221,12 +223,14 @@ class Traffic(System):
         models = [(terms, lane)]
         if lane is None:
             models = [([terms[0], term], effect_alone(terms[0], term)) for term in added]
-        found: dict[tuple[int, str], Tensor] = {}
-        for i, (own, formula) in enumerate(models):
+        start_values: dict[tuple[int, str], Tensor] = {}
+        for i, (model_terms, formula) in enumerate(models):
             assert formula is not None
-            starts = starts_of(own, formula, batch.x[0], batch.v[0], scene)
-            found |= {(i, state): starts[state] for state in list(formula.rates)[self.order :]}
-        return [torch.stack(list(found.values()), -1)]
+            starts = starts_of(model_terms, formula, batch.x[0], batch.v[0], scene)
+            start_values |= {
+                (i, state): starts[state] for state in list(formula.rates)[self.order :]
+            }
+        return [torch.stack(list(start_values.values()), -1)]
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
         place = scene.measured_at(t) if self.leader_measured else None
@@ -245,21 +249,21 @@ class Traffic(System):
                 -1,
             )
         law = self.terms[0]
-        # a law of the gap alone computes its speed without a formula of the lane
+        # a law of only the gap computes its speed without the lane's formula
         alone = len(self.terms) == 1 and isinstance(law, Law) and law.of_gap
         lane = None if alone else self.formula
         if lane is not None:
-            rate = rates_of(self._terms(), lane, y, t, scene, place is not None)
+            rate = rates_of(self.term_list, lane, y, t, scene, place is not None)
             return rate if place is None else rate.masked_fill(lead, 0.0)
-        found = self._rates(State(t, y[..., :1], None, scene), y[..., 1:])
+        rates = self._rates(State(t, y[..., :1], None, scene), y[..., 1:])
         if place is None:
-            return found
+            return rates
         # the leader's state is never read: its place is known at every time
-        rate = found[..., :1].masked_fill(lead, 0.0)
-        return torch.cat([rate, found[..., 1:]], -1)
+        rate = rates[..., :1].masked_fill(lead, 0.0)
+        return torch.cat([rate, rates[..., 1:]], -1)
 
     def _imposed(self, rate: Tensor, state: State) -> Tensor:
-        # of no account for laws of the gap, but effects look at the speed of the vehicle ahead
+        # effects depend on the speed of the vehicle ahead; laws of the gap alone do not
         if not self.leader_measured or len(self.terms) == 1:
             return rate
         speed = state.scene.measured_rate_at(state.t)
@@ -285,13 +289,13 @@ class Traffic(System):
 
 
 class Crowd(System):
-    """Two dimensions: dx_i/dt = v_i, dv_i/dt is the sum of the terms; or dx_i/dt, of a law of
-    first order.
+    """People in the plane: dx_i/dt = v_i, and dv_i/dt is the sum of the terms. For a law of first
+    order, dx_i/dt is the sum.
 
     Args:
-        desired: where people want to go, see :func:`nnode.model.scene.wanted`.
+        desired: where people want to go, see :func:`nnode.model.scene.with_destinations`.
         neighbours: ``simulated``: people react to each other's simulated states;
-            ``measured``: each is simulated alone among the measured paths of the others.
+            ``measured``: each person is simulated among the measured paths of the others.
     """
 
     domain = "crowd"
@@ -317,41 +321,47 @@ class Crowd(System):
 
     @property
     def formula(self) -> CrowdDynamics | None:
-        return crowd_of(self._terms())
+        return crowd_of(self.term_list)
 
     def scene(self, batch: Batch) -> Scene:
-        return wanted(super().scene(batch), batch, self.desired)
+        return with_destinations(super().scene(batch), batch, self.desired)
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
         moving = [y] if self.order == 1 else [y[..., :2], y[..., 2:]]
-        seen = None
+        measured_others = None
         if self.neighbours == "measured":
             place = scene.measured_at(t)
-            seen = place, place if self.order == 1 else scene.measured_rate_at(t)
-        state = State(t, moving[0], moving[1] if self.order > 1 else None, scene, seen=seen)
+            measured_others = place, place if self.order == 1 else scene.measured_rate_at(t)
+        state = State(
+            t,
+            moving[0],
+            moving[1] if self.order > 1 else None,
+            scene,
+            measured_others=measured_others,
+        )
         return torch.cat([*moving[1:], self._rates(state)], -1)
 
 
 def with_parameters(module: N, parameters: Mapping[str, Tensor]) -> N:
-    """A model or a term with tensors in place of some parameters; the others are shared.
+    """A copy of a model or term with tensors in place of some parameters; it shares the others.
 
     Args:
-        parameters: by their names in ``module.named_parameters()``; of any shape.
+        parameters: name in ``module.named_parameters()`` to a tensor of any shape.
     """
-    found = copy.copy(module)
-    found._parameters, found._modules = dict(module._parameters), dict(module._modules)
-    inner: dict[str, dict[str, Tensor]] = {}
+    copied = copy.copy(module)
+    copied._parameters, copied._modules = dict(module._parameters), dict(module._modules)
+    by_module: dict[str, dict[str, Tensor]] = {}
     for name, value in parameters.items():
-        first, _, rest = name.partition(".")
-        if rest:
-            inner.setdefault(first, {})[rest] = value
+        first, _, inner_name = name.partition(".")
+        if inner_name:
+            by_module.setdefault(first, {})[inner_name] = value
         else:
-            found._parameters[name] = value  # type: ignore[assignment]
-    for name, own in inner.items():
+            copied._parameters[name] = value  # type: ignore[assignment]
+    for name, inner_parameters in by_module.items():
         part = module._modules[name]
         assert part is not None
-        found._modules[name] = with_parameters(part, own)
-    return found
+        copied._modules[name] = with_parameters(part, inner_parameters)
+    return copied
 
 
 def initial_with(

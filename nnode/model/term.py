@@ -1,4 +1,4 @@
-"""What a term of a model is: a module with a name, a formula, units and a source."""
+"""Terms of models: modules with a name, a formula, units and a source."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from nnode.model.terms import Rule
 
 @dataclass
 class State:
-    """What the terms of a model see at one moment.
+    """The arguments of a model's terms at one time.
 
     Attributes:
         t: seconds since the first sample, a scalar tensor, or ``(B,)``.
         x: ``(B, N, D)`` positions, m.
         v: ``(B, N, D)`` velocities, m/s; None in first-order models.
-        scene: everything that does not change during the simulation.
-        terms: the model's terms; an effect looks there for the law that it changes.
+        scene: the fixed surroundings.
+        terms: the model's terms, among them the law that an effect changes.
         rate: ``(B, N, D)`` sum of the terms before, m/s or m/s².
         memory: ``(B, N, M)`` the M states that the term adds.
-        seen: where the others are, ``(x, v)``, for a person who looks around; None where they
+        measured_others: the others' measured positions and velocities; None where others
             are simulated as well.
     """
 
@@ -39,13 +39,13 @@ class State:
     terms: Sequence[Term] = ()
     rate: Tensor | None = None
     memory: Tensor | None = None
-    seen: tuple[Tensor, Tensor] | None = None
+    measured_others: tuple[Tensor, Tensor] | None = None
 
     @property
     def others(self) -> tuple[Tensor, Tensor]:
         """Positions and velocities of the others, ``(B, N, D)`` each."""
-        if self.seen is not None:
-            return self.seen
+        if self.measured_others is not None:
+            return self.measured_others
         if self.v is None:
             raise ValueError("a term of a second-order model needs velocities")
         return self.x, self.v
@@ -71,12 +71,12 @@ class Term(nn.Module):
     :meth:`declare`, which records unit and admissible set.
 
     Class attributes:
-        name: the field's name of the effect.
+        name: the name of the effect in the literature.
         formula: the formula of a term without rules, in the symbols of the parameters.
-        source: where the formula stands.
-        rule: of a law or a force, its formulas; None: ``forward`` is code, which runs in PyTorch.
-        rules: of an effect, the order of a model to what the effect does to it, as formulas.
-        fast: parameters that time constants of its states are proportional to, with the factor.
+        source: reference of the formula.
+        rule: the formulas of a law or a force; None if ``forward`` is PyTorch code.
+        rules: for an effect, the order of a model to the effect's formulas in it.
+        fast: parameter to a factor; the product is a time constant of the term's states.
         side_by_side: whether ``forward`` takes many simulations at once, with times ``(B,)`` and
             scalar parameters ``(B, 1, 1)``.
     """
@@ -101,7 +101,7 @@ class Term(nn.Module):
         """Add a scalar parameter, in float64, with its unit and admissible set.
 
         Raises:
-            ConfigError: its name cannot stand in a formula.
+            ConfigError: a formula cannot contain the name.
         """
         check_names("parameters", [name], in_code=True)
         start = torch.tensor(float(value), dtype=torch.float64)
@@ -113,7 +113,7 @@ class Term(nn.Module):
 
     @property
     def shape(self) -> tuple[Any, ...]:
-        """What its formula depends on: terms with the same have the same formula."""
+        """Key of the formula: terms with equal keys have equal formulas."""
         return type(self), tuple(self.scalars)
 
     def bound_all(self, prefix: str, bounds: Interval) -> None:
@@ -123,7 +123,7 @@ class Term(nn.Module):
                 self.bounds[name] = bounds
 
     def idle(self, name: str) -> None:
-        """Take a declared parameter out of calibration and out of reports."""
+        """Exclude a declared parameter from calibration and reports."""
         getattr(self, name).requires_grad_(False)
         del self.units[name]
 
@@ -136,7 +136,7 @@ class Term(nn.Module):
                 parameter.clamp_(bounds.low, bounds.high)
 
     def rule_for(self, order: int) -> Rule | None:
-        """Its formulas in a model of an order; None: there are none, or it is code."""
+        """Its formulas in a model of an order; None if there are none."""
         return self.rules.get(order)
 
     @classmethod
@@ -147,25 +147,25 @@ class Term(nn.Module):
 
     @classmethod
     def formula_lines(cls) -> list[str]:
-        """Its formulas in all orders, line by line; lines that repeat are left out."""
-        found: list[str] = []
+        """Its formulas in all orders, line by line, without repeated lines."""
+        collected: list[str] = []
         for order, rule in sorted(cls.rules.items()):
             lines = described(rule)
             of = "of an acceleration, " if order == 2 and not rule.of_crowd else ""
-            new = [of + lines[0], *(line for line in lines[1:] if line not in found)]
-            found += [f"{of}the same"] if lines == found else new
-        return found or [cls.formula]
+            new = [of + lines[0], *(line for line in lines[1:] if line not in collected)]
+            collected += [f"{of}the same"] if lines == collected else new
+        return collected or [cls.formula]
 
     def forward(self, state: State) -> Tensor:
-        """``(B, N, D)`` what it adds to the sum; then the rates of the states that it adds."""
+        """``(B, N, D + M)``: its addition to the sum, then the rates of the states that it adds."""
         raise NotImplementedError  # pragma: no cover - every term defines its own
 
     def inputs(self, scene: Scene) -> dict[str, Tensor]:
-        """``(B, N)`` values of what agents have from the data, by the names of the rule's."""
+        """Name of a rule's input to the agents' values ``(B, N)`` from the data."""
         return {}
 
 
-#: Entries of a crowd's rule that are reduced over others or walls, in words.
+#: Descriptions of the entries of a crowd's rule that are reduced over others or walls.
 _REDUCED = {
     "others": "sum over others",
     "points": "sum over wall points",
@@ -179,33 +179,33 @@ def described(rule: Rule, left: str = "W becomes ") -> list[str]:
     """The formulas of a rule, line by line.
 
     Args:
-        left: what stands before the rate of a lane.
+        left: prefix of the rate of a lane.
     """
     if rule.of_crowd:
         change = "dv{}/dt: {}{}" if rule.order == 2 else "d{}/dt = {}{}"
-        found = [
+        text_lines = [
             change.format(axis, "" if rule.order == 1 or text.startswith("-") else "+ ", text)
             for axis, text in zip("xy", rule.rate, strict=True)
         ]
         for over, words in _REDUCED.items():
             parts = getattr(rule, over)
-            found += [f"{name} = {words} of {text}" for name, (_, text) in parts.items()]
+            text_lines += [f"{name} = {words} of {text}" for name, (_, text) in parts.items()]
     else:
-        found = [f"{left}{rule.rate}" if rule.rate else f"a leader's W becomes {rule.leader}"]
-        found += [
+        text_lines = [f"{left}{rule.rate}" if rule.rate else f"a leader's W becomes {rule.leader}"]
+        text_lines += [
             f"{name} = {text}, {delay} ago (at most {rule.remembered} steps)"
             for name, (text, _, delay) in rule.delayed.items()
         ]
-        found += [
+        text_lines += [
             f"d{name}/dt = {rate}, at the start {start}"
             for name, (_, rate, start) in rule.states.items()
         ]
-    found += [f"{name} = {text}" for name, text in rule.where.items()]
-    found += [
+    text_lines += [f"{name} = {text}" for name, text in rule.where.items()]
+    text_lines += [
         f"{name} = {value:g} {'' if unit == '1' else unit}".rstrip()
         for name, (value, unit) in rule.constants.items()
     ]
-    return found + [
+    return text_lines + [
         f"{name}: of each agent, from the data{'' if unit == '1' else f' ({unit})'}"
         for name, unit in rule.inputs.items()
     ]
@@ -214,8 +214,8 @@ def described(rule: Rule, left: str = "W becomes ") -> list[str]:
 def physical_parameters(module: nn.Module) -> dict[str, tuple[Tensor, str]]:
     """Address to (value, unit) of every declared scalar parameter of the terms in ``module``.
 
-    The address is the term's name and the parameter's, ``lin.v0``: whatever other terms there are,
-    it stays the same. Of terms of one name the second is numbered, ``speed_zone_2.alpha``.
+    The address consists of the term's name and the parameter's name, ``lin.v0``, and does not
+    depend on the other terms. Repeated names of terms are numbered, ``speed_zone_2.alpha``.
     """
     return {
         address: (getattr(term, name).detach(), term.units[name])
@@ -237,17 +237,17 @@ def _declared(module: nn.Module) -> Iterator[tuple[str, Term, str]]:
 
 
 def numbered(names: Iterable[str]) -> list[str]:
-    """Names of terms, of which the second of one name is numbered, and those after it."""
-    seen: Counter[str] = Counter()
-    found = []
+    """Unique names of terms: repeated names are numbered from the second on."""
+    count: Counter[str] = Counter()
+    unique = []
     for name in names:
-        seen[name] += 1
-        found.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
-    return found
+        count[name] += 1
+        unique.append(name if count[name] == 1 else f"{name}_{count[name]}")
+    return unique
 
 
 def short_names(addresses: Iterable[str]) -> dict[str, str]:
-    """Addresses of parameters to what is printed: the parameter's name where it is alone."""
+    """Addresses of parameters to printed names: the parameter's name, if it is unique."""
     bare = {address: address.rpartition(".")[2] for address in addresses}
     count = Counter(bare.values())
     return {address: name if count[name] == 1 else address for address, name in bare.items()}

@@ -1,15 +1,14 @@
-"""Formulas as text: plain, and LaTeX."""
+"""Formulas as plain text and as LaTeX."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 from nnode.model.expression import Expr, topological
 from nnode.model.operations import OPERATIONS, Notation
 
-#: Characters of a part that is written out: what can be read again. A part that is named often
-#: is written as often: without a bound, 40 parts that double have 10^12 characters.
+#: Largest number of characters of a part that is written out, which is the parser's limit. The
+#: text repeats shared nodes: without a bound, 40 nodes that double it have 10^12 characters.
 LONGEST = 2000
 
 
@@ -30,34 +29,33 @@ _LATEX = _Language(
 
 
 class _Part(NamedTuple):
-    """A part that is written, how tightly it binds, and the brackets of its language."""
+    """The text of a node, its precedence, and the brackets of its language."""
 
     text: str
     level: int
     brackets: str
 
-    def __format__(self, least: str) -> str:
-        return self.brackets.format(self.text) if self.level < int(least or 0) else self.text
+    def __format__(self, min_level: str) -> str:
+        return self.brackets.format(self.text) if self.level < int(min_level or 0) else self.text
 
 
 def number(value: float) -> str:
-    """As short as it can be read back."""
+    """The shortest of two texts that restores the number."""
     short = f"{value:.12g}"
     return short if float(short) == value else repr(value)
 
 
 def plain(node: Expr) -> str:
-    """As :func:`nnode.model.parse.parse` reads it; parts that are longer than it reads are
-    written ``(...)``."""
-    return _written(node, _PLAIN, {})
+    """The text that :func:`nnode.model.parse.parse` reads; longer parts are written ``(...)``."""
+    return _written(node, _PLAIN)
 
 
-def latex(node: Expr, names: Mapping[str, str] | None = None) -> str:
-    """For a page; ``names`` of symbols that are written otherwise."""
-    return _written(node, _LATEX, names or {})
+def latex(node: Expr) -> str:
+    """The LaTeX text for a page; longer parts are written ``(...)``."""
+    return _written(node, _LATEX)
 
 
-def _written(node: Expr, language: _Language, names: Mapping[str, str]) -> str:
+def _written(node: Expr, language: _Language) -> str:
     written: dict[Expr, _Part] = {}
     for part in topological([node]):
         args: tuple[Expr, ...] = part.args
@@ -65,9 +63,8 @@ def _written(node: Expr, language: _Language, names: Mapping[str, str]) -> str:
         if part.op == "const":
             text, level = number(part.value), 5 if part.value >= 0 else 3
         elif part.op == "symbol":
-            # in plain text a parameter by its address
-            name = part.value.replace("__", ".") if language is _PLAIN else _subscript(part.value)
-            text = names.get(part.value, name)
+            # plain text shows a parameter's address
+            text = part.value.replace("__", ".") if language is _PLAIN else _subscript(part.value)
         elif part.op == "mul" and args[0] is args[1]:
             text, level = language.square
         elif part.op == "mul" and "recip" in (args[0].op, args[1].op):
@@ -88,7 +85,7 @@ def _written(node: Expr, language: _Language, names: Mapping[str, str]) -> str:
 
 
 def _notation(op: str, language: _Language) -> Notation | None:
-    """Of an operation that is not written as a call."""
+    """The notation of an operation; None if it is written as a call."""
     if op == "call":
         return None
     row = OPERATIONS[op]

@@ -1,7 +1,7 @@
-"""Whether the parts of a formula have units that go together.
+"""Dimensional analysis of formulas.
 
-Dimensions are exponents of metre, second and kilogram; ``*`` is any unit, as weights of a network
-have.
+A dimension consists of the exponents of metre, second and kilogram. The unit ``*`` is any unit, as
+of the weights of a network.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ Dimension = tuple[Fraction, Fraction, Fraction]
 NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
 _BASE = ("[length]", "[time]", "[mass]")
 
-# Pint computes the text of a quantity: a tower of powers such as 9**9**9 would never end. Only
-# names of units may be raised, once each, to one digit: the package's laws need m⁴ at most.
-#: Characters of a quantity or unit; the longest of the package's laws has 11.
+# Pint evaluates the text of a quantity, and powers such as 9**9**9 would never end. Only names of
+# units may be raised, once each, to one digit. The package's laws need at most m⁴.
+#: Largest number of characters of a quantity or unit. The package's laws have at most 11.
 LONGEST = 100
 _DIGIT = r"[+-]?\d(?:\.\d{1,3})?"
 _POWER = rf"(?:\s*(?:\*\*|\^)\s*(?:{_DIGIT}|\(\s*{_DIGIT}\s*\))|[⁺⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹])(?![\w.]|\s*\()"
@@ -33,17 +33,17 @@ _TOKEN = re.compile(
     r"|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?(?![\d.])"  # a number
     r"|\*(?!\s*\*)|[/·()\s]"
 )
-#: Words by which Pint raises as well.
+#: Words that Pint reads as powers.
 _POWER_WORDS = re.compile(r"squared|cubed|square|cubic|sq\b")
 _EXPECTED_UNIT = (
     "expected one such as m/s² or kg/(m s), of names of units, *, / and powers of one digit"
 )
-#: Powers of units in the parts of a formula; beyond them they are no quantities of mechanics.
+#: Largest power of a unit in the parts of a formula.
 _HIGHEST_POWER = 1000
 
 
 def _readable(text: str) -> bool:
-    """Whether Pint may compute a text: its size is bounded, and so is every power in it."""
+    """Whether Pint may evaluate a text, because its length and every power in it are bounded."""
     if len(text) > LONGEST or _POWER_WORDS.search(text):
         return False
     place = len(text) - len(text.lstrip().removeprefix("-"))
@@ -57,17 +57,17 @@ def _readable(text: str) -> bool:
 
 @cache
 def _registry() -> Any:
-    import pint  # takes a third of a second: only who checks units waits for it
+    import pint  # the import takes a third of a second
 
     return pint.UnitRegistry()
 
 
 @cache
 def dimension(unit: str) -> Dimension | None:
-    """Of a unit such as ``m/s²``; None for ``*``.
+    """The dimension of a unit such as ``m/s²``; None for ``*``.
 
     Raises:
-        ConfigError: it is no unit of length, time and mass.
+        ConfigError: the text is not a unit of length, time and mass.
     """
     if unit == "*":
         return None
@@ -84,10 +84,10 @@ def dimension(unit: str) -> Dimension | None:
 
 @cache
 def in_si(value: str) -> tuple[float, str]:
-    """A quantity such as ``120 km/h`` in SI units, and its unit's name as written in them.
+    """The value of a quantity such as ``120 km/h`` in SI units, and the SI unit.
 
     Raises:
-        ConfigError: it is no number with a unit.
+        ConfigError: the text is not a number with a unit.
     """
     wrong = (
         f"{value[:LONGEST]!r} is no quantity; expected a finite number and a unit, such as 30 m/s "
@@ -106,13 +106,13 @@ def in_si(value: str) -> tuple[float, str]:
 
 
 def _powers(dimensionality: Mapping[str, Any]) -> Dimension:
-    """Of metre, second and kilogram."""
+    """The exponents of metre, second and kilogram."""
     length, time, mass = (Fraction(dimensionality.get(b, 0)).limit_denominator(8) for b in _BASE)
     return length, time, mass
 
 
 def shown(unit: Dimension) -> str:
-    """A dimension as a unit, such as m/s²."""
+    """The SI unit of a dimension as text, such as m/s²."""
     powers = {"kg": unit[2], "m": unit[0], "s": unit[1]}
     over = [_raised(name, power) for name, power in powers.items() if power > 0]
     under = [_raised(name, -power) for name, power in powers.items() if power < 0]
@@ -128,10 +128,10 @@ def _raised(name: str, power: Fraction) -> str:
 
 
 def unit_of(node: Expr, units: Mapping[str, str]) -> Dimension | None:
-    """Of a formula, from the units of its symbols; None: any.
+    """The dimension of a formula from the units of its symbols; None for any dimension.
 
     Raises:
-        ConfigError: parts whose units do not go together, with both of them.
+        ConfigError: parts of the formula have incompatible units.
     """
     dimensions: dict[Expr, Dimension | None] = {}
     for part in topological([node]):
@@ -140,10 +140,10 @@ def unit_of(node: Expr, units: Mapping[str, str]) -> Dimension | None:
 
 
 def check(name: str, node: Expr, units: Mapping[str, str], wanted: str) -> None:
-    """That a formula has a unit.
+    """Check that a formula has the unit ``wanted``.
 
     Raises:
-        ConfigError: it has not, or its parts do not go together.
+        ConfigError: the formula has another unit, or its parts have incompatible units.
     """
     unit, expected = unit_of(node, units), dimension(wanted)
     if unit is not None and expected is not None and unit != expected and not node.is_number(0):

@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.model import System
-from nnode.model.extend import beside
+from nnode.model.extend import omitted_effects
 from nnode.plots.interaction import (
     Part,
     Vector,
@@ -195,7 +195,7 @@ def _contours(
     bar.ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
     bar.ax.yaxis.label.set_fontsize(FONT)
     title = describe(term, part)
-    left_out = beside(system)
+    left_out = omitted_effects(system)
     if left_out:
         title += f", {left_out}"
     if contact is not None:

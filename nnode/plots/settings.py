@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from nnode.errors import ConfigError
 from nnode.model import System
-from nnode.model.extend import beside
+from nnode.model.extend import omitted_effects
 from nnode.plots.interaction import (
     Part,
     Vector,
@@ -100,7 +100,7 @@ def six_settings(
             "force_red": [tuple(map(float, force)) for force in red],
         }
     )
-    what = ", ".join(filter(None, (describe(term, part), beside(system))))
+    what = ", ".join(filter(None, (describe(term, part), omitted_effects(system))))
     return _quivers(table, what), table
 
 

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 from nnode.model import System
-from nnode.model.extend import beside
+from nnode.model.extend import omitted_effects
 from nnode.model.laws import Law
 from nnode.plots.style import (
     GREY,
@@ -304,7 +304,7 @@ def _curve(
 
 def _left_out(models: Mapping[str, System]) -> list[str]:
     """Which effects the curves are drawn without."""
-    effects = {name: beside(system) for name, system in models.items()}
+    effects = {name: omitted_effects(system) for name, system in models.items()}
     having = {name: words for name, words in effects.items() if words}
     if len(having) > 2:
         return [f"{len(having)} models have effects beside their laws, not drawn"]

@@ -1,4 +1,4 @@
-"""Solvers: one interface, several ways to a trajectory and its gradient."""
+"""Solvers with one interface, which compute trajectories and their gradients."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["FusedSolver", "Solver", "TorchdiffeqSolver", "Trajectory", "substeps
 
 
 def __getattr__(name: str) -> Any:
-    # Numba takes a second to import: only who asks for compiled code waits for it
+    # importing Numba takes a second, so it is delayed until compiled code is needed
     if name == "FusedSolver":
         from nnode.simulation.fused import FusedSolver
 

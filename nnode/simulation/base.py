@@ -14,13 +14,13 @@ from nnode.errors import ConfigError, DataError, SimulationError
 from nnode.model.system import System
 
 #: Default steps, s, by domain and order: the paper's for traffic and for crowds at 25 frames/s;
-#: crowds recorded at 16 frames/s keep their own interval. Car following of second order takes the
-#: interval of most recordings, as the field does (Treiber & Kanagaraj 2015).
+#: crowds recorded at 16 frames/s use the sampling interval. Car following of second order uses the
+#: interval of most recordings (Treiber & Kanagaraj 2015).
 DEFAULT_STEP = {("traffic", 1): 0.002, ("traffic", 2): 0.1}
 _CROWD_STEP = 0.0625
 
-#: Steps in a sampling interval, at most: of 1 s they would be microseconds, in which no vehicle
-#: and no person changes its speed by more than 1e-5 m/s.
+#: Largest number of steps in a sampling interval. In an interval of 1 s the steps are then 1 µs, in
+#: which vehicles and people change their speeds by at most 1e-5 m/s.
 MOST_STEPS = 10**6
 
 
@@ -32,8 +32,8 @@ class Trajectory:
         x: ``(K, B, N, D)`` m, in the coordinates of the batch.
         v: ``(K, B, N, D)`` m/s in second-order models, else None.
         given: ``(B, N)`` True for agents that follow their measured paths, as a leader with
-            ``model.leader=measured``: their error is 0 by construction, and errors of the model
-            leave them out. None: there is none.
+            ``model.leader=measured``. Their error is 0 by construction, so the model's errors
+            exclude them. None if there are none.
     """
 
     x: Tensor
@@ -42,25 +42,25 @@ class Trajectory:
 
 
 class Solver(Protocol):
-    """Anything that simulates a model on a batch and can be differentiated through."""
+    """A differentiable simulation of a model on a batch."""
 
     def __call__(self, system: System, batch: Batch) -> Trajectory:
         """Simulate from the first measured state, at the batch's sampling times."""
 
 
 def simulated_batch(system: System, batch: Batch) -> tuple[Batch, Tensor | None]:
-    """What a solver computes with: the batch, all of it in the precision of simulations.
+    """The batch in the precision of simulations.
 
-    Simulations in float64 take positions as they are. Others take them relative to an origin of
-    each sequence, since what float32 rounds grows with the distance from the origin. Where the
-    model's formula names places themselves, as a speed zone does, they stay as they are too.
+    Simulations in float64 use the measured positions. Simulations in float32 use positions
+    relative to an origin of each sequence, because rounding errors grow with the distance from the
+    origin. Positions are not shifted if the model depends on them, as with a speed zone.
 
     Returns:
-        The batch and the origins ``(B, D)``, m; None: positions are as they are.
+        The batch; and the origins ``(B, D)``, m, or None if positions are not shifted.
     """
     if batch.dtype == batch.x.dtype:
         return batch, None
-    origin = None if system.names_places else batch.origins()
+    origin = None if system.depends_on_position else batch.origins()
     return batch.relative_to(origin), origin
 
 
@@ -69,8 +69,8 @@ def observed(system: System, y: Tensor, batch: Batch, origin: Tensor | None) -> 
 
     Args:
         y: ``(..., B, N, M)`` states, positions first.
-        batch: as it was measured, before :func:`simulated_batch`.
-        origin: ``(B, D)`` m, of the states; None: 0.
+        batch: the measured batch, before :func:`simulated_batch`.
+        origin: ``(B, D)`` origins of the states, m; None for 0.
     """
     y = y.to(batch.x.dtype)
     if origin is not None:
@@ -80,7 +80,7 @@ def observed(system: System, y: Tensor, batch: Batch, origin: Tensor | None) -> 
 
 
 def substeps(sampling: float, dt: float | None, system: System) -> int:
-    """Number of steps in a sampling interval; a whole number, never rounded silently.
+    """The whole number of steps in a sampling interval.
 
     Args:
         sampling: sampling interval, s.
@@ -88,9 +88,9 @@ def substeps(sampling: float, dt: float | None, system: System) -> int:
             the default of the model's domain and order.
 
     Raises:
-        ConfigError: ``dt`` is not positive, does not divide the sampling interval, or there are
-            more than :data:`MOST_STEPS`.
-        DataError: there is no sampling interval, as in a single sample.
+        ConfigError: ``dt`` is not positive or does not divide the sampling interval, or there are
+            more than :data:`MOST_STEPS` steps.
+        DataError: the sampling interval is not a positive number, as for a single sample.
     """
     if not (math.isfinite(sampling) and sampling > 0):
         raise DataError(
@@ -99,20 +99,20 @@ def substeps(sampling: float, dt: float | None, system: System) -> int:
         )
     if dt is not None and not (math.isfinite(dt) and dt > 0):
         raise ConfigError(f"solver.dt={dt} must be a positive number of seconds")
-    usual = DEFAULT_STEP.get((system.domain, system.order), _CROWD_STEP)
-    ratio = sampling / (dt or usual)
+    default = DEFAULT_STEP.get((system.domain, system.order), _CROWD_STEP)
+    ratio = sampling / (dt or default)
     if ratio > MOST_STEPS * (1 + 1e-6):
         raise ConfigError(
-            f"steps of {dt or usual:g} s (solver.dt) are {ratio:.3g} in the sampling interval of "
+            f"steps of {dt or default:g} s (solver.dt) are {ratio:.3g} in the sampling interval of "
             f"{sampling:g} s, expected at most {MOST_STEPS:.0e}; take a larger solver.dt, or "
             "solver.dt=null, and check that the times of the data are in seconds"
         )
     if dt is None:
         return max(1, math.ceil(ratio - 1e-6))
     number = round(ratio)
-    # sampling intervals come from recorded times, which carry rounding errors
+    # recorded times, and so sampling intervals, have rounding errors
     if number < 1 or abs(ratio - number) > 1e-6 * max(1.0, ratio):
-        near = " or ".join(f"{value:.6g}" for value in _dividing(sampling, dt))
+        near = " or ".join(f"{value:.6g}" for value in _dividing_steps(sampling, dt))
         raise ConfigError(
             f"solver.dt={dt:g} s does not divide the sampling interval {sampling:g} s of the "
             f"data; use solver.dt={near}, or solver.dt=null to let it be chosen"
@@ -120,24 +120,24 @@ def substeps(sampling: float, dt: float | None, system: System) -> int:
     return number
 
 
-def _dividing(sampling: float, dt: float) -> list[float]:
-    """The nearest steps at or below and above ``dt`` that divide ``sampling``, short decimals
-    first choice."""
+def _dividing_steps(sampling: float, dt: float) -> list[float]:
+    """The nearest steps at or below and above ``dt`` that divide ``sampling``, preferably with few
+    decimals."""
 
     def short(number: int) -> bool:
         return float(f"{sampling / number:.3g}") == float(f"{sampling / number:.9g}")
 
     first = max(1, math.ceil(sampling / dt))
-    below = next((n for n in range(first, 4 * first) if short(n)), first)
-    above = next((n for n in range(first - 1, 0, -1) if short(n)), None)
-    return [sampling / n for n in (below, above) if n]
+    smaller = next((n for n in range(first, 4 * first) if short(n)), first)
+    larger = next((n for n in range(first - 1, 0, -1) if short(n)), None)
+    return [sampling / n for n in (smaller, larger) if n]
 
 
 def check_finite(trajectory: Trajectory, batch: Batch) -> Trajectory:
-    """Return the trajectory, or say where its first number that is none stands.
+    """Return the trajectory if it is finite.
 
     Raises:
-        SimulationError: with sequence, agent and time.
+        SimulationError: a number is not finite; the message states sequence, agent and time.
     """
     bad = (~trajectory.x.isfinite()).any(-1) & batch.valid
     if bool(bad.any()):

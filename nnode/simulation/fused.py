@@ -1,10 +1,9 @@
-"""The fused solver: all steps of a simulation, and its gradient, in one compiled call."""
+"""The fused solver, which computes all steps of a simulation and its gradient in compiled code."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -13,7 +12,6 @@ from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.model.steps import METHODS
 from nnode.model.system import System, with_parameters
-from nnode.model.term import Term
 from nnode.simulation.base import (
     Trajectory,
     check_finite,
@@ -28,41 +26,40 @@ log = logging.getLogger(__name__)
 
 
 class FusedSolver:
-    """A method of fixed steps and the exact gradient of its discrete scheme, in compiled code.
+    """A fixed-step method with the exact gradient of its discrete scheme, in compiled code.
 
-    With ``method="euler"``, the default of speeds, states equal those of
-    ``TorchdiffeqSolver("euler")`` up to rounding; in float32 those of traffic are closer to the
-    float64 ones, as steps are added with compensation. The gradient is that of
-    ``TorchdiffeqSolver("euler", "discrete")``: not the paper's continuous adjoint, from which it
-    differs by O(dt). ``rk4`` is the classic method, and torchdiffeq's the 3/8 rule, which differs
-    from it by O(dt^4).
+    With ``method="euler"``, the default for laws of first order, states equal those of
+    ``TorchdiffeqSolver("euler")`` up to rounding. In float32, traffic states are closer to the
+    float64 states, because steps are added with compensation. The gradient is that of
+    ``TorchdiffeqSolver("euler", "discrete")``. It differs by O(dt) from the paper's continuous
+    adjoint. ``rk4`` is the classic Runge-Kutta method; torchdiffeq's ``rk4`` is the 3/8 rule, from
+    which it differs by O(dt^4).
 
-    Models whose law and effects are formulas (see :mod:`nnode.model.terms`) run compiled.
-    Any other model, with a term that is code of its own, goes through torchdiffeq: the same
-    gradient, at the speed and with the memory of PyTorch. The solver warns of it once.
+    Compiled code covers models whose law and effects are formulas (see
+    :mod:`nnode.model.terms`). A model with a term that is PyTorch code runs by torchdiffeq, which
+    gives the same gradient at the speed and with the memory of PyTorch. The solver warns once.
 
-    The first call for a law compiles (seconds) and keeps the result in the user's cache
-    folder, or in NNODE_CACHE where this environment variable is set.
+    The first call for a law compiles (seconds) and stores the result in the user's cache folder,
+    or in the folder of the environment variable NNODE_CACHE.
 
     Args:
         dt: step, s; None takes the domain's default, as TorchdiffeqSolver.
-        threads: at most so many threads compute blocks of simulations.
-        cutoff: m; in crowds, pairs, and people and wall points, that are farther apart do not
-            interact, whatever the number of people. It must be larger than the distance 2 r of
-            people who touch. For a force network it changes the model, since nothing makes such
-            a force decay. None derives it from ``cutoff_error`` for social forces of many
-            people, and lets everybody meet everybody otherwise.
-        cutoff_error: without a ``cutoff``, the largest social force of one partner that may be
-            left out, in units of A. The acceleration of one person is then off by less than
-            ``cutoff_error`` A / m through people, and as much through walls; see
-            :func:`nnode.simulation.kernels.crowds.cutoff_distance`. 0 lets everybody meet
-            everybody.
-        method: of lanes, one of :data:`nnode.model.steps.METHODS`; None takes the law's own,
-            ``rk4`` for the smooth laws of the field, else ``ballistic`` for accelerations and
-            ``euler`` for speeds.
+        threads: largest number of threads for blocks of simulations.
+        cutoff: in crowds, distance (m) beyond which people do not interact with each other and
+            with wall points. It must be larger than the distance 2 r of people who touch. For a
+            force network it changes the model, because such a force need not decay. None derives
+            it from ``cutoff_error`` for social forces of many people, and otherwise computes all
+            pairs.
+        cutoff_error: without a ``cutoff``, the largest omitted social force of one partner, in
+            units of A. The error of a person's acceleration is then below ``cutoff_error`` A / m
+            through people, and as much through walls; see
+            :func:`nnode.simulation.kernels.crowds.cutoff_distance`. 0 computes all pairs.
+        method: for lanes, one of :data:`nnode.model.steps.METHODS`. None takes the law's method,
+            ``rk4`` for smooth laws, or else ``ballistic`` for accelerations and ``euler`` for
+            speeds.
 
     Attributes:
-        uncompiled: why the model it warned of is not compiled; empty: there was none.
+        uncompiled: why the model of the warning is not compiled; empty without a warning.
 
     Raises:
         ConfigError: fewer than one thread, a cutoff that is not positive, or an error outside
@@ -101,15 +98,15 @@ class FusedSolver:
         return check_finite(self.unchecked(system, batch), batch)
 
     def unchecked(self, system: System, batch: Batch) -> Trajectory:
-        """The same, with states that are not finite among them."""
-        n, near, origin = self._posed(system, batch)
+        """Simulate without the check that states are finite."""
+        n, near, origin = self._prepare(system, batch)
         lane, law = lanes.supports(system, batch), crowds.supports(system, batch)
         if lane is not None:
             y = lanes.simulate(system, lane, near, n, self.threads, method=self.method)[:, 0]
         elif law is not None:
             y = crowds.simulate(system, law, near, n, self.threads, self.cutoff, self.cutoff_error)
         else:
-            # the relaxation alone is a baseline, and cheap
+            # relaxation without interactions is a cheap baseline
             if not self.uncompiled and not crowds.without_partners(system):
                 self.uncompiled = _reason(system)
                 log.warning(
@@ -123,20 +120,20 @@ class FusedSolver:
     def ensemble(
         self, system: System, parameters: Mapping[str, Tensor], batch: Batch
     ) -> Trajectory:
-        """Simulate R runs with parameters of their own, side by side.
+        """Simulate R runs with separate parameters at the same time.
 
-        A run that blows up keeps its states that are not finite; the others do not notice.
+        A run that blows up keeps its non-finite states and does not affect other runs.
 
         Args:
-            parameters: by their names in ``system.named_parameters()``, each with a leading
-                axis of R runs; the trajectory can be differentiated with respect to them.
-                Parameters that are missing are the system's own in all runs.
+            parameters: name in ``system.named_parameters()`` to values with a leading axis of R
+                runs; the trajectory is differentiable with respect to them. Missing parameters
+                have the system's values in all runs.
 
         Returns:
             x and v of shape ``(K, R, B, N, D)``.
 
         Raises:
-            ConfigError: as in a single run, an unknown name, or shapes that do not fit.
+            ConfigError: as in a single run; an unknown name; or shapes that do not fit.
             DataError: as in a single run.
         """
         stacked = _stack(system, parameters)
@@ -150,17 +147,16 @@ class FusedSolver:
                 for r in range(len(next(iter(stacked.values()))))
             ]
         else:
-            n, near, origin = self._posed(system, batch)
+            n, near, origin = self._prepare(system, batch)
             y = lanes.simulate(system, lane, near, n, self.threads, stacked, self.method)
-            runs = [observed(system, own, batch, origin) for own in y.unbind(1)]
+            runs = [observed(system, states, batch, origin) for states in y.unbind(1)]
         v = [run.v for run in runs if run.v is not None]
         return Trajectory(torch.stack([run.x for run in runs], 1), torch.stack(v, 1) if v else None)
 
-    def _posed(self, system: System, batch: Batch) -> tuple[int, Batch, Tensor | None]:
-        """Steps in a sampling interval, the batch as it is simulated, and the origins of its
-        places."""
+    def _prepare(self, system: System, batch: Batch) -> tuple[int, Batch, Tensor | None]:
+        """Steps in a sampling interval, the simulated batch, and the origins of its positions."""
         if batch.x.shape[-1] != system.dim:
-            system.scene(batch)  # says so
+            system.scene(batch)  # raises the error
         if self.cutoff is not None and not (
             crowds.supports(system, batch) or crowds.without_partners(system)
         ):
@@ -172,8 +168,8 @@ class FusedSolver:
 
 
 def _reason(system: System) -> str:
-    """Why compiled code is not used, in words: terms that it does not cover, by their names."""
-    terms = cast(list[Term], list(system.terms))
+    """Why compiled code is not used: the names of terms that it does not cover."""
+    terms = system.term_list
     names = ", ".join(t.name for t in terms if t.rule_for(system.order) is None)
     if names:
         return f"it does not cover {names}"
@@ -183,22 +179,23 @@ def _reason(system: System) -> str:
 
 def _stack(system: System, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """All parameters of the system with a leading axis of runs."""
-    own = dict(system.named_parameters())
-    unknown = sorted(set(parameters) - set(own))
+    defaults = dict(system.named_parameters())
+    unknown = sorted(set(parameters) - set(defaults))
     if unknown or not parameters:
         raise ConfigError(
             f"an ensemble needs parameters of the model, found {unknown or 'none'}; the model "
-            f"has: {', '.join(own)}"
+            f"has: {', '.join(defaults)}"
         )
     runs = {len(value) if value.ndim else 0 for value in parameters.values()}
     for name, value in parameters.items():
-        if len(runs) > 1 or value.shape[1:] != own[name].shape or 0 in runs:
+        shape = defaults[name].shape
+        if len(runs) > 1 or value.shape[1:] != shape or 0 in runs:
             raise ConfigError(
-                f"{name} of an ensemble must have shape (R, {', '.join(map(str, own[name].shape))})"
+                f"{name} of an ensemble must have shape (R, {', '.join(map(str, shape))})"
                 f" with the same R >= 1 for all parameters, found {tuple(value.shape)}"
             )
     number = runs.pop()
     return {
         name: parameters[name] if name in parameters else value.expand(number, *value.shape)
-        for name, value in own.items()
+        for name, value in defaults.items()
     }

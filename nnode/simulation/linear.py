@@ -1,8 +1,8 @@
-"""The linear response of a simulated path: how small changes move it, without simulating again.
+"""The linear response of a simulated path to small changes, without another simulation.
 
-Along a path y(t) of dy/dt = f(t, y) small changes d of the states obey d' = A(t) d + s(t), where A
-is the derivative of f by the states and s a change of the rates. The trapezoidal rule solves this
-at the sampling times, in time proportional to their number.
+Along a path y(t) of dy/dt = f(t, y), small changes d of the states obey d' = A(t) d + s(t), where
+A is the derivative of f by the states and s is a change of the rates. The trapezoidal rule solves
+this at the sampling times, in time proportional to their number.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from nnode.model.terms import LaneDynamics
 from nnode.simulation.numpy import runge_kutta
 from nnode.simulation.rhs import RightHandSide, arranged, rates_along, samples
 
-#: Derivatives of rates ``(N - 1, K, B)`` by number of the rate's state, number of vehicles ahead,
-#: and number of the state that is varied. The number after the last state is that of the speed
-#: ``dx_1`` of the vehicle ahead.
+#: (index of the rate's state, number of vehicles ahead, index of the varied state) to derivatives
+#: of rates ``(N - 1, K, B)``. The index after the last state stands for ``dx_1``, the speed of the
+#: vehicle ahead.
 Blocks = dict[tuple[int, int, int], np.ndarray]
 
 
@@ -36,21 +36,21 @@ class Solver(Protocol):
     """Linearised equations along a path."""
 
     def response(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-        """``(K, N, C, B)`` changes of the first state, by changes of rates and starts.
+        """``(K, N, C, B)`` changes of the first state by C changes of rates and starts.
 
         Args:
-            source: ``(K, W, N, C, B)`` changes of the first W states' rates; the others' do not
-                change.
-            start: ``(M, N, C, B)`` changes of the states at the start; None: there are none.
+            source: ``(K, W, N, C, B)`` changes of the rates of the first W states; the other
+                rates do not change.
+            start: ``(M, N, C, B)`` changes of the states at the start; None for 0.
         """
         ...
 
 
 class DenseSolver:
-    """Equations where all states of a group depend on all.
+    """Equations in which all states of a sequence may depend on each other.
 
     Args:
-        matrix: A, ``(K, B, M N, M N)``, one state of all agents after the other.
+        matrix: A, ``(K, B, M N, M N)``; each state of all agents is contiguous.
         width: M. dt: sampling interval, s.
     """
 
@@ -60,18 +60,18 @@ class DenseSolver:
 
     def response(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
         k, w, n, c, b = source.shape
-        every = np.zeros((k, self._width, n, c, b))
-        every[:, :w] = source
-        flat = torch.from_numpy(every).flatten(1, 2).permute(0, 3, 1, 2)
+        all_sources = np.zeros((k, self._width, n, c, b))
+        all_sources[:, :w] = source
+        flat = torch.from_numpy(all_sources).flatten(1, 2).permute(0, 3, 1, 2)
         forced = self._forced(flat)
         state = flat.new_zeros(flat.shape[1:])
         if start is not None:
             state = torch.from_numpy(start).flatten(0, 1).permute(2, 0, 1).contiguous()
-        found = [state]
+        states = [state]
         for step, change in zip(self._step, forced, strict=True):
-            found.append(step @ found[-1] + change)
-        moved: np.ndarray = torch.stack(found)[:, :, :n].permute(0, 2, 3, 1).numpy()
-        return moved
+            states.append(step @ states[-1] + change)
+        positions: np.ndarray = torch.stack(states)[:, :, :n].permute(0, 2, 3, 1).numpy()
+        return positions
 
     def _forced(self, source: Tensor) -> Tensor:
         """``(K - 1, B, M N, C)`` changes of the states in each step by ``source``
@@ -80,9 +80,10 @@ class DenseSolver:
 
 
 class RungeKuttaSolver(DenseSolver):
-    """Positions and velocities, by the classical method of fourth order in place of the trapezoidal
-    rule; accelerations are parabolas through three samples. A gait's sway of one second, and the
-    contact of two people, change too fast for lines.
+    """Positions and velocities by the classic Runge-Kutta method instead of the trapezoidal rule.
+
+    Accelerations are parabolas through three samples. Linear interpolation is too inaccurate for a
+    gait's sway of one second and for contacts of people.
 
     Args:
         matrix: A, ``(K, B, 2 N, 2 N)``, positions of all agents before velocities.
@@ -104,18 +105,18 @@ class RungeKuttaSolver(DenseSolver):
         self._step, self._of_before, self._of_after = y.split(size, -1)
 
     def _forced(self, source: Tensor) -> Tensor:
-        found = self._of_before @ source[:-1] + self._of_after @ source[1:]
+        change = self._of_before @ source[:-1] + self._of_after @ source[1:]
         half = source.shape[2] // 2
         bend = source[2:, :, half:] - 2 * source[1:-1, :, half:] + source[:-2, :, half:]
-        found[1:, :, :half] -= self._dt**2 / 24 * bend
-        found[1:, :, half:] -= self._dt / 12 * bend
-        return found
+        change[1:, :, :half] -= self._dt**2 / 24 * bend
+        change[1:, :, half:] -= self._dt / 12 * bend
+        return change
 
 
 class FrontToBackSolver:
-    """Equations of a platoon whose vehicles depend on themselves and on the two ahead.
+    """Equations of a platoon whose vehicles depend on themselves and on the two vehicles ahead.
 
-    At each time the vehicles are solved one by one, from the front on.
+    At each time the vehicles are solved one by one, starting from the front.
 
     Args:
         blocks: A.
@@ -126,11 +127,13 @@ class FrontToBackSolver:
         self._blocks, self._width, self._half = blocks, width, dt / 2
         self._chained = any(q == width for _, _, q in blocks)
         self._ahead = {key: dt / 2 * slope for key, slope in blocks.items() if key[1]}
-        own = {(p, q): slope for (p, ahead, q), slope in blocks.items() if not ahead}
+        own_blocks = {(p, q): slope for (p, ahead, q), slope in blocks.items() if not ahead}
         self._inverse = dict[tuple[int, int], np.ndarray]()
-        if own:
-            matrix = np.zeros((*next(iter(own.values())).shape, width, width)) + np.eye(width)
-            for (p, q), slope in own.items():
+        if own_blocks:
+            matrix = np.zeros((*next(iter(own_blocks.values())).shape, width, width)) + np.eye(
+                width
+            )
+            for (p, q), slope in own_blocks.items():
                 matrix[..., p, q] -= dt / 2 * slope
             inverse = _inverse(torch.from_numpy(matrix)).numpy()
             for p, q in np.ndindex(width, width):
@@ -138,46 +141,48 @@ class FrontToBackSolver:
                     self._inverse[p, q] = np.ascontiguousarray(inverse[..., p, q])
 
     def response(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-        times, known, n, c, b = source.shape
-        # after the states stands the change of the speed, (A d)_0
+        times, width, n, c, b = source.shape
+        # the row after the states is the change of the speed, (A d)_0
         d = np.zeros((self._width + 1, n, c, b))
         half = np.zeros((self._width, n, c, b))
         if start is not None:
             d[:-1] = start
             first = {key: slope[:, :1] for key, slope in self._blocks.items()}
-            matrix = whole(first, (self._width, n, 1, b))[..., 0, :]
+            matrix = dense_jacobian(first, (self._width, n, 1, b))[..., 0, :]
             half = start + self._half * np.einsum("pnqmb,qmcb->pncb", matrix, start)
-        right, share = np.empty_like(half), np.empty((c, b))
-        found = np.empty((times, n, c, b))
-        found[0] = d[0]
+        right_side, share = np.empty_like(half), np.empty((c, b))
+        positions = np.empty((times, n, c, b))
+        positions[0] = d[0]
         for k in range(1, times):
-            right[:] = half
-            right[:known] += self._half * (source[k - 1] + source[k])
-            d[:-1, -1] = right[:, -1]
+            right_side[:] = half
+            right_side[:width] += self._half * (source[k - 1] + source[k])
+            d[:-1, -1] = right_side[:, -1]
             for i in range(n - 2, -1, -1):
-                self._solve(d, right, i, k, share)
-            # the other half of the rule follows from what was solved: d - dt/2 A d = right
+                self._solve(d, right_side, i, k, share)
+            # d + dt/2 A d for the next step follows from d - dt/2 A d = right_side
             np.multiply(d[:-1], 2.0, out=half)
-            half -= right
-            found[k] = d[0]
-        return found
+            half -= right_side
+            positions[k] = d[0]
+        return positions
 
-    def _solve(self, d: np.ndarray, right: np.ndarray, i: int, k: int, share: np.ndarray) -> None:
-        """The states of vehicle ``i`` at a time, those ahead of it being known."""
-        rest = right[:, i].copy() if self._ahead else right[:, i]
+    def _solve(
+        self, d: np.ndarray, right_side: np.ndarray, i: int, k: int, share: np.ndarray
+    ) -> None:
+        """Solve for the states of vehicle ``i`` at time ``k`` from those of the vehicles ahead."""
+        remainder = right_side[:, i].copy() if self._ahead else right_side[:, i]
         for (p, ahead, q), slope in self._ahead.items():
             if i + ahead < d.shape[1]:
                 np.multiply(slope[i, k], d[q, i + ahead], out=share)
-                rest[p] += share
+                remainder[p] += share
         if not self._inverse:
-            d[:-1, i] = rest
+            d[:-1, i] = remainder
         else:
             d[:-1, i] = 0.0
             for (p, q), inverse in self._inverse.items():
-                np.multiply(inverse[i, k], rest[q], out=share)
+                np.multiply(inverse[i, k], remainder[q], out=share)
                 d[p, i] += share
         if self._chained:
-            np.subtract(d[0, i], right[0, i], out=d[-1, i])
+            np.subtract(d[0, i], right_side[0, i], out=d[-1, i])
             d[-1, i] /= self._half
 
 
@@ -188,60 +193,61 @@ def trapezoidal(matrix: np.ndarray, dt: float) -> tuple[Tensor, Tensor]:
         matrix: A, ``(K, ..., M, M)``. dt: sampling interval, s.
 
     Returns:
-        Two tensors ``(K - 1, ..., M, M)``: the states after an interval by those before, and by
-        ``dt / 2`` times the sum of s at both ends.
+        Two tensors ``(K - 1, ..., M, M)``: derivatives of the states after an interval by the
+        states before it, and by ``dt / 2`` times the sum of s at both ends.
     """
-    half, one = dt / 2 * torch.from_numpy(matrix), torch.eye(matrix.shape[-1]).double()
-    after = _inverse(one - half[1:])
-    return after @ (one + half[:-1]), after
+    half, identity = dt / 2 * torch.from_numpy(matrix), torch.eye(matrix.shape[-1]).double()
+    after = _inverse(identity - half[1:])
+    return after @ (identity + half[:-1]), after
 
 
 def _inverse(matrix: Tensor) -> Tensor:
-    """Inverse matrices; no numbers where there is none, as of a model that blows up."""
-    found, info = torch.linalg.inv_ex(matrix)
-    return torch.where(info[..., None, None] == 0, found, torch.nan)
+    """Inverse matrices; NaN for singular matrices, as of a model that blows up."""
+    inverse, info = torch.linalg.inv_ex(matrix)
+    return torch.where(info[..., None, None] == 0, inverse, torch.nan)
 
 
-def whole(blocks: Blocks, shape: tuple[int, ...]) -> np.ndarray:
+def dense_jacobian(blocks: Blocks, shape: tuple[int, ...]) -> np.ndarray:
     """``(M, N, M, N, K, B)`` derivatives of all rates by all states.
 
     Args:
-        shape: of the states, ``(M, N, K, B)``.
+        shape: shape of the states, ``(M, N, K, B)``.
     """
     m, n = shape[:2]
-    found = np.zeros((m, n, m, n, *shape[2:]))
+    matrix = np.zeros((m, n, m, n, *shape[2:]))
     for i in range(n - 2, -1, -1):
         for (p, ahead, q), slope in blocks.items():
             if q == m:
-                found[p, i] += slope[i] * found[0, i + 1]
+                matrix[p, i] += slope[i] * matrix[0, i + 1]
             elif i + ahead < n:
-                found[p, i, q, i + ahead] += slope[i]
-    return found
+                matrix[p, i, q, i + ahead] += slope[i]
+    return matrix
 
 
 @cache
 def _derivatives(
     lane: LaneDynamics,
 ) -> tuple[list[tuple[int, str]], Formulas, list[str], Formulas]:
-    """Which derivatives of rates there are, a function of all, and those of a leader's speed."""
+    """Keys and function of the derivatives of rates, and the same for a leader's speed."""
     states = list(lane.rates)
     names = [f"{s}{ahead}" for ahead in ("", "_1", "_2") for s in states] + ["dx_1", *lane.owned]
-    found = {
+    slopes = {
         (p, name): node
         for p, rate in enumerate(lane.rates.values())
         for name, node in derivatives(rate, names).items()
     }
     lead = derivatives(lane.leader, list(lane.owned))
-    return list(found), Formulas(list(found.values())), list(lead), Formulas(list(lead.values()))
+    return list(slopes), Formulas(list(slopes.values())), list(lead), Formulas(list(lead.values()))
 
 
 class LinearResponse:
-    """The linear response of a run of a model of a lane.
+    """The linear response of a run of a lane model.
 
     Args:
         system: the model, with the run's parameters.
-        batch: the sequences. scene: their surroundings, with the step of the run.
-        states: ``(K, B, N, M)`` of the run at the sampling times.
+        batch: the sequences.
+        scene: their surroundings, with the step of the run.
+        states: ``(K, B, N, M)`` states of the run at the sampling times.
 
     Attributes:
         rhs: the right-hand side.
@@ -251,12 +257,12 @@ class LinearResponse:
         self.system, self._batch, self.states = system, batch, states
         self.rhs, self._t = RightHandSide(system, scene), samples(scene, len(states))
         self._y, _ = self.rhs.placed(self._t, arranged(states))
-        m, n, *rest = self._y.shape
+        m, n, *axes = self._y.shape
         self._blocks, self._speed = Blocks(), np.zeros(self._y.shape[1:])
         self._of_parameters = dict[tuple[int, str], np.ndarray]()
         self._of_lead = dict[str, Any]()
-        #: of the rates of the added term by the speeds that the formula says
-        self._by_speed = np.zeros((n, n, *rest))
+        #: derivatives of the added term's rates by the speeds of the formula
+        self._by_speed = np.zeros((n, n, *axes))
         self._solver: Solver
         with np.errstate(all="ignore"):
             if self.rhs.lane is not None:
@@ -264,12 +270,12 @@ class LinearResponse:
             if self.rhs.lane is not None and self.rhs.added is None:
                 self._solver = FrontToBackSolver(self._blocks, m, batch.dt)
                 return
-            matrix = self._with_code(whole(self._blocks, self._y.shape))
-            matrix = matrix.reshape(m * n, m * n, *rest).transpose(2, 3, 0, 1)
+            matrix = self._with_code(dense_jacobian(self._blocks, self._y.shape))
+            matrix = matrix.reshape(m * n, m * n, *axes).transpose(2, 3, 0, 1)
             self._solver = DenseSolver(matrix.copy(), m, batch.dt)
 
     def _differentiate(self, lane: LaneDynamics) -> None:
-        """Derivatives of the formula along the path."""
+        """Evaluate the derivatives of the formula along the path."""
         rhs, blocks = self.rhs, self._blocks
         symbols = rhs.symbols(self._t, self._y)[1]
         rates = rhs.by_formula(self._y, symbols)
@@ -288,7 +294,7 @@ class LinearResponse:
                 self._of_parameters[p, name] = wide
                 continue
             ahead, q = places[name]
-            if ahead == 2:  # who has no second vehicle ahead sees one behind the first
+            if ahead == 2:  # without a second vehicle ahead, its values are those of the first
                 near = np.where(rhs.rates.second, 0.0, wide)
                 blocks[p, 1, q] = blocks.get((p, 1, q), 0.0) + near
                 wide = wide - near
@@ -298,11 +304,10 @@ class LinearResponse:
             self._of_lead.update(zip(lead, values, strict=True))
 
     def _with_code(self, matrix: np.ndarray) -> np.ndarray:
-        """Derivatives of all rates by all states ``(M, N, M, N, K, B)``, from those of the
-        formula."""
+        """Add the derivatives of code to those of the formula, ``(M, N, M, N, K, B)``."""
         rhs = self.rhs
-        y, speed = known = [
-            torch.from_numpy(one).clone().requires_grad_() for one in (self._y, self._speed)
+        y, speed = variables = [
+            torch.from_numpy(array).clone().requires_grad_() for array in (self._y, self._speed)
         ]
         with torch.enable_grad():
             rates = rhs.by_code(self._t, y, speed)
@@ -310,8 +315,10 @@ class LinearResponse:
         by_formula, coded = matrix[0].copy(), matrix[rhs.coded]
         for p, i in np.ndindex(*coded.shape[:2]):
             if sums[p][i].requires_grad:
-                found = torch.autograd.grad(sums[p][i], known, retain_graph=True, allow_unused=True)
-                for total, part in zip((coded[p, i], self._by_speed[i]), found, strict=True):
+                gradients = torch.autograd.grad(
+                    sums[p][i], variables, retain_graph=True, allow_unused=True
+                )
+                for total, part in zip((coded[p, i], self._by_speed[i]), gradients, strict=True):
                     total += 0.0 if part is None else part.numpy()
         matrix[rhs.top] += np.einsum("ijkb,jqmkb->iqmkb", self._by_speed, by_formula)
         return matrix
@@ -321,49 +328,50 @@ class LinearResponse:
         """``(C, K, B, N)`` m: positions moved by changes of the rates and of the start.
 
         Args:
-            source: ``(C, K, B, N, W)`` changes of the first W states' rates, m/s for positions,
-                as a column of an effect; of leaders those that change their paths.
-            start: ``(C, B, N, M)`` changes of the states at the start, by default none.
+            source: ``(C, K, B, N, W)`` changes of the rates of the first W states, m/s for
+                positions, such as the columns of effects; for leaders only those that change
+                their paths.
+            start: ``(C, B, N, M)`` changes of the states at the start; None for 0.
         """
         first = None if start is None else start.permute(3, 2, 0, 1).contiguous().numpy()
-        found = self._solver.response(source.permute(1, 4, 3, 0, 2).contiguous().numpy(), first)
-        return torch.from_numpy(found).permute(2, 0, 3, 1)
+        moved = self._solver.response(source.permute(1, 4, 3, 0, 2).contiguous().numpy(), first)
+        return torch.from_numpy(moved).permute(2, 0, 3, 1)
 
     def parameters(self, entries: Sequence[tuple[str, int]]) -> Tensor:
         """``(C, K, B, N)`` m per unit of parameters.
 
         Args:
-            entries: of each the name in the model, and the place in that parameter.
+            entries: (name in the model, index in the flattened parameter) of each number.
         """
         return self.response(self._sources(entries), self._starts(entries))
 
     def _sources(self, entries: Sequence[tuple[str, int]]) -> Tensor:
         """``(C, K, B, N, M)`` derivatives of the rates by parameters."""
         rhs, (m, n) = self.rhs, self._y.shape[:2]
-        found = np.zeros((len(entries), *self._y.shape))
+        sources = np.zeros((len(entries), *self._y.shape))
         owned = {} if rhs.lane is None else rhs.lane.owned
         for symbol, (name, place, _) in owned.items():
             if (name, place) not in entries:
                 continue
-            own = found[entries.index((name, place))]
+            source = sources[entries.index((name, place))]
             for p in range(m):
-                own[p, :-1] += self._of_parameters.get((p, symbol), 0.0)
-            own[0] += np.where(rhs.leads, self._of_lead.get(symbol, 0.0), 0.0)
+                source[p, :-1] += self._of_parameters.get((p, symbol), 0.0)
+            source[0] += np.where(rhs.is_leader, self._of_lead.get(symbol, 0.0), 0.0)
         for i in range(n - 2, -1, -1):
             for (p, _, q), slope in self._blocks.items():
                 if q == m:
-                    found[:, p, i] += slope[i] * found[:, 0, i + 1]
-        found[:, rhs.top] += np.einsum("ijkb,cjkb->cikb", self._by_speed, found[:, 0])
+                    sources[:, p, i] += slope[i] * sources[:, 0, i + 1]
+        sources[:, rhs.top] += np.einsum("ijkb,cjkb->cikb", self._by_speed, sources[:, 0])
         code = rhs.lane is None or rhs.added is not None
         y, speed = torch.from_numpy(self._y), torch.from_numpy(self._speed)
-        for own, (name, place) in zip(found, entries, strict=True):
-            if code and name.startswith(rhs.own):
+        for source, (name, place) in zip(sources, entries, strict=True):
+            if code and name.startswith(rhs.code_prefix):
                 rates = self._along(name, place, partial(rhs.by_code, self._t, y, speed))
-                own[rhs.coded] += rates.numpy()
-        return torch.from_numpy(found).permute(0, 3, 4, 2, 1)
+                source[rhs.coded] += rates.numpy()
+        return torch.from_numpy(sources).permute(0, 3, 4, 2, 1)
 
     def _starts(self, entries: Sequence[tuple[str, int]]) -> Tensor | None:
-        """``(C, B, N, M)`` derivatives of the states at the start; None: they are measured."""
+        """``(C, B, N, M)`` derivatives of the states at the start; None if these are measured."""
         if self.states.shape[-1] == self.system.order:
             return None
         start = partial(initial_with, self.system, batch=self._batch)
@@ -372,19 +380,19 @@ class LinearResponse:
     def _along(
         self, name: str, place: int, function: Callable[[dict[str, Tensor]], Tensor]
     ) -> Tensor:
-        """The derivative of a function by one number of a parameter."""
+        """The derivative of a function by one entry of a parameter."""
         value = self.system.get_parameter(name).detach()
         change = torch.zeros(value.numel(), dtype=value.dtype)
         change[place] = 1.0
         with torch.no_grad(), forward_ad.dual_level():
-            found = function({name: forward_ad.make_dual(value, change.reshape(value.shape))})
-            moved: Tensor | None = forward_ad.unpack_dual(found).tangent
-        return torch.zeros_like(found) if moved is None else moved
+            value_at = function({name: forward_ad.make_dual(value, change.reshape(value.shape))})
+            tangent: Tensor | None = forward_ad.unpack_dual(value_at).tangent
+        return torch.zeros_like(value_at) if tangent is None else tangent
 
     def rates(self, system: System) -> Tensor:
         """``(K, B, N, M)`` rates of another model along the path."""
         return rates_along(system, self.rhs.scene, self.states)
 
     def state(self) -> State:
-        """What terms see along the path, see :meth:`RightHandSide.state`."""
+        """Arguments of terms along the path, see :meth:`RightHandSide.state`."""
         return self.rhs.state(self._t, self._y)

@@ -1,4 +1,4 @@
-"""Steps in NumPy, for models that live for a second: nothing is compiled for them."""
+"""Integration in NumPy, for models of a search that are too short-lived to compile."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ States = TypeVar("States", np.ndarray, Tensor)
 def runge_kutta(
     rate: Callable[[Time, States], States], t: Time, y: States, h: float, k1: States
 ) -> States:
-    """The states after a step of ``h`` s by the classical method of fourth order, from those
-    and their rates ``k1`` before."""
+    """The states after a step of ``h`` s by the classic Runge-Kutta method.
+
+    Args:
+        y, k1: states and their rates before the step.
+    """
     k2 = rate(t + h / 2, y + h / 2 * k1)
     k3 = rate(t + h / 2, y + h / 2 * k2)
     k4 = rate(t + h, y + h * k3)
@@ -31,28 +34,28 @@ def simulated(
     samples: int,
     longest: float,
 ) -> np.ndarray:
-    """``(samples, ...)`` states every ``dt`` s from ``y`` on.
+    """``(samples, ...)`` states every ``dt`` s, starting from ``y``.
 
-    Steps are as long as ``longest`` (s) allows: several samples, between which Hermite's cubic
-    interpolation gives the states, or a whole part of the sampling interval.
+    Steps are as long as ``longest`` (s) allows. A step is several sampling intervals, with cubic
+    Hermite interpolation between its ends, or a whole part of the sampling interval.
     """
     stride, steps = strides(dt, longest)
     h = dt * stride / steps
-    slope, found = rate(0.0, y), [y]
+    slope, states = rate(0.0, y), [y]
     for step in range(math.ceil((samples - 1) / stride) * steps):
         t = step * h
         after = runge_kutta(rate, t, y, h, slope)
-        then = rate(t + h, after)
+        slope_after = rate(t + h, after)
         for part in range(1, stride):
             s = part / stride
-            away = h * (s * (1 - s) ** 2 * slope - s**2 * (1 - s) * then)
-            found.append((1 + 2 * s) * (1 - s) ** 2 * y + s**2 * (3 - 2 * s) * after + away)
+            bend = h * (s * (1 - s) ** 2 * slope - s**2 * (1 - s) * slope_after)
+            states.append((1 + 2 * s) * (1 - s) ** 2 * y + s**2 * (3 - 2 * s) * after + bend)
         if (step + 1) % steps == 0:
-            found.append(after)
-        y, slope = after, then
-    return np.stack(found[:samples])
+            states.append(after)
+        y, slope = after, slope_after
+    return np.stack(states[:samples])
 
 
 def strides(dt: float, longest: float) -> tuple[int, int]:
-    """Samples in a step, or steps in a sample."""
+    """Sampling intervals in a step, and steps in a sampling interval; one of them is 1."""
     return max(1, math.floor(longest / dt + 1e-9)), max(1, math.ceil(dt / longest - 1e-9))

@@ -1,4 +1,4 @@
-"""torchdiffeq: the continuous adjoint, or the exact gradient of the discrete scheme."""
+"""Solver by torchdiffeq, with the continuous adjoint or the discrete scheme's exact gradient."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ GRADIENTS = ("adjoint", "discrete")
 
 
 def whole_steps(func: Any, y0: Tensor, t: Tensor) -> Tensor:
-    """Time grid of one step per unit between the first and the last time, either direction."""
+    """Time grid with one step per unit between the first and the last time, in either direction."""
     n = round(float((t[-1] - t[0]).abs()))
     return (
         torch.linspace(0, 1, n + 1, dtype=torch.float64, device=t.device)
@@ -43,14 +43,14 @@ def whole_steps(func: Any, y0: Tensor, t: Tensor) -> Tensor:
 
 
 class Rates(nn.Module):
-    """Change of the state in one step: time counted in steps is exact in any precision.
+    """Change of the state in one step. Time is counted in steps, which is exact in any precision.
 
-    A sequence that is shorter than its batch stands still after its end, so that nothing that
-    nobody measured can blow up and spoil the gradient of the others.
+    A sequence that is shorter than its batch does not move after its end, so that it cannot blow
+    up there and corrupt the gradient of the other sequences.
 
     Args:
-        steps: in a sampling interval.
-        method: what becomes of a law of vehicles in a step, see :mod:`nnode.model.steps`.
+        steps: number of steps in a sampling interval.
+        method: method of stepping for laws of vehicles, see :mod:`nnode.model.steps`.
     """
 
     def __init__(self, system: System, batch: Batch, steps: int, method: str = "euler") -> None:
@@ -62,26 +62,26 @@ class Rates(nn.Module):
         self.ragged = bool((last < batch.n_samples - 1).any())
 
     def forward(self, step: Tensor, y: Tensor) -> Tensor:
-        """``(B, N, order * D)``: change of ``y`` from ``step`` to the next."""
+        """``(B, N, order * D + M)``: change of ``y`` from ``step`` to the next step."""
         return self.until_the_end(step, self.dt * self.system(step * self.dt, y, self.scene))
 
     def until_the_end(self, step: Tensor, rate: Tensor) -> Tensor:
-        """A change of the state, and none of the sequences that have ended."""
-        # the end itself still moves: integrating backwards starts there
+        """The change of the state, which is 0 for sequences that have ended."""
+        # the last step is included, because the backward integration starts there
         return rate.where(step <= self.end, 0.0) if self.ragged else rate
 
 
 class TorchdiffeqSolver:
     """Solve with torchdiffeq.
 
-    Time runs in units of the step, so that the grid consists of whole numbers and the number
-    of steps is the one that is meant, also in float32. Only sampling times are outputs.
+    The unit of time is the step, so that the grid consists of whole numbers and the number of
+    steps is exact, also in float32. Only sampling times are outputs.
 
     Args:
-        method: a torchdiffeq method, or ``ballistic`` or ``semi_implicit``, which are Euler's of
-            a changed formula (see :mod:`nnode.model.steps`); None takes the law's own, ``rk4``
-            for the smooth laws of the field, else ``ballistic`` for accelerations of vehicles and
-            ``euler`` for everything else. Fixed-step ones step ``dt``, adaptive ones obey
+        method: a torchdiffeq method, or ``ballistic`` or ``semi_implicit``, which are Euler's
+            method on a changed formula (see :mod:`nnode.model.steps`). None takes the law's
+            method, ``rk4`` for smooth laws, or else ``ballistic`` for accelerations of vehicles
+            and ``euler`` for everything else. Fixed-step methods use ``dt``, adaptive methods
             ``rtol`` and ``atol``. torchdiffeq's ``rk4`` is the 3/8 rule.
         gradient: ``adjoint`` integrates the adjoint equation backwards (the continuous
             adjoint of the paper, discretised: differs from the exact gradient of the
@@ -92,8 +92,8 @@ class TorchdiffeqSolver:
         atol: absolute tolerance of adaptive methods, m and m/s.
 
     Raises:
-        ConfigError: unknown method or gradient, two that exclude each other, or a step that
-            does not divide.
+        ConfigError: an unknown method or gradient, a method and a gradient that exclude each
+            other, or tolerances that are not positive.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class TorchdiffeqSolver:
         return check_finite(self.solve(system, batch), batch)
 
     def solve(self, system: System, batch: Batch) -> Trajectory:
-        """The same, states that are no finite numbers among them."""
+        """Simulate without the check that states are finite."""
         n = substeps(batch.dt, self.dt, system)
         method = self.method or system.step
         near, origin = simulated_batch(system, batch)

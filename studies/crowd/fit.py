@@ -99,7 +99,9 @@ def calibrate(
     options: dict[str, Any] = {"weights": weights, "tolerance": 1e-6}
     begin = problem.start
     if grow:
-        begin = problem.begin(begin, GROWTH[model], steps=min(steps, SHORT_STEPS[model]), **options)
+        begin = problem.initial_fit(
+            begin, GROWTH[model], steps=min(steps, SHORT_STEPS[model]), **options
+        )
     found = pooled(problem, begin, steps=steps, **options)
     row = row_of(problem.vector.fill_(found.row).requires_grad_())  # those that were held, too
     return Fitted(row, float(found.cost), problem.simulations)

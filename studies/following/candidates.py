@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.calibrate.pooling import scattered
+from nnode.calibrate.pooling import random_starts
 from nnode.calibrate.problem import ResidualProblem
 from nnode.model.build import build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
@@ -122,7 +122,7 @@ def starts(candidate: Candidate, cost: ResidualProblem, number: int, seed: int) 
     """
     systems = (candidate.system(seed + i) for i in range(number))
     rows = (ParameterVector(system, cost.vector.places).row.numpy() for system in systems)
-    return scattered(cost, rows, seed)
+    return random_starts(cost, rows, seed)
 
 
 def decay(cost: ResidualProblem) -> tuple[np.ndarray, np.ndarray] | None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.model.scene import Scene, wanted
+from nnode.model.scene import Scene, with_destinations
 from nnode.model.system import System
 from nnode.simulation.fused import FusedSolver
 from studies.pooled import pooled_fit, start_of
@@ -68,7 +68,7 @@ def simulated(system: System) -> Predict:
 
 def along_stream(batch: Batch) -> Tensor:
     """``(B, N, 2)`` m/s: preferred speeds in the directions of streams."""
-    scene = wanted(Scene.of(batch), batch, "direction")
+    scene = with_destinations(Scene.of(batch), batch, "direction")
     way = scene.destination - batch.x[0]
     length = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
     return scene.pace[..., None] * way / length.clamp(min=1e-9)  # who stood wants to stay

@@ -79,7 +79,7 @@ import json
 import numpy as np
 import nnode
 from nnode.app.python.inputs import model_options
-from nnode.exchange.drivers import Drivers, Seen
+from nnode.exchange.drivers import Drivers, DriverInputs
 from nnode.model import build_model
 from nnode.model.steps import METHODS
 from nnode.simulation.kernels import lanes
@@ -104,7 +104,7 @@ model = build_model(model_options("saturating", "measured", [{"name": "hills", "
 drivers = Drivers(model, 0.1, "euler")
 drivers.enter([(), ()])
 gap, nobody = np.array([20.0, 30.0]), np.full(2, np.inf)
-seen = Seen(v=np.full(2, 9.0), gap=gap, v_1=np.full(2, 9.0), length_1=np.full(2, 5.0),
+seen = DriverInputs(v=np.full(2, 9.0), gap=gap, v_1=np.full(2, 9.0), length_1=np.full(2, 5.0),
             lead=np.full(2, -1), gap_1=nobody, v_2=np.full(2, 9.0), x=np.array([35.0, 80.0]))
 print(json.dumps({"package": nnode.__file__, "speeds": drivers.speeds(0.0, seen).tolist()}))
 """

@@ -12,7 +12,7 @@ import torch
 import nnode
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.options import Pooling
-from nnode.calibrate.pooling import Own, own_parameters
+from nnode.calibrate.pooling import SequenceParameters, sequence_parameters
 from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
@@ -24,13 +24,13 @@ from tests.studies.following.test_fit import HELLY, driven
 TIME_GAPS = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
 
 
-def own(kind: Pooling, sequences: list[Sequence]) -> Own:
+def own(kind: Pooling, sequences: list[Sequence]) -> SequenceParameters:
     system = EVERY["helly"].system()
     with torch.no_grad():
         for name, value in HELLY.items():
             getattr(system.terms[0], name).fill_(value)
     cost = partial(ResidualProblem, solver=FusedSolver(), convention=Convention.spacing)
-    return own_parameters(kind, system, sequences, cost, seed=0)
+    return sequence_parameters(kind, system, sequences, cost, seed=0)
 
 
 def test_drivers_who_differ_are_told_apart() -> None:

@@ -133,4 +133,4 @@ if __name__ == "__main__":
     found["failing"] = failing(prepared, out / "failing")
     found["interrupted"] = interrupted(prepared, out / "interrupted")
     (out / f"process_{World().rank}.json").write_text(json.dumps(found))
-    World().part()
+    World().leave()

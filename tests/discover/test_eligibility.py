@@ -49,7 +49,7 @@ class Haste(IndividualEffect):
     strengths: ClassVar = {"sigma": ANY}
 
     def forward(self, state: State) -> Tensor:
-        return followers(state, self.known(state.scene, state.x)[0])
+        return followers(state, self.agent_numbers(state.scene, state.x)[0])
 
 
 class Stride(IndividualEffect):
@@ -67,7 +67,7 @@ class Stride(IndividualEffect):
         return [({"a": 1.0}, 0.0), ({"a": 1.0}, math.pi / 2)]
 
     def forward(self, state: State) -> Tensor:
-        phase, there = self.known(state.scene, state.x)
+        phase, there = self.agent_numbers(state.scene, state.x)
         clock = (state.scene.start + state.t)[:, None]
         size = self.a * torch.sin(2 * torch.pi * clock + phase) * there
         return size[..., None] * heading(velocity(state))

@@ -301,7 +301,7 @@ def test_a_scenario_with_other_steps_is_refused(sumo: Path, program: str, tmp_pa
         tmp_path,
         program=program,
         expected=expected,
-        told=expected,
+        forced_steps=expected,
         end=5.0,
     )
     assert (found.step, found.method, found.steps) == (0.1, "ballistic", 50)

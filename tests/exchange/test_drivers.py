@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nnode.app.python.inputs import model_options
 from nnode.errors import ConfigError, SimulationError
-from nnode.exchange.drivers import Drivers, Seen, drivable, one_behind_the_other
+from nnode.exchange.drivers import DriverInputs, Drivers, drivable, leaders_first
 from nnode.model import System, Traffic, build_model, make_law
 from nnode.model.laws import FollowTheLeader
 
@@ -22,7 +22,9 @@ def model(name: str, *effects: dict[str, Any], leader: str = "measured") -> Syst
     return build_model({**model_options(name, leader), "effects": list(effects)}).double()
 
 
-def seen(v: list[float], gap: list[float], lead: list[int] | None = None, **more: Any) -> Seen:
+def seen(
+    v: list[float], gap: list[float], lead: list[int] | None = None, **more: Any
+) -> DriverInputs:
     """Vehicles whose leaders, where they are others, drive as fast as they do."""
     own, far = np.array(v, float), np.full(len(v), np.inf)
     who = np.full(len(v), -1) if lead is None else np.array(lead)
@@ -36,7 +38,7 @@ def seen(v: list[float], gap: list[float], lead: list[int] | None = None, **more
         "v_2": own,
         "x": 0 * own,
     }
-    return Seen(**{**values, **{k: np.array(value, float) for k, value in more.items()}})
+    return DriverInputs(**{**values, **{k: np.array(value, float) for k, value in more.items()}})
 
 
 def idm(v: float, net: float, dv: float) -> float:
@@ -124,7 +126,7 @@ def test_who_looks_at_the_speed_ahead_is_computed_after_it() -> None:
 
 
 def test_an_order_for_everybody_even_in_a_ring() -> None:
-    groups = one_behind_the_other(np.array([1, 2, -1, 2, 5, 6, 4]))
+    groups = leaders_first(np.array([1, 2, -1, 2, 5, 6, 4]))
     assert sorted(np.concatenate(groups)) == list(range(7))
     assert [g.tolist() for g in groups[:3]] == [[2], [1, 3], [0]]
     assert [g.tolist() for g in groups[3:]] == [[4], [6], [5]]

@@ -14,7 +14,13 @@ from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError, DataError
 from nnode.generate.fit import fit_noise
-from nnode.generate.noise import Noise, constant_speed, free, sample, takes_drivers
+from nnode.generate.noise import (
+    Noise,
+    allows_driver_differences,
+    constant_speed,
+    free_running,
+    sample,
+)
 from nnode.generate.scores import band
 from nnode.model import Traffic, build_model
 from nnode.model.laws import make_law
@@ -31,7 +37,7 @@ def idm(*effects: dict[str, object]) -> Traffic:
     model = build_model({**model_options("idm", "measured"), "effects": list(effects)})
     for name, value in TRUE.items():
         getattr(model.terms[0], name).data.fill_(value)
-    return free(model)
+    return free_running(model)
 
 
 def platoons(number: int, seconds: float, cars: int = 3, seed: int = 0) -> Batch:
@@ -65,7 +71,7 @@ def test_a_push_stops_a_vehicle_and_does_not_turn_it() -> None:
     # gaps at which the law by itself stops nobody
     batch = platoons(4, 20.0)
     batch = replace(batch, x=batch.x + 1000.0 * torch.arange(3)[:, None])
-    x = sample(free(build_model(options)), batch, Noise(3.0, 1.0), 5, seed=0, dt=0.1).x
+    x = sample(free_running(build_model(options)), batch, Noise(3.0, 1.0), 5, seed=0, dt=0.1).x
     steps = torch.diff(x[:, :, :2, 0], dim=0)
     assert float(steps.min()) >= -1e-12
     assert float((steps == 0).double().mean()) > 0.1
@@ -85,7 +91,7 @@ def test_a_model_that_is_code_is_sampled_as_its_formula() -> None:
     by_formula = Traffic([make_law("lin", v0=25.0, L=6.0, L_min=0.0)], "measured")
     by_code = Traffic([make_law("lin", v0=25.0, L=6.0, L_min=0.0), Nothing()], "measured")
     assert by_code.formula is None
-    assert takes_drivers(by_code, batch)
+    assert allows_driver_differences(by_code, batch)
     one, two = (sample(m, batch, noise, 3, seed=0, dt=0.05).x for m in (by_formula, by_code))
     torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
 
@@ -175,6 +181,6 @@ def test_unknown_drivers_are_drawn_and_known_ones_are_kept() -> None:
 def test_bad_input_is_refused() -> None:
     with pytest.raises(ConfigError, match="positive time"):
         Noise(0.1, 0.0)
-    assert not takes_drivers(constant_speed(), platoons(1, 5.0))
+    assert not allows_driver_differences(constant_speed(), platoons(1, 5.0))
     with pytest.raises(DataError, match="more than 3 s"):
         fit_noise(idm(), [platoons(2, 2.0)], np.arange(2))

@@ -13,7 +13,13 @@ from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Batch, collate
 from nnode.errors import DataError
 from nnode.generate.fit import fit_noise
-from nnode.generate.noise import Noise, constant_speed, free, sample, takes_drivers
+from nnode.generate.noise import (
+    Noise,
+    allows_driver_differences,
+    constant_speed,
+    free_running,
+    sample,
+)
 from nnode.generate.people import SLOWEST
 from nnode.generate.scores import band, nearest
 from nnode.model import Crowd, System, build_model
@@ -24,7 +30,9 @@ STEP = 0.1
 
 
 def walking(*effects: dict[str, object], desired: str = "direction") -> System:
-    return free(build_model({**model_options("sf"), "desired": desired, "effects": list(effects)}))
+    return free_running(
+        build_model({**model_options("sf"), "desired": desired, "effects": list(effects)})
+    )
 
 
 def groups(number: int, seconds: float, people: int = 4, seed: int = 0) -> Batch:
@@ -65,11 +73,11 @@ def test_no_noise_is_the_solver_s_motion() -> None:
 
 def test_who_is_asked_for_a_pace() -> None:
     batch = groups(2, 8.0)
-    assert takes_drivers(walking(), batch)
-    assert not takes_drivers(walking(desired="last"), batch)
-    assert not takes_drivers(constant_speed("crowd"), batch)
+    assert allows_driver_differences(walking(), batch)
+    assert not allows_driver_differences(walking(desired="last"), batch)
+    assert not allows_driver_differences(constant_speed("crowd"), batch)
     differ = walking({"name": "walker_heterogeneity", "sigma": 0.3})
-    assert not takes_drivers(differ, batch)
+    assert not allows_driver_differences(differ, batch)
 
 
 def test_paces_are_drawn_around_the_measured_ones() -> None:
@@ -137,4 +145,4 @@ def test_the_nearest_other() -> None:
 def test_what_is_refused() -> None:
     with pytest.raises(DataError, match=r"people|more than 0\.75 s"):
         fit_noise(walking(), [groups(2, 0.6)], np.arange(2))
-    assert isinstance(free(build_model({**model_options("sf")})), Crowd)
+    assert isinstance(free_running(build_model({**model_options("sf")})), Crowd)

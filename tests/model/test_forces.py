@@ -124,7 +124,7 @@ def test_network_force(oneself: bool) -> None:
 def test_the_push_of_oneself_does_not_depend_on_where_others_are_seen() -> None:
     batch, scene = collate(CROWDS), Scene.of(collate(CROWDS), SPACING)
     x, v = batch.x[0], batch.v[0]
-    state = State(torch.zeros(()), x, v, scene, seen=(x + 0.3, v - 1))
+    state = State(torch.zeros(()), x, v, scene, measured_others=(x + 0.3, v - 1))
     found = []
     for oneself in (False, True):
         draw = torch.Generator().manual_seed(2)

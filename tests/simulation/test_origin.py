@@ -139,24 +139,24 @@ def test_a_leader_that_follows_its_measured_path_has_no_error_at_all() -> None:
 
 @pytest.mark.parametrize("law", [make_law("lin"), make_law("log"), make_law("network_speed")])
 def test_the_paper_s_lanes_name_no_places(law: object) -> None:
-    assert not Traffic([law]).names_places  # type: ignore[list-item]
+    assert not Traffic([law]).depends_on_position  # type: ignore[list-item]
 
 
 @pytest.mark.parametrize("name", CAR_FOLLOWING_LAWS)
 def test_laws_of_the_field_name_no_places(name: str) -> None:
-    assert not build_model(model_options(name)).names_places
+    assert not build_model(model_options(name)).depends_on_position
 
 
 @pytest.mark.parametrize("name", PEDESTRIAN_LAWS)
 def test_laws_of_people_name_no_places(name: str) -> None:
-    assert not Crowd([law_from(name, PEDESTRIAN_LAWS[name])]).names_places
+    assert not Crowd([law_from(name, PEDESTRIAN_LAWS[name])]).depends_on_position
 
 
 def test_the_paper_s_crowds_name_no_places() -> None:
     assert not Crowd(
         [make_law("relaxation"), make_law("social_force", A=1.0, k=30.0, kappa=9.0)]
-    ).names_places
-    assert not Crowd([make_law("relaxation"), make_law("network_force")]).names_places
+    ).depends_on_position
+    assert not Crowd([make_law("relaxation"), make_law("network_force")]).depends_on_position
 
 
 PLACES = {"speed_zone", "slope", "obstacle", "attraction"}
@@ -173,7 +173,7 @@ def test_effects_of_places_name_places(kind: str, leader: str | None) -> None:
         with suppress(ConfigError):  # some are for laws of the other order
             model = build_model(model_options(kind, leader, [effect.name]))
             offered.add(effect.name)
-            if model.names_places:
+            if model.depends_on_position:
                 found.add(effect.name)
     assert found == PLACES & offered
 
@@ -183,7 +183,7 @@ def test_a_term_that_is_code_may_name_places() -> None:
         def forward(self, state):  # type: ignore[no-untyped-def]
             return super().forward(state) + state.x * 1e-3
 
-    assert Crowd([Windy("relaxation")]).names_places
+    assert Crowd([Windy("relaxation")]).depends_on_position
 
 
 def test_a_zone_stays_where_it_is() -> None:

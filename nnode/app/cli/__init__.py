@@ -1,1 +1,1 @@
-"""Command lines: options, help, checks, folders, launchers; what every command shares."""
+"""Shared parts of the commands: options, help, checks, folders and launchers."""

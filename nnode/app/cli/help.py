@@ -1,7 +1,7 @@
-"""What ``--help`` behind a command prints: purpose, examples, choices, options, where results go.
+"""The text of ``--help`` for a command: purpose, examples, choices, options and flags.
 
-Nothing is written twice: the words are the command's docstring, the first comments of the files
-in ``conf/``, and the comments beside the fields of the options' dataclasses.
+Its sources are the command's docstring, the first comments of the files in ``conf/``, and the
+comments at the fields of the options' dataclasses.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from nnode.app.cli.typed import literal
 from nnode.model.laws import LAW_MODELS, entries
 from nnode.program import words
 
-#: A dataclass's field with the comments above it and beside it.
+#: A dataclass's field with the comments above it and in its line.
 _FIELD = re.compile(r"((?:^    # .*\n)*)^    (\w+): [^#\n]*(?:  # (.*))?$", re.MULTILINE)
 
-#: Characters of a line, and those before what explains an option.
+#: Width of a line, and of the column of options.
 WIDTH, LEFT = 100, 34
 
 _FLAGS = {
@@ -38,10 +38,11 @@ _FLAGS = {
 
 
 def help_text(name: str, *, _root_: DictConfig) -> str:
-    """The help of a command, as a template of Hydra's.
+    """The help of a command, as a template for Hydra.
 
     Args:
-        _root_: the composed configuration, Hydra's part with it.
+        name: name of the command.
+        _root_: the composed configuration, including Hydra's part.
     """
     hydra = _root_.hydra
     folders = [Path(s.path) for s in hydra.runtime.config_sources if s.schema == "file"]
@@ -50,8 +51,8 @@ def help_text(name: str, *, _root_: DictConfig) -> str:
         if not group.startswith("hydra/"):
             about = {name: entries()[name]["about"] for name in LAW_MODELS if group == "model"}
             files = [path for folder in folders for path in (folder / group).glob("*.yaml")]
-            about |= {path.stem: said_of(path) for path in files}
-            rows = [_row(f"{' *'[n == chosen]} {n}", said, 18) for n, said in sorted(about.items())]
+            about |= {path.stem: first_comment(path) for path in files}
+            rows = [_row(f"{' *'[n == chosen]} {n}", text, 18) for n, text in sorted(about.items())]
             choices.append("\n".join([f"{group}=", *rows]))
     if choices:
         choices.insert(0, "Choices, GROUP=NAME; those with * are taken now")
@@ -64,42 +65,42 @@ def help_text(name: str, *, _root_: DictConfig) -> str:
     return "\n\n".join(parts).replace("$", "$$")
 
 
-def said_of(path: Path) -> str:
-    """The first comment of a choice's file."""
-    found = re.search(r"^# (?!@)(.*)", path.read_text(encoding="utf-8"), re.MULTILINE)
-    return found[1] if found else ""
+def first_comment(path: Path) -> str:
+    """The first comment of the file of a choice."""
+    comment = re.search(r"^# (?!@)(.*)", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return comment[1] if comment else ""
 
 
 def _options(node: DictConfig, values: dict[str, Any], prefix: str = "") -> Iterator[str]:
     kind = OmegaConf.get_type(node)
-    said = remarks(kind) if is_dataclass(kind) else {}
+    texts = remarks(kind) if is_dataclass(kind) else {}
     for key, value in values.items():
         if OmegaConf.is_missing(node, key):
-            yield _row(f"{prefix}{key}=...", f"must be given: {said.get(key, '')}")
+            yield _row(f"{prefix}{key}=...", f"must be given: {texts.get(key, '')}")
         elif is_dataclass(OmegaConf.get_type(node, key)):
             yield from _options(node[key], value, f"{prefix}{key}.")
         else:
-            yield _row(f"{prefix}{key}={literal(value)}", said.get(key, ""))
+            yield _row(f"{prefix}{key}={literal(value)}", texts.get(key, ""))
 
 
 def _row(left: str, right: str, size: int = LEFT) -> str:
-    """Name and explanation side by side, or below each other where the name is long."""
+    """Name and explanation in one line, or in two lines if the name is long."""
     lines = textwrap.wrap(right, WIDTH - size - 2, break_on_hyphens=False) or [""]
     head = f"  {left:<{size - 2}}" if len(left) < size - 2 else f"  {left}\n{'':<{size}}"
     return "\n".join([f"{head}{lines[0]}".rstrip(), *(f"{'':<{size}}{line}" for line in lines[1:])])
 
 
 def remarks(schema: type) -> dict[str, str]:
-    """What the comments beside, or above, a dataclass's fields say; choices of enums with it."""
-    found: dict[str, str] = {}
+    """Field of a dataclass to the comment in its line or above it, with the values of enums."""
+    texts: dict[str, str] = {}
     for part in filter(is_dataclass, reversed(schema.__mro__)):
-        for above, name, beside in _FIELD.findall(inspect.getsource(part)):
-            if said := beside or " ".join(re.findall("# (.*)", above)):
-                found[name] = said
-    for one in fields(schema):
-        if isinstance(one.default, Enum):
-            kind = type(one.default)
+        for above, name, comment in _FIELD.findall(inspect.getsource(part)):
+            if text := comment or " ".join(re.findall("# (.*)", above)):
+                texts[name] = text
+    for option in fields(schema):
+        if isinstance(option.default, Enum):
+            kind = type(option.default)
             valid = " | ".join(str(member.value) for member in kind)
             about = (inspect.getdoc(kind) or "").partition("\n")[0]
-            found[one.name] = f"{valid}: {found.get(one.name, about)}"
-    return found
+            texts[option.name] = f"{valid}: {texts.get(option.name, about)}"
+    return texts

@@ -1,6 +1,6 @@
-"""Mistakes on a command line in the package's own words: what is unknown, and what there is.
+"""The package's messages for mistakes on a command line.
 
-Hydra's messages name its schemas and its search path, which no user has chosen.
+They replace Hydra's messages, which refer to its schemas and search path.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from nnode.app.cli.saved import composed
 from nnode.errors import ConfigError
 from nnode.program import configuration
 
-#: What an option's value must be, by OmegaConf's name of the type.
+#: OmegaConf's name of a type to the description of the expected value.
 _KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
 
 
 def in_words(error: Exception, name: str, overrides: list[str], flags: list[str]) -> ConfigError:
-    """An error of Hydra or OmegaConf, met while a command line was composed, as the package's.
+    """The package's error for an error of Hydra or OmegaConf in the composition of a command line.
 
     Args:
-        name: of the command.
-        overrides, flags: as they were typed.
+        name: name of the command.
+        overrides, flags: the typed overrides and flags.
     """
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
-    said = _first_line(cause)
+    message = _first_line(cause)
     if isinstance(error, OverrideParseException):
         return ConfigError(
             f"{error.override} cannot be read: expected NAME=VALUE, a list [A, B] or a mapping "
@@ -56,50 +56,56 @@ def in_words(error: Exception, name: str, overrides: list[str], flags: list[str]
         )
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, chosen = str(error.missing_cfg_file).removesuffix(".yaml").rpartition("/")
-        there = [str(one) for one in error.options or () if not str(one).endswith("_schema")]
-        return unknown_choice(group, chosen, there)
+        names = [
+            str(choice) for choice in error.options or () if not str(choice).endswith("_schema")
+        ]
+        return unknown_choice(group, chosen, names)
     if isinstance(error, SearchPathException):
-        return ConfigError(f"{said}; name a folder that is there with --config-dir")
-    if several := re.match(r"Ambiguous value for argument '(.*)'$", said):
-        key, _, values = several[1].partition("=")
+        return ConfigError(f"{message}; name a folder that is there with --config-dir")
+    if ambiguous := re.match(r"Ambiguous value for argument '(.*)'$", message):
+        key, _, values = ambiguous[1].partition("=")
         return ConfigError(
-            f"{several[1]} has several values: add -m for a run with each, or type "
+            f"{ambiguous[1]} has several values: add -m for a run with each, or type "
             f"'{key}=[{values}]' for a list, '{key}=\"{values}\"' for one text with commas"
         )
-    gone = re.match(r"Could not delete from config. '(.*)' does not exist", str(error))
-    twice = re.match(r"Multiple values for (\S+?)\.", str(error))
-    if twice:
-        return ConfigError(f"{twice[1]} is chosen twice; type {twice[1]}=NAME once, without a +")
-    key = gone[1] if gone else str(getattr(cause, "full_key", None) or "")
+    undeletable = re.match(r"Could not delete from config. '(.*)' does not exist", str(error))
+    repeated = re.match(r"Multiple values for (\S+?)\.", str(error))
+    if repeated:
+        return ConfigError(
+            f"{repeated[1]} is chosen twice; type {repeated[1]}=NAME once, without a +"
+        )
+    key = undeletable[1] if undeletable else str(getattr(cause, "full_key", None) or "")
     if isinstance(cause, ValidationError):
-        whole = _typed_for(key, overrides)
-        return wrong_value(key, whole, said, _composed(name, overrides, flags))
-    lost = re.match(r"(?:Could not override|Key) '([^']*)'", str(error))
-    if (gone or lost) and (key or lost):
-        whole = _typed_for(key or str(lost and lost[1]), overrides)
-        return unknown_option(whole, _composed(name, overrides, flags), name)
+        override = _typed_for(key, overrides)
+        return wrong_value(key, override, message, _composed(name, overrides, flags))
+    missing = re.match(r"(?:Could not override|Key) '([^']*)'", str(error))
+    if (undeletable or missing) and (key or missing):
+        override = _typed_for(key or str(missing and missing[1]), overrides)
+        return unknown_option(override, _composed(name, overrides, flags), name)
     return without_value(cause)
 
 
 def without_value(error: Exception) -> ConfigError:
-    """The error of an option that must be given, or refers to what there is not."""
-    said = _first_line(error)
+    """The error for a mandatory option without a value, or an invalid interpolation."""
+    message = _first_line(error)
     if isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
-        key = said.rpartition(" ")[2]
+        key = message.rpartition(" ")[2]
         return ConfigError(f"{key} is missing; type {key}=VALUE, --help shows examples")
-    said = re.sub(r"^\w+ raised while resolving interpolation: |, possible .* keys: .*", "", said)
-    return ConfigError(f"{said}; --help shows examples and all options")
+    message = re.sub(
+        r"^\w+ raised while resolving interpolation: |, possible .* keys: .*", "", message
+    )
+    return ConfigError(f"{message}; --help shows examples and all options")
 
 
 def _first_line(error: Exception) -> str:
     return (str(error) or type(error).__name__).splitlines()[0]
 
 
-def unknown_choice(group: str, chosen: str, there: Iterable[str]) -> ConfigError:
-    """The error of a choice that its group does not have."""
-    known = sorted(there)
-    near = _near(chosen, {one: f"{group}={one}" for one in known})
-    text = f"there is no {group}={chosen}{near or ';'} {group} is one of {', '.join(known)}"
+def unknown_choice(group: str, chosen: str, available: Iterable[str]) -> ConfigError:
+    """The error for a choice that its group does not have."""
+    names = sorted(available)
+    near = _near(chosen, {name: f"{group}={name}" for name in names})
+    text = f"there is no {group}={chosen}{near or ';'} {group} is one of {', '.join(names)}"
     if group == "data" and (Path(chosen).suffix or Path(chosen).exists()):
         text += (
             f". For a file of your own, nnode check {chosen} prints the options that "
@@ -112,73 +118,79 @@ def unknown_option(
     override: str,
     config: DictConfig | None,
     name: str,
-    more: str = ", --help explains them",
+    hint: str = ", --help explains them",
 ) -> ConfigError:
-    """The error of an option that a command does not have.
+    """The error for an option that a command does not have.
 
     Args:
-        override: as it was typed.
-        config: what the command's choices have; None: unknown.
-        name: of the command.
-        more: stands behind what there is.
+        override: the typed override.
+        config: configuration of the command's choices; None if it is unknown.
+        name: name of the command.
+        hint: text after the list of options.
     """
     key, _, value = override.lstrip("+~").partition("=")
     text = f"{name} has no option {key}"
     if config is None:
         return ConfigError(f"{text}; --help shows all options")
-    node, at, rest = config, "", key
-    while OmegaConf.is_dict(node) and rest.partition(".")[0] in node and "." in rest:
-        word, _, rest = rest.partition(".")
+    node, at, remainder = config, "", key
+    while OmegaConf.is_dict(node) and remainder.partition(".")[0] in node and "." in remainder:
+        word, _, remainder = remainder.partition(".")
         at, node = f"{at}{word}.", node[word]
     if not OmegaConf.is_dict(node):
         return ConfigError(f"{text}: {at.rstrip('.')} is a value, without options of its own")
-    if at == "model." and (how := _start_value(node, rest, value)):
+    if at == "model." and (how := _start_value(node, remainder, value)):
         return ConfigError(f"{text}: {how}")
-    own = [str(one) for one in node if one != "hydra"]
-    near = _near(rest.partition(".")[0], {one: f"{at}{one}" for one in own})
+    options = [str(option) for option in node if option != "hydra"]
+    near = _near(remainder.partition(".")[0], {option: f"{at}{option}" for option in options})
     if not near:
-        # the right name in the wrong place; the first one of each name counts
-        every = {one.rpartition(".")[2]: one for one in reversed([*_keys(config)])}
-        near = _near(rest.rpartition(".")[2], every, cutoff=0.75)
-    whose = at.rstrip(".") or name
-    return ConfigError(f"{text}{near or ';'} {whose} has {', '.join(own)}{more}")
+        # suggests the same name in another section, the first one of each name
+        every = {option.rpartition(".")[2]: option for option in reversed([*_keys(config)])}
+        near = _near(remainder.rpartition(".")[2], every, cutoff=0.75)
+    owner = at.rstrip(".") or name
+    return ConfigError(f"{text}{near or ';'} {owner} has {', '.join(options)}{hint}")
 
 
-def wrong_value(key: str, override: str, said: str, config: DictConfig | None) -> ConfigError:
-    """The error of a value that the option ``key`` cannot have; ``said``: OmegaConf's words."""
+def wrong_value(key: str, override: str, message: str, config: DictConfig | None) -> ConfigError:
+    """The error for a value that the option ``key`` cannot have.
+
+    Args:
+        override: the typed override.
+        message: OmegaConf's message.
+        config: configuration of the command's choices; None if it is unknown.
+    """
     typed, _, value = override.lstrip("+").partition("=")
     if typed != key:
         return ConfigError(f"{override}: {key} is a value, without options of its own")
-    if match := re.search(r"could not be converted to (\w+)", said):
+    if match := re.search(r"could not be converted to (\w+)", message):
         return ConfigError(f"{override}: expected {_KINDS.get(match[1], match[1].lower())}")
-    if match := re.search(r"expected one of \[(.*)\]", said):
-        known = [one.strip() for one in match[1].split(",")]
-        near = _near(value, {one: one for one in known})
-        return ConfigError(f"{override}: expected one of {', '.join(known)}{near}")
-    if "not a valid bool" in said:
+    if match := re.search(r"expected one of \[(.*)\]", message):
+        valid = [item.strip() for item in match[1].split(",")]
+        near = _near(value, {item: item for item in valid})
+        return ConfigError(f"{override}: expected one of {', '.join(valid)}{near}")
+    if "not a valid bool" in message:
         return ConfigError(f"{override}: expected {_KINDS['Boolean']}")
-    if "is not a subclass of" in said or "Invalid type assigned" in said:
+    if "is not a subclass of" in message or "Invalid type assigned" in message:
         node = None if config is None else OmegaConf.select(config, key)
-        own = [str(one) for one in node] if isinstance(node, DictConfig) else []
-        has = f": {', '.join(own)}" if own else ""
+        options = [str(item) for item in node] if isinstance(node, DictConfig) else []
+        has = f": {', '.join(options)}" if options else ""
         return ConfigError(
             f"{override}: {key} has options of its own{has}; type {key}.NAME=VALUE, --help shows "
             "them"
         )
-    if "None" in said or "not Optional" in said:
+    if "None" in message or "not Optional" in message:
         return ConfigError(f"{override}: null is no value of this option; leave it out")
-    if "is not a ListConfig" in said:
+    if "is not a ListConfig" in message:
         return ConfigError(f"{override}: expected a list, such as [{value}]")
-    if "convert 'dict'" in said:
+    if "convert 'dict'" in message:
         return ConfigError(f"{override}: {key} is a value, without options of its own")
-    return ConfigError(f"{override}: {said}")
+    return ConfigError(f"{override}: {message}")
 
 
 def refuse_added(config: DictConfig, name: str) -> None:
-    """Refuse what stands behind a plus and no option reads, and an experiment there is not.
+    """Refuse added options that do not exist, and an unknown experiment.
 
     Raises:
-        ConfigError: names what there is.
+        ConfigError: the option or the experiment does not exist.
     """
     settings = HydraConfig.get()
     for override in settings.overrides.task:
@@ -188,7 +200,7 @@ def refuse_added(config: DictConfig, name: str) -> None:
             node = OmegaConf.select(config, at) if at else config
             kind = OmegaConf.get_type(node) if OmegaConf.is_dict(node) else None
             if is_dataclass(kind) and leaf not in kind.__dataclass_fields__:
-                # the option itself is in the configuration by now
+                # the configuration already contains the added option
                 clean = cast(DictConfig, OmegaConf.create(OmegaConf.to_container(config)))
                 del (OmegaConf.select(clean, at) if at else clean)[leaf]
                 raise unknown_option(override, clean, name)
@@ -200,36 +212,36 @@ def refuse_added(config: DictConfig, name: str) -> None:
             raise unknown_choice("experiment", chosen, {path.stem for path in files})
 
 
-def _start_value(model: DictConfig, rest: str, value: str) -> str:
-    """How a parameter of the law, or of an effect, gets the value; empty: it is none."""
-    leaf = rest.partition(".")[0]
+def _start_value(model: DictConfig, path: str, value: str) -> str:
+    """How to set the start value of a law's parameter; empty if the name is not a parameter."""
+    leaf = path.partition(".")[0]
     parameters = OmegaConf.select(model, "law.parameters")
     if not OmegaConf.is_dict(parameters) or not parameters:
         return ""
-    known = {str(one).casefold(): str(one) for one in parameters}
-    own = leaf if leaf in parameters else known.get(leaf.casefold())
-    if own is None:
-        if near := get_close_matches(leaf, list(known.values()), n=1):
+    by_folded_name = {str(parameter).casefold(): str(parameter) for parameter in parameters}
+    name = leaf if leaf in parameters else by_folded_name.get(leaf.casefold())
+    if name is None:
+        if near := get_close_matches(leaf, list(by_folded_name.values()), n=1):
             return f"did you mean the parameter model.law.parameters.{near[0]}.value?"
         return ""
-    about = parameters[own]
-    now = str(about.value if OmegaConf.is_dict(about) else about)
-    unit = now.partition(" ")[2]
+    about = parameters[name]
+    current = str(about.value if OmegaConf.is_dict(about) else about)
+    unit = current.partition(" ")[2]
     low, high = (
         str(about.get(e)) if OmegaConf.is_dict(about) and about.get(e) is not None else ""
         for e in ("low", "high")
     )
-    asked, least, most = _number(value), _number(low), _number(high)
+    asked, minimum, maximum = _number(value), _number(low), _number(high)
     within = f"between {low} and {high}" if low and high else ""
     outside = asked is not None and (
-        (least is not None and asked < least) or (most is not None and asked > most)
+        (minimum is not None and asked < minimum) or (maximum is not None and asked > maximum)
     )
-    shown = value if asked is not None and not outside else now.partition(" ")[0]
+    shown = value if asked is not None and not outside else current.partition(" ")[0]
     quantity = f"{shown} {unit}".strip()
-    text = f"{own} is a parameter of the law, calibrated from a start value"
+    text = f"{name} is a parameter of the law, calibrated from a start value"
     text += f", which lies {within}" if within else ""
     text += f"; {value} does not" if outside and within else ""
-    return f"{text}: type \"model.law.parameters.{own}.value='{quantity}'\" (now {now})"
+    return f"{text}: type \"model.law.parameters.{name}.value='{quantity}'\" (now {current})"
 
 
 def _number(text: str) -> float | None:
@@ -239,15 +251,19 @@ def _number(text: str) -> float | None:
         return None
 
 
-def _near(word: str, known: Mapping[str, str], cutoff: float = 0.65) -> str:
-    """A question for the nearest of some words, of either case, told as ``known`` says."""
-    folded = {one.casefold(): told for one, told in known.items()}
-    found = get_close_matches(word.casefold(), list(folded), n=1, cutoff=cutoff)
-    return f"; did you mean {folded[found[0]]}?" if found else ""
+def _near(word: str, suggestions: Mapping[str, str], cutoff: float = 0.65) -> str:
+    """The end of a message that suggests the most similar word, ignoring case.
+
+    Args:
+        suggestions: word to the text that suggests it.
+    """
+    folded = {candidate.casefold(): suggestion for candidate, suggestion in suggestions.items()}
+    matches = get_close_matches(word.casefold(), list(folded), n=1, cutoff=cutoff)
+    return f"; did you mean {folded[matches[0]]}?" if matches else ""
 
 
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
-    for key in (str(one) for one in node if one != "hydra"):
+    for key in (str(child) for child in node if child != "hydra"):
         yield f"{prefix}{key}"
         if OmegaConf.is_missing(node, key) or OmegaConf.is_interpolation(node, key):
             continue
@@ -256,16 +272,16 @@ def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
 
 
 def _typed_for(key: str, overrides: list[str]) -> str:
-    """The override that a key comes from; the key alone where none does."""
+    """The override that sets a key, or else the key."""
     for override in reversed(overrides):
-        own = override.lstrip("+~").partition("=")[0]
-        if own == key or own.startswith(f"{key}."):
+        option = override.lstrip("+~").partition("=")[0]
+        if option == key or option.startswith(f"{key}."):
             return override.lstrip("+~")
     return key
 
 
 def _composed(name: str, overrides: list[str], flags: list[str]) -> DictConfig | None:
-    """The configuration that the choices among the overrides give, all others left out."""
+    """The configuration of the choices among the overrides, without other overrides."""
     parser = OverridesParser.create()
     kept: list[str] = []
     for text in overrides:
@@ -281,10 +297,10 @@ def _composed(name: str, overrides: list[str], flags: list[str]) -> DictConfig |
     try:
         GlobalHydra.instance().clear()
         return composed(name, kept)
-    except Exception:  # a second mistake: it is told when the first one is mended
+    except Exception:  # a second mistake, which is reported after the first one is corrected
         return None
 
 
 def _first(override: Override) -> Any:
-    """A choice; of several the first one."""
+    """The value of an override, or the first one of a sweep."""
     return next(override.sweep_iterator()) if override.is_sweep_override() else override.value()

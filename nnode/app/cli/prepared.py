@@ -1,4 +1,4 @@
-"""``data.prepared=FOLDER`` alone: the folder's manifest tells how its data were made."""
+"""The options of prepared data, which ``data.prepared=FOLDER`` takes from the folder's manifest."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from nnode.errors import ConfigError
 
 
 def prepared_group(overrides: list[str]) -> list[str]:
-    """The override that chooses a prepared folder's data set, where the user chooses none.
+    """The override that chooses a prepared folder's data set if the user chooses none.
 
     Args:
-        overrides: as given by the user.
+        overrides: the user's overrides.
 
     Raises:
-        ConfigError, DataError: the folder holds no store, or does not say how it was made.
+        ConfigError, DataError: the folder has no store, or no record of its preparation.
     """
     folder = path_given(overrides, "data.prepared")
     if folder is None or any(override.startswith("data=") for override in overrides):
@@ -32,13 +32,13 @@ def prepared_group(overrides: list[str]) -> list[str]:
 
 
 def with_prepared(config: DictConfig) -> DictConfig:
-    """``config`` with the options that ``data.prepared`` was prepared with, where that is set; else
-    with those that a table is recognised to need.
+    """``config`` with the options of the preparation of ``data.prepared``, if that is set; or else
+    with the options that are recognised for a table.
 
     Raises:
-        ConfigError: another data set was chosen, or options on the command line contradict the
-            folder's; named with both values.
-        DataError: no store in that folder.
+        ConfigError: another data set is chosen, or an option on the command line contradicts the
+            folder's; the message states both values.
+        DataError: the folder has no store.
     """
     folder = OmegaConf.select(config, "data.prepared")
     if not in_hydra():
@@ -46,17 +46,19 @@ def with_prepared(config: DictConfig) -> DictConfig:
     if folder is None:
         return with_recognised(config)
     store = _store(folder)
-    choice, own = str(HydraConfig.get().runtime.choices["data"]), _group(store)
-    # another one of nnode's; a choice of the user's own may be of the same reader
-    other = choice != own and choice in choices("data")
+    choice, group = str(HydraConfig.get().runtime.choices["data"]), _group(store)
+    # a user's own choice may have the same reader
+    other = choice != group and choice in choices("data")
     if other or OmegaConf.get_type(config.data) is not made_by(store):
         raise ConfigError(
-            f"data.prepared={store.folder} holds data={own}, chosen is data={choice}; leave out "
+            f"data.prepared={store.folder} holds data={group}, chosen is data={choice}; leave out "
             f"data={choice} to take the folder, or data.prepared to prepare data={choice}"
         )
-    now = OmegaConf.create({"data": plain(config.data)})
-    asked = [key for key in keys_given() if key.startswith("data.")]
-    refuse_others(store, {key.removeprefix("data."): OmegaConf.select(now, key) for key in asked})
+    current = OmegaConf.create({"data": plain(config.data)})
+    given_keys = [key for key in keys_given() if key.startswith("data.")]
+    refuse_others(
+        store, {key.removeprefix("data."): OmegaConf.select(current, key) for key in given_keys}
+    )
     merged, made = config.copy(), store.manifest["options"]
     for key in made.keys() & config.data.keys() - NOT_PREPARATION:
         OmegaConf.update(merged, f"data.{key}", made[key], merge=False)
@@ -68,8 +70,8 @@ def _store(folder: str) -> Store:
 
 
 def _group(store: Store) -> str:
-    """The group of the folder's data set, that of its reader where the user made his own."""
+    """The group of the folder's data set, or of its reader if the data set is user-defined."""
     reader, name = made_by(store), str(store.manifest["options"].get("name"))
     # the name comes from the folder's manifest: a path in it would lead out of conf/
-    known = name in choices("data") and written("data", name)[0] is reader
-    return name if known else str(reader().name)
+    is_nnodes = name in choices("data") and written("data", name)[0] is reader
+    return name if is_nnodes else str(reader().name)

@@ -1,4 +1,4 @@
-"""Columns and units of a table on the command line, where its names are not those of its format."""
+"""Recognition of a table's columns and units on the command line."""
 
 from __future__ import annotations
 
@@ -14,43 +14,49 @@ from nnode.errors import ConfigError, DataError
 
 
 def with_recognised(config: DictConfig) -> DictConfig:
-    """``config`` with the columns and units that a table is recognised to have.
+    """``config`` with the recognised columns and units of a table.
 
-    Nothing changes where the table has the columns of its format, under their own names or under
-    those that ``data.columns`` gives. What is given wins.
+    Nothing changes if the table has the columns of its format, with their names or with those in
+    ``data.columns``. Given options have priority.
 
     Raises:
-        ConfigError: columns or units that may be two things, or a table of another format.
+        ConfigError: columns or units are ambiguous, or the table has another format.
     """
     kind = OmegaConf.get_type(config.data)
-    group = next((name for name, (own, _) in NEEDED.items() if own is kind), None)
+    group = next((name for name, (schema, _) in NEEDED.items() if schema is kind), None)
     if kind is None or group is None or not in_hydra() or OmegaConf.is_missing(config.data, "path"):
         return config
     place = Path(config.data.path).expanduser()
     if config.data.source is not None and not place.is_file():
         place = Path(config.data.source).expanduser() / place
-    usual, asked = plain_options(kind()), keys_given()
-    now = plain(OmegaConf.masked_copy(config.data, [key for key in config.data if key in _SAID]))
-    given = {k: v for k, v in now.items() if v != usual[k] or f"data.{k}" in asked}
+    defaults, asked = plain_options(kind()), keys_given()
+    current = plain(
+        OmegaConf.masked_copy(config.data, [key for key in config.data if key in _SAID])
+    )
+    given = {k: v for k, v in current.items() if v != defaults[k] or f"data.{k}" in asked}
     if not place.is_file() or has_columns(place, group, given):
         return config
-    known = OmegaConf.is_missing(config.data, "domain")
+    no_domain = OmegaConf.is_missing(config.data, "domain")
     try:
-        found = recognised(place, None if known else config.data.domain, given)
+        recognition = recognised(place, None if no_domain else config.data.domain, given)
     except DataError:
-        return config  # the reader's own words are nearer to what was asked for
-    if found.group != group or found.table is not None:
+        return config  # the reader's error is more specific
+    if recognition.group != group or recognition.table is not None:
         raise ConfigError(
             f"{place} has no columns of data={group}; nnode check {place} prints what reads it"
         )
-    say_recognised(found)
+    say_recognised(recognition)
     merged = config.copy()
-    for key, value in plain_options(found.options).items():
-        if key not in ("path", "name") and value != usual[key] and key not in given.keys() - _OWN:
+    for key, value in plain_options(recognition.options).items():
+        if (
+            key not in ("path", "name")
+            and value != defaults[key]
+            and key not in given.keys() - _OWN
+        ):
             OmegaConf.update(merged, f"data.{key}", value, merge=False)
     return merged
 
 
-#: Options that recognition takes into account, and the one that it completes.
+#: Options that the recognition considers, and the option that it completes.
 _SAID = {"columns", "frame_rate", *UNIT.values()}
 _OWN = {"columns"}

@@ -1,4 +1,4 @@
-"""From a command line to a job, through Hydra; errors of the package in one line each."""
+"""Execution of a command through Hydra, with the package's errors in one line each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from difflib import get_close_matches
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -31,17 +30,17 @@ from nnode.app.cli.typed import literal
 from nnode.calibrate.distributed import World, join, started_together
 from nnode.calibrate.interrupt import Interrupted
 from nnode.config import register
-from nnode.errors import ConfigError, NNodeError
+from nnode.errors import ConfigError, NNodeError, suggestion
 from nnode.files import disk_words, write_json
 from nnode.program import configuration, running
 from nnode.version import VERSION
 
 Job = Callable[[DictConfig, Path], None]
 
-#: Variable of the environment with which Hydra raises errors.
+#: Environment variable that makes Hydra raise errors.
 _RAISE = "HYDRA_FULL_ERROR"
 
-#: Flags of Hydra's that are offered, and those that take a value, with the values that there are.
+#: Supported flags of Hydra, and those with a value, with the allowed values.
 _FLAGS = ("-h", "--help", "-m", "--multirun", "--version", "--resolve")
 _CFG = ("job", "hydra", "all")
 _VALUED: dict[str, tuple[str, ...]] = {
@@ -62,15 +61,14 @@ def run(
     parallel: bool = False,
     bare: str | None = None,
 ) -> None:
-    """Run ``job(config, folder)`` as the command ``name``; ends the process on errors.
+    """Run ``job(config, folder)`` as the command ``name``, and end the process on errors.
 
     Args:
         name: the command, and its configuration ``conf/<name>.yaml``.
-        job: does the work; writes only into ``folder``.
-        inject: looks at the overrides given by the user and returns further ones that go
-            before them.
-        parallel: whether the job is for all processes that were started together; otherwise
-            the first one does it alone.
+        job: the work, which writes only into ``folder``.
+        inject: function from the user's overrides to further overrides before them.
+        parallel: whether all processes that were started together run the job; otherwise only the
+            first one.
         bare: option whose value may be typed without its name.
     """
     if started_together() and not parallel and os.environ["RANK"] != "0":
@@ -79,9 +77,9 @@ def run(
         print(f"nnode {VERSION}")
         return
     if {"-h", "--help"} & set(sys.argv) and hasattr(signal, "SIGPIPE"):
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # a reader such as head has seen enough
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # a reader such as head may close the pipe
     register()
-    # on a full disk the log cannot be written either, which shall not bury the run's own words
+    # on a full disk, errors of the log must not hide the run's error
     logging.raiseExceptions = False
     running(name)
     OmegaConf.register_new_resolver("nnode_help", partial(help_text, name), replace=True)
@@ -94,7 +92,7 @@ def run(
             given = [*extra, *(inject([*given, *extra]) if inject else []), *given]
     except NNodeError as error:
         end(error)
-    GlobalHydra.instance().clear()  # of a job that has forked this process
+    GlobalHydra.instance().clear()  # a forked process inherits the state
     with _out_of_sight() as places, _errors_raised():
         sys.argv[1:] = [*given, *places, *flags]
         command = hydra.main(version_base="1.3", config_path=str(configuration()), config_name=name)
@@ -102,7 +100,7 @@ def run(
             command(_task(job, name))()
         except (HydraException, OmegaConfBaseException) as error:
             end(in_words(error, name, given, flags))
-    World().part()
+    World().leave()
     if failures():
         sys.exit(1)
 
@@ -124,13 +122,13 @@ def _task(job: Job, name: str) -> Callable[[DictConfig], None]:
         else:
             return
         sweep, world = settings.mode == RunMode.MULTIRUN, World()
-        # a launcher may run the job elsewhere, where only this job can be stopped
+        # a launcher may run the job in another process, where a signal stops only this job
         stopped = isinstance(failed, Interrupted) and os.getpid() == here
         if stopped or not sweep or (world.size > 1 and not world.agreed):
             if stopped and sweep:
                 say("the sweep ends here: its later runs were not started")
             end(failed)
-        # the other jobs of a sweep go on
+        # the other jobs of a sweep continue
         if world.first:
             say(f"error in {folder}: {failed}")
         write_json(folder / RESULT, {"error": str(failed)})
@@ -139,10 +137,10 @@ def _task(job: Job, name: str) -> Callable[[DictConfig], None]:
 
 
 def _parted(bare: str | None) -> tuple[list[str], list[str]]:
-    """Overrides and all else of the command line; Hydra wants overrides side by side.
+    """The overrides and the flags of the command line, since Hydra needs contiguous overrides.
 
     Raises:
-        ConfigError: a word without a name, and no option that it could be meant for.
+        ConfigError: a word is neither an override nor a flag.
     """
     overrides, flags = [], []
     for before, word in pairwise(["", *sys.argv[1:]]):
@@ -169,10 +167,10 @@ def _parted(bare: str | None) -> tuple[list[str], list[str]]:
 
 
 def _flag(word: str) -> str:
-    """A flag of Hydra's.
+    """Check a flag.
 
     Raises:
-        ConfigError: there is no such flag.
+        ConfigError: the flag does not exist.
     """
     name, _, value = word.partition("=")
     if word in _FLAGS or name in _VALUED:
@@ -180,28 +178,27 @@ def _flag(word: str) -> str:
     if value and name not in _FLAGS:
         raise ConfigError(f"{word}: options have no dashes; type {word.lstrip('-')}")
     flags = [flag for flag in (*_FLAGS, *_VALUED) if flag.startswith("--")]
-    near = get_close_matches(name, flags, n=1, cutoff=0.7)
-    hint = f"; did you mean {near[0]}?" if near else ";"
+    hint = suggestion(name, flags, cutoff=0.7) or ";"
     raise ConfigError(f"there is no flag {word}{hint} --help shows all options and flags")
 
 
 @contextmanager
 def _errors_raised() -> Iterator[None]:
-    """Let Hydra raise its errors; it would print them otherwise, in words of its own."""
-    asked = os.environ.get(_RAISE)
+    """Let Hydra raise its errors instead of printing them."""
+    before = os.environ.get(_RAISE)
     os.environ[_RAISE] = "1"
     try:
         yield
     finally:
-        if asked is None:
+        if before is None:
             del os.environ[_RAISE]
         else:
-            os.environ[_RAISE] = asked
+            os.environ[_RAISE] = before
 
 
 @contextmanager
 def _out_of_sight() -> Iterator[list[str]]:
-    """Silence for all processes but the first, and a folder for Hydra that nobody looks for."""
+    """Disable output of all processes except the first; yields overrides for a temporary folder."""
     if World().first:
         yield []
         return

@@ -1,6 +1,6 @@
-"""The folders of runs and sweeps: taken before Hydra writes there, and gathered at the end.
+"""The folders of runs and sweeps: locks at the start, and the table of a sweep at the end.
 
-Runs of a sweep may be other processes, on other machines: only the files that they write tell.
+Runs of a sweep may be other processes, on other machines. Their only output are files.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from nnode.errors import ConfigError, NNodeError, WriteError, printable
 from nnode.files import PARTIAL, csv_text, disk_words, write_text
 from nnode.lock import give, take
 
-#: What a run came to, or why it failed; in its folder.
+#: File with the result of a run, or its error, in its folder.
 RESULT = "result.json"
 
-#: Bytes that Hydra writes of a configuration, at most.
+#: Largest number of bytes of the configuration files that Hydra writes.
 ROOM = 1 << 15
 
-#: The sweep of this process: its folder, and the results that lay there before.
+#: Folder of this process's sweep to the result files that existed before it.
 _sweep: dict[Path, set[tuple[Path, int]]] = {}
 
 
 class Runs(Callback):
-    """Refuses a second run, or a second sweep, where one is at work; gathers a sweep's results."""
+    """Refuses a second run or sweep in a folder in use, and collects a sweep's results."""
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        # a folder named after an option that is missing: Hydra raises the error itself
+        # the folder's name may contain a missing option, for which Hydra raises an error later
         with suppress(OmegaConfBaseException):
             _take(Path(config.hydra.run.dir))
 
@@ -58,34 +58,34 @@ class Runs(Callback):
 
 
 class LogFormatter(logging.Formatter):
-    """Lines of the log: they may quote names from files."""
+    """Formatter that makes log messages printable, because they may contain names from files."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         return printable(super().formatMessage(record))
 
 
 def end(error: NNodeError) -> NoReturn:
-    """Say what happened and leave with the exit status that belongs to it.
+    """Print an error, and end the process with its exit status.
 
-    What all processes know is said by the first one, and they leave together.
+    If all processes have the error, the first one prints it, and they end together.
     """
     world, stopped = World(), isinstance(error, Interrupted)
     if world.first or not world.agreed:
         say(str(error) if stopped else f"error: {error}")
     if world.agreed:
-        world.part()
+        world.leave()
     if isinstance(error, Interrupted):
         sys.exit(128 + error.signal)
     sys.exit(2 if isinstance(error, ConfigError) else 1)
 
 
 def say(text: str) -> None:
-    """Tell the user at once."""
+    """Print a message to standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 def failures() -> list[Path]:
-    """Folders of the runs of this process's sweep that failed, wherever they ran."""
+    """Folders of the failed runs of this process's sweep."""
     new = [path for folder, old in _sweep.items() for path, _ in _results(folder) - old]
     return sorted(path.parent for path in new if "error" in json.loads(path.read_text()))
 
@@ -94,7 +94,7 @@ def _take(folder: Path, what: str = "run") -> None:
     path = folder / f".room.{os.getpid()}{PARTIAL}"
     try:
         take(folder)
-        # fail here, where there are words for it, and not where Hydra writes its configuration
+        # a full disk is detected here, because Hydra's error would be less clear
         with disk_words(folder):
             try:
                 path.write_bytes(bytes(ROOM))
@@ -102,23 +102,23 @@ def _take(folder: Path, what: str = "run") -> None:
                 path.unlink(missing_ok=True)
     except NNodeError as error:
         end(error)
-    except (OSError, ValueError) as error:  # a path that the system does not know how to make
-        said = getattr(error, "strerror", None) or error
+    except (OSError, ValueError) as error:  # the system cannot create the path
+        reason = getattr(error, "strerror", None) or error
         end(
             WriteError(
-                f"the folder {folder} cannot be made: {said}; choose another one with "
+                f"the folder {folder} cannot be made: {reason}; choose another one with "
                 f"hydra.{what}.dir="
             )
         )
 
 
 def _results(folder: Path) -> set[tuple[Path, int]]:
-    """Result files of the runs in a folder, with the time of their last change."""
+    """Result files of the runs in a folder, with their modification times."""
     return {(path, path.stat().st_mtime_ns) for path in folder.rglob(RESULT)}
 
 
 def _table(folder: Path) -> None:
-    """Write the results of trainings into ``sweep.csv`` and print them; nothing for other jobs."""
+    """Write the results of trainings to ``sweep.csv``, and print them; nothing for other jobs."""
     results = {
         path.parent.name: json.loads(path.read_text())
         for path in sorted(folder.glob(f"*/{RESULT}"), key=lambda p: (len(str(p)), p))

@@ -1,4 +1,4 @@
-"""A checkpoint's configuration under what the user asks for now."""
+"""A checkpoint's configuration as the default of the user's options."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from nnode.program import configuration, own_choices
 GROUPS = ("model", "data", "optimizer", "solver")
 
 
-#: Groups that were chosen for the user, from his first checkpoint.
+#: Groups that were taken from the first checkpoint instead of the user.
 _chosen: set[str] = set()
 
 
 def in_hydra() -> bool:
-    """Whether Hydra runs now; a job that has ended leaves its configuration behind."""
+    """Whether Hydra is running. HydraConfig alone stays initialised after a job."""
     return HydraConfig.initialized() and GlobalHydra.instance().is_initialized()
 
 
 def composed(name: str, overrides: list[str]) -> DictConfig:
-    """The configuration of a command with some overrides, Hydra's part with it."""
+    """The configuration of a command with overrides, including Hydra's part."""
     with initialize_config_dir(str(configuration().absolute()), version_base="1.3"):
         return compose(name, overrides, return_hydra_config=True)
 
@@ -40,22 +40,31 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, enum_to_str=True))
 
 
-def plain_config(config: DictConfig) -> dict[str, Any]:
-    """The composed configuration in plain types, with the groups it was composed from.
+def options_of(section: DictConfig) -> Any:
+    """A section of a configuration as its dataclass of options.
 
-    One that was made without Hydra names its groups itself.
+    Raises:
+        MissingMandatoryValue: a mandatory option has no value.
     """
-    found = plain(config)
-    make_absolute(found.get("data", {}))
-    found.pop("resume", None)
+    return OmegaConf.to_object(section)
+
+
+def plain_config(config: DictConfig) -> dict[str, Any]:
+    """The composed configuration in plain types, with the chosen groups.
+
+    A configuration that was made without Hydra already contains its groups.
+    """
+    values = plain(config)
+    make_absolute(values.get("data", {}))
+    values.pop("resume", None)
     if in_hydra():
         choices = HydraConfig.get().runtime.choices
-        found["groups"] = {group: str(choices[group]) for group in GROUPS if group in choices}
-    return found
+        values["groups"] = {group: str(choices[group]) for group in GROUPS if group in choices}
+    return values
 
 
 def make_absolute(data: dict[str, Any]) -> None:
-    """Let a data set's files be found again from any working directory."""
+    """Make a data set's paths absolute, so that they do not depend on the working directory."""
     for key in ("path", "source", "prepared", "walls", "geometry"):
         place = data.get(key)
         if isinstance(place, str) and Path(place).exists():
@@ -70,11 +79,11 @@ def path_given(overrides: list[str], option: str) -> str | None:
 
 
 def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GROUPS) -> list[str]:
-    """Overrides that choose a checkpoint's groups where the user chooses none.
+    """Overrides that choose a checkpoint's groups if the user chooses none.
 
     Raises:
-        CheckpointError: a group's name for which there is no file ``conf/GROUP/NAME.yaml``. Hydra
-            would take any path for a name, and would run what a file that it finds there asks for.
+        CheckpointError: there is no file ``conf/GROUP/NAME.yaml`` for a group's name. The check is
+            necessary because Hydra accepts any path as a name, and such a file can run code.
     """
     path = path_given(overrides, option)
     if path is None:
@@ -83,20 +92,20 @@ def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GR
     given = {override.partition("=")[0] for override in overrides}
     chosen = [group for group in groups if group in saved.keys() - given]
     for group in chosen:
-        known = choices(group)
-        if saved[group] not in [*known, *own_choices(group)]:
+        available = choices(group)
+        if saved[group] not in [*available, *own_choices(group)]:
             raise CheckpointError(
                 f"{path} was made with {group}={str(saved[group])[:80]!r}, and there is no such "
-                f"file in conf/{group}, which has {', '.join(known)}; give {group}=NAME yourself, "
-                f"or name the folder with the file {group}/NAME.yaml with --config-dir"
+                f"file in conf/{group}, which has {', '.join(available)}; give {group}=NAME "
+                f"yourself, or name the folder with the file {group}/NAME.yaml with --config-dir"
             )
     _chosen.update(chosen)
     return [f"{group}={saved[group]}" for group in chosen]
 
 
 def field_groups(overrides: list[str]) -> list[str]:
-    """Overrides that choose compiled code and Gauss and Newton's method for the field's laws where
-    the user chooses nothing else; the paper's models keep the paper's."""
+    """Overrides that choose compiled code and Gauss-Newton for car-following laws if the user does
+    not choose a solver and an optimiser. The paper's models keep the paper's methods."""
     pairs = (override.lstrip("+").partition("=") for override in overrides)
     chosen = {key: value for key, _, value in pairs}
     if "experiment" in chosen or not CAR_FOLLOWING_LAWS.keys() >= set(
@@ -108,22 +117,22 @@ def field_groups(overrides: list[str]) -> list[str]:
 
 
 def train_groups(overrides: list[str]) -> list[str]:
-    """What ``nnode train`` chooses for the user, from a checkpoint or for a law."""
+    """The groups that ``nnode train`` chooses for the user, from a checkpoint or for a law."""
     return saved_groups(overrides, option="resume") or field_groups(overrides)
 
 
 def keys_given() -> list[str]:
-    """Names of the options that this job was started with."""
+    """Names of the options on this job's command line."""
     return [override.partition("=")[0].lstrip("+") for override in HydraConfig.get().overrides.task]
 
 
 def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, ...]) -> DictConfig:
-    """``config`` with ``sections`` as a checkpoint has them, and the user's options on top.
+    """``config`` with ``sections`` of a checkpoint, and with the user's options in them.
 
-    A section stays as composed where the user chose another group than the checkpoint's.
+    A section does not change if the user chose another group than the checkpoint's.
 
     Raises:
-        ConfigError: checkpoints of different groups in one sweep.
+        ConfigError: a sweep has checkpoints of different groups.
         CheckpointError: the checkpoint's configuration lacks a section.
     """
     merged = config.copy()
@@ -132,21 +141,21 @@ def merge_saved(config: DictConfig, saved: dict[str, Any], sections: tuple[str, 
             f"the checkpoint's configuration has no {', '.join(sorted(lacking))}; it is damaged: "
             "take another checkpoint"
         )
-    choices, own = HydraConfig.get().runtime.choices, saved["groups"]
+    choices, saved_choices = HydraConfig.get().runtime.choices, saved["groups"]
     for name in sections:
-        if name not in own or choices[name] == own[name]:
-            own_options = with_present_names(saved[name]) if name == "data" else saved[name]
-            OmegaConf.update(merged, name, own_options, merge=True)
+        if name not in saved_choices or choices[name] == saved_choices[name]:
+            saved_options = with_present_names(saved[name]) if name == "data" else saved[name]
+            OmegaConf.update(merged, name, saved_options, merge=True)
             if isinstance(saved[name], dict) and "law" in saved[name]:
-                # a law is one piece: what its description did not say then, it does not say now
+                # a law's description is replaced as a whole, without the present file's entries
                 OmegaConf.update(merged, f"{name}.law", saved[name]["law"], merge=False)
         elif name in _chosen:
             raise ConfigError(
-                f"this checkpoint has {name}={own[name]}, the first one of the sweep "
+                f"this checkpoint has {name}={saved_choices[name]}, the first one of the sweep "
                 f"{name}={choices[name]}; sweep over checkpoints of one {name}"
             )
     for key in keys_given():
-        if key not in own and key.partition(".")[0] in sections:
+        if key not in saved_choices and key.partition(".")[0] in sections:
             OmegaConf.update(merged, key, OmegaConf.select(config, key), force_add=True)
     return merged
 
@@ -156,10 +165,10 @@ def refuse_changes(
 ) -> None:
     """Refuse any difference outside ``allowed`` keys.
 
-    An option that the version of the checkpoint did not have has its default, unless it is given.
+    Options that the checkpoint's version did not have are compared only if they are given.
 
     Raises:
-        ConfigError: naming the option, what the checkpoint has and what is asked for.
+        ConfigError: an option differs; the message states both values.
     """
     for key, value in now.items():
         full, had = prefix + key, saved.get(key)

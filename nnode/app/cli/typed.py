@@ -1,4 +1,4 @@
-"""Options as they can be typed: overrides in Hydra's grammar, quoted for the shell."""
+"""Options as text: overrides in Hydra's grammar, quoted for the shell."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from nnode.program import configuration
 
 
 def shell_override(key: str, value: object) -> str:
-    """``key=value`` as it can be typed, whatever characters the value has."""
+    """The override ``key=value``, quoted for the shell."""
     return shlex.quote(f"{key}={literal(value)}")
 
 
 def literal(value: object) -> str:
-    """A value in Hydra's grammar: text, number, truth, None, or lists and mappings of them."""
+    """A value in Hydra's grammar: text, number, bool, None, or lists and mappings of these."""
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     if isinstance(value, Mapping):
@@ -43,7 +43,7 @@ def literal(value: object) -> str:
 
 
 def _name(key: object) -> str:
-    """The name of a mapping's entry."""
+    """The escaped key of a mapping."""
     return re.sub(r"([\\()\[\]{}:=, \t])", r"\\\1", str(key))
 
 
@@ -53,27 +53,27 @@ def plain_options(options: object) -> dict[str, Any]:
 
 
 def group_defaults(section: str, group: str, command: str | None = None) -> dict[str, Any]:
-    """What a configuration group has where nothing is said, ``???`` where something must be.
+    """The defaults of a configuration group; mandatory options have the value ``???``.
 
     Args:
-        command: one that has such groups, if the one that runs has none.
+        command: a command with this section, if the running one has none.
     """
     if in_hydra():
         name = command or HydraConfig.get().job.config_name
         config = OmegaConf.select(compose(name, [f"{section}={group}"]), section)
     else:
         config = cast(DictConfig, OmegaConf.merge(*written(section, group)))
-    found = plain(config)
+    values = plain(config)
     if section == "data":
-        make_absolute(found)
-    return found
+        make_absolute(values)
+    return values
 
 
 def written(section: str, group: str) -> tuple[type, DictConfig]:
-    """A group's schema, and what its file has besides.
+    """A group's schema, and the values in its file.
 
     Raises:
-        ConfigError: no such file.
+        ConfigError: the file does not exist.
     """
     from nnode.config import SCHEMAS, choices
 
@@ -81,22 +81,26 @@ def written(section: str, group: str) -> tuple[type, DictConfig]:
         raise ConfigError(
             f"{section}={group} is unknown, expected one of {', '.join(choices(section))}"
         )
-    own = cast(DictConfig, OmegaConf.load(configuration() / section / f"{group}.yaml"))
-    return SCHEMAS[section, str(own.pop("defaults")[0])], own
+    values = cast(DictConfig, OmegaConf.load(configuration() / section / f"{group}.yaml"))
+    return SCHEMAS[section, str(values.pop("defaults")[0])], values
 
 
 def changes(prefix: str, values: Mapping[str, Any], defaults: Mapping[str, Any]) -> list[str]:
-    """The overrides, as they can be typed, that make ``values`` of ``defaults``.
+    """The overrides, quoted for the shell, that change ``defaults`` to ``values``.
 
-    Options of options are told one by one; a mapping that takes any name is told as a whole.
+    Nested options are written one by one, and mappings with free keys as a whole.
     """
-    found = []
+    overrides = []
     for key, value in values.items():
-        known = defaults.get(key)
-        if value == known and key in defaults:
+        default = defaults.get(key)
+        if value == default and key in defaults:
             continue
-        if isinstance(value, Mapping) and isinstance(known, Mapping) and set(value) == set(known):
-            found += changes(f"{prefix}.{key}", value, known)
+        if (
+            isinstance(value, Mapping)
+            and isinstance(default, Mapping)
+            and set(value) == set(default)
+        ):
+            overrides += changes(f"{prefix}.{key}", value, default)
         else:
-            found.append(shell_override(f"{prefix}.{key}", value))
-    return found
+            overrides.append(shell_override(f"{prefix}.{key}", value))
+    return overrides

@@ -1,1 +1,1 @@
-"""The commands: one file each, whose docstring ``--help`` shows."""
+"""The commands, one file each. ``--help`` shows its docstring."""

@@ -1,11 +1,12 @@
-"""What a file of trajectories holds and what is wrong with it, before anything else.
+"""Check the content of a file of trajectories before using it.
 
-Columns, units, rate and time scale, identifiers, swaps, overlaps, holes, direction, order, who
-comes and goes, how sure all that is, and the options with which the other commands read the file.
+The check covers columns, units, sampling rate and time scale, identifiers, swaps, overlaps, gaps in
+time, direction, order, arrivals and departures. It states the certainty of what it recognises, and
+the options with which the other commands read the file.
 
 Examples:
   nnode check mine.csv
-  # what is known need not be guessed
+  # known options are not guessed
   nnode check people.txt domain=crowd frame_rate=25
 
 Results: a text, and check.html, a page that needs no other file. Nothing is changed.

@@ -6,14 +6,14 @@ Examples:
   nnode discover model=lin model.leader=measured data=table data.path=F.csv \\
       data.domain=traffic
   nnode discover model=sf data=table data.path=F.csv data.domain=crowd data.walls=W.csv
-  # not looking for one effect, in a folder of your choice
+  # without one effect, in a folder of your choice
   nnode discover model=lin data=ngsim 'discover.exclude=[inertia]' hydra.run.dir=DIR
 
-Networks (model=n2, n4, n10, nn) hide effects of their own inputs: diagnose a law to see those. The
-effects that are looked for, with formulas, units and sources: python -m nnode.discover.catalogue
+Networks (model=n2, n4, n10, nn) can represent effects of their inputs: diagnose a law to find
+them. python -m nnode.discover.catalogue lists the effects with formulas, units and sources.
 
 Results: report.html, report.json, and the extended model as model.yaml and checkpoints/best.pt;
-docs/discovery.md tells how to read them, and how to write an effect of your own.
+docs/discovery.md explains them, and how to write your own effect.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Errors of a calibrated model beside its baselines.
+"""Compute the errors of a calibrated model and of baselines.
 
 Examples:
   # on the sequences that its training held out
@@ -7,8 +7,8 @@ Examples:
   nnode evaluate checkpoint=RUN/checkpoints/best.pt data=esimas data.recording=2-1_1
   nnode evaluate checkpoint=RUN/checkpoints/best.pt part=all
 
-Results: a table, metrics.json, and replay.html, in which agents move. Data and solver are those of
-the training where none are chosen.
+Results: a table, metrics.json, and replay.html, an animation. Data and solver are those of the
+training by default.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""A run's results in the formats of other programs.
+"""Export a run's results to the formats of other programs.
 
 Examples:
-  # all that fit the run's model
+  # all formats that fit the run's model
   nnode export run=RUN
   # the social force's parameters for JuPedSim, a law's for SUMO
   nnode export run=RUN to=jupedsim
   nnode export run=RUN 'to=[pedpy,parquet]' trajectories=simulated part=heldout
 
-Results: the files, and what of the model has no counterpart there; docs/exchange.md. Data are those
-of the run where none are chosen.
+Results: the files, and a list of parts of the model without a counterpart; see docs/exchange.md.
+Data are those of the run by default.
 """
 
 from __future__ import annotations

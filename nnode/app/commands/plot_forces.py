@@ -1,8 +1,8 @@
-"""Force plots of one or many calibrated models.
+"""Plot the forces or speed curves of calibrated models.
 
 Examples:
   nnode plot_forces checkpoint=RUN/checkpoints/best.pt
-  # several models of traffic in one picture
+  # several models of traffic in one figure
   nnode plot_forces 'checkpoint=[A/checkpoints/best.pt,B/checkpoints/best.pt]'
   # a crowd's force within 2 m
   nnode plot_forces checkpoint=RUN/checkpoints/best.pt extent=2

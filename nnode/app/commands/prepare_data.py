@@ -1,6 +1,6 @@
-"""Turn raw recordings into sequences, with a manifest of everything kept and dropped.
+"""Convert raw recordings to sequences, with a manifest of what was kept and dropped.
 
-Other commands do so on the fly; this one does it once, to look at what became of the files.
+Other commands do this implicitly. This command stores the result, so that it can be inspected.
 
 Examples:
   # the paper's traffic data, downloaded or from the folder in NNODE_DATA
@@ -13,8 +13,8 @@ Examples:
   nnode prepare_data data=pairs data.path=FOLDER 'data.columns={time: t, spacing: gap}'
   nnode prepare_data data=sumo data.path=fcd.xml
 
-Results: the sequences, manifest.json, and pictures of those with faults. Train with
-data.prepared=FOLDER, and no other option of the data.
+Results: the sequences, manifest.json, and figures of sequences with faults. Train with
+data.prepared=FOLDER, without other options of the data.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""Motion sampled from a calibrated model, with its noise and its drivers or walkers.
+"""Sample motion from a calibrated model, with noise and random drivers or pedestrians.
 
 Examples:
-  # what the run held out, 99 times, scored beside the model without noise and constant speeds
+  # 99 samples of held-out sequences, scored with the model without noise and constant speeds
   nnode simulate run=RUN
   nnode simulate run=RUN samples=399 seed=1
-  # the samples as SUMO or PedPy have trajectories; scores alone
+  # the samples in the formats of SUMO or PedPy; only scores
   nnode simulate run=RUN format=fcd
   nnode simulate run=RUN format=pedpy
   nnode simulate run=RUN format=null
 
-Results: scores.json, the noise, CRPS and what bands cover; bands.png; samples.parquet, which
-data=table reads, of people with walls.csv. docs/sampling.md has the other formats and how noise is
-fitted. Data are those of the run.
+Results: scores.json with the noise, CRPS and the coverage of bands; bands.png; samples.parquet,
+which data=table reads, for pedestrians with walls.csv. docs/sampling.md explains other formats and
+the fit of the noise. Data are those of the run.
 """
 
 from __future__ import annotations

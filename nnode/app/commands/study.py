@@ -1,15 +1,15 @@
-"""Redo the paper's studies on the real recordings; ends with one page beside its printed numbers.
+"""Repeat the paper's studies on the real recordings, with a page that compares printed numbers.
 
 Examples:
   nnode study study=traffic
-  # shows within a minute that all works; no figures to cite
+  # a test of one minute, whose numbers are not results
   nnode study study=crowd study.quick=true
   # pairs and platoons that the study cannot download: a folder with ngsim_pairs, openacc, tgsim
   NNODE_DATA=FOLDER nnode study study=following
   nnode study study=traffic study.workers=8 hydra.run.dir=runs/study/mine
 
 Results: study.html, the same in Markdown, and a CSV of every table and of all parameters. The same
-command goes on where it was stopped.
+command continues a stopped study.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What users of Python meet: tables and names in, objects out."""
+"""The Python interface: tables and names as arguments, objects as results."""

@@ -1,4 +1,4 @@
-"""Calibrate in Python: an estimator as scikit-learn's are, which is not needed for it."""
+"""Calibration in Python by an estimator with scikit-learn's interface."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import time
 from collections.abc import Mapping
 from collections.abc import Sequence as ListLike
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from html import escape
 from pathlib import Path
 from typing import Any, Self
@@ -17,6 +16,7 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.calibration import Calibration, calibrated
+from nnode.app.cli.saved import options_of
 from nnode.app.python.inputs import choice, data_of, model_options, sequences
 from nnode.app.python.words import python_words
 from nnode.app.training import (
@@ -30,7 +30,7 @@ from nnode.app.training import (
 from nnode.calibrate.options import Device
 from nnode.data.dataset import Source, sound_speeds
 from nnode.data.sequences import Sequences
-from nnode.errors import ConfigError, NotFittedError
+from nnode.errors import ConfigError, NotFittedError, suggestion
 from nnode.exchange.trajectories import simulated
 from nnode.model import System
 from nnode.model.build import add_effects
@@ -43,44 +43,45 @@ _TOGETHER = 32
 
 @dataclass(eq=False, repr=False)
 class Calibrator:
-    """Calibrates a model to trajectories; scikit-learn's conventions, with or without it.
+    """Calibrates a model to trajectories, with scikit-learn's interface but without requiring it.
 
-    A sample is a sequence: what is fitted, predicted and scored is a tidy table, or
-    :func:`nnode.sequences` of one, which scikit-learn's splitters can divide:
+    A sample is a sequence. The methods take a tidy table, or :func:`nnode.sequences` of one, which
+    scikit-learn's splitters can divide:
     ``cross_val_score(Calibrator("idm"), X, groups=X.groups, cv=GroupKFold(5))``. All work is done
-    on the CPU; the command can take a GPU.
+    on the CPU; the command can use a GPU.
 
     Args:
         model: a name as in ``conf/model``; options with their ``term``; or a
             :class:`nnode.model.System`, which is copied.
-        effects: beside it, names or ``{"name": ..., parameter: value}``.
-        leader: ``constant`` or ``measured``, what the first vehicle does; None: the model's own.
-        cost: what is minimised, see :class:`nnode.calibrate.cost.Convention`.
+        effects: additional effects, names or ``{"name": ..., parameter: value}``.
+        leader: ``constant`` or ``measured``, the motion of the first vehicle; None takes the
+            model's default.
+        cost: the cost, see :class:`nnode.calibrate.cost.Convention`.
         drivers: ``none``, ``auto`` or names of parameters such as ``["T", "v0"]``, which differ
-            between drivers; ``auto``: those of which the data tell how they differ. Laws of lanes
-            are then calibrated by a mixed-effects model, see ``docs/method.md``. None: ``auto``
-            for laws of second order where errors of positions are 0.015 to 0.45 m, otherwise
+            between drivers; ``auto`` selects those whose variance the data determine. Laws of lanes
+            are then calibrated by a mixed-effects model, see ``docs/method.md``. None is ``auto``
+            for laws of second order if errors of positions are 0.015 to 0.45 m, and otherwise
             ``none``.
-        pooling: ``pooled``, ``alone`` or ``shrunk``: parameters of each sequence's own beside the
-            pool's, in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
-        start_speeds: ``auto``, ``given``, or ``fitted`` beside the parameters to each training
-            sequence; see :class:`nnode.calibrate.options.StartSpeeds`.
-        optimizer: a name as in ``conf/optimizer``, or options with their ``name``; None: as the
-            command does, Gauss and Newton's method for the field's laws; also for ``sf``, and
-            L-BFGS for all others (where the command has the paper's stochastic descent).
-        solver: ``fused`` (compiled) or ``torchdiffeq``; None: fused.
-        method: of stepping; None: the solver's choice.
-        dt: s, step; None: the solver's choice.
-        epochs: at most; methods that end by themselves do.
-        heldout: share of the sequences of a fit that it does not see, to watch their cost.
-        seed: of start values, of the order of mini-batches and of the division.
+        pooling: ``pooled``, ``alone`` or ``shrunk``; the last two add separate parameters of each
+            sequence in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
+        start_speeds: ``auto``, ``given``, or ``fitted`` for each training sequence; see
+            :class:`nnode.calibrate.options.StartSpeeds`.
+        optimizer: a name as in ``conf/optimizer``, or options with their ``name``. None takes
+            Gauss-Newton for car-following laws, as the command does, and for ``sf``; and L-BFGS
+            for all others (for which the command takes the paper's stochastic descent).
+        solver: ``fused`` (compiled) or ``torchdiffeq``; None is fused.
+        method: method of stepping; None takes the solver's default.
+        dt: step, s; None takes the solver's default.
+        epochs: largest number of epochs; some optimisers end earlier.
+        heldout: share of the sequences that are held out, to monitor their cost.
+        seed: seed of start values, of the order of mini-batches and of the division.
 
     Attributes:
-        result_: the whole :class:`nnode.app.calibration.Calibration`.
+        result_: the complete :class:`nnode.app.calibration.Calibration`.
         model_: the calibrated model, a torch module.
         parameters_: data frame with ``estimate``, ``lower``, ``upper`` and ``unit``.
         cost_: mean cost of a training sequence.
-        n_iter_: epochs that were done.
+        n_iter_: number of epochs.
         history_: data frame, a row per evaluation.
     """
 
@@ -106,10 +107,10 @@ class Calibrator:
             X: a data frame or the path of a table, :func:`nnode.sequences`, or a list of
                 :class:`nnode.data.sequence.Sequence`.
             y: not used.
-            groups: not used; clusters are found from who is in the sequences.
+            groups: not used; clusters follow from the agents and times of sequences.
 
         Raises:
-            NNodeError: a table, a model or options that do not fit; the message says what to do.
+            NNodeError: invalid table, model or options; the message says what to do.
         """
         with python_words():
             return self._fitted(Sequences.of(X))
@@ -119,11 +120,11 @@ class Calibrator:
         check(config)
         with threads_given_back():
             model = self._built(config, given)
-            solver = build_solver(OmegaConf.to_object(config.solver))  # type: ignore[arg-type]
+            solver = build_solver(options_of(config.solver))
             plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
             assert isinstance(plain, dict)
-            told = {str(key): value for key, value in plain.items()}
-            trainer = trainer_of(config, model, solver, given, plain=told)
+            plain_values = {str(key): value for key, value in plain.items()}
+            trainer = trainer_of(config, model, solver, given, plain=plain_values)
             start = time.monotonic()
             trainer.fit()
             self.result_: Calibration = calibrated(trainer, given, time.monotonic() - start)
@@ -140,11 +141,11 @@ class Calibrator:
 
         Returns:
             The simulated trajectories, at the times and of the agents of ``X``;
-            ``.to_dataframe()`` is their tidy table with the keys of the one that was given.
+            ``.to_dataframe()`` is their tidy table with the keys of the given table.
 
         Raises:
-            NotFittedError: before :meth:`fit`.
-            NNodeError: a table that does not fit, or a simulation that blows up.
+            NotFittedError: :meth:`fit` has not been called.
+            NNodeError: the table is invalid, or a simulation blows up.
         """
         if not hasattr(self, "result_"):
             raise _unfitted()
@@ -163,14 +164,14 @@ class Calibrator:
     def score(self, X: Any, y: object = None) -> float:
         """Minus the root mean square distance (m) of simulated from measured positions.
 
-        Over all simulated agents and samples after the first, as ``nnode evaluate`` prints it;
-        higher is better. A leader that drives as it was measured is left out.
+        It is over all simulated agents and samples after the first, as ``nnode evaluate`` prints
+        it; higher is better. A measured leader is excluded.
         """
         with python_words():
             given = Sequences.of(X)
         return self.predict(given).score(given)
 
-    # -- what scikit-learn asks of an estimator ------------------------------------------------
+    # -- scikit-learn's interface of estimators ------------------------------------------------
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
         """The arguments of the constructor by name; ``deep`` changes nothing."""
@@ -180,15 +181,14 @@ class Calibrator:
         """Change arguments of the constructor.
 
         Raises:
-            ConfigError: one that there is not.
+            ConfigError: an unknown argument.
         """
-        known = list(self.get_params())
+        names = list(self.get_params())
         for name, value in params.items():
-            if name not in known:
-                near = get_close_matches(name, known, n=1)
-                hint = f"; did you mean {near[0]}?" if near else ""
+            if name not in names:
                 raise ConfigError(
-                    f"a Calibrator has no parameter {name}, it has {', '.join(known)}{hint}"
+                    f"a Calibrator has no parameter {name}, it has {', '.join(names)}"
+                    f"{suggestion(name, names)}"
                 )
             setattr(self, name, value)
         return self
@@ -207,11 +207,11 @@ class Calibrator:
         return hasattr(self, "result_")
 
     def __repr__(self) -> str:
-        usual = {field.name: field.default for field in fields(self)}
-        changed = {
-            k: v for k, v in self.get_params().items() if v is not usual[k] and v != usual[k]
+        defaults = {field.name: field.default for field in fields(self)}
+        arguments = {
+            k: v for k, v in self.get_params().items() if v is not defaults[k] and v != defaults[k]
         }
-        return f"Calibrator({', '.join(f'{k}={v!r}' for k, v in changed.items())})"
+        return f"Calibrator({', '.join(f'{k}={v!r}' for k, v in arguments.items())})"
 
     def _repr_html_(self) -> str:
         head = f"<p><code>{escape(repr(self))}</code></p>"
@@ -273,9 +273,13 @@ class Calibrator:
 
 
 def _unfitted() -> NotFittedError:
-    """The error of what is asked too early, of scikit-learn's kind as well where that is loaded."""
-    theirs = sys.modules.get("sklearn.exceptions")
-    kinds = (NotFittedError,) if theirs is None else (NotFittedError, theirs.NotFittedError)
+    """The error before a fit, which is also scikit-learn's NotFittedError if that is loaded."""
+    sklearn_errors = sys.modules.get("sklearn.exceptions")
+    kinds = (
+        (NotFittedError,)
+        if sklearn_errors is None
+        else (NotFittedError, sklearn_errors.NotFittedError)
+    )
     error: NotFittedError = type("NotFittedError", kinds, {})(
         "this Calibrator is not fitted yet; call fit(table) first"
     )
@@ -295,25 +299,20 @@ def fit(
     seed: int = 0,
     **reading: Any,
 ) -> Calibration:
-    """Calibrate a model to a table in one call: :class:`Calibrator`, without the estimator.
+    """Calibrate a model to a table in one call, with :class:`Calibrator`.
 
     Args:
         data: CSV or Parquet, or a data frame, whose columns and units are recognised, see
-            :func:`nnode.sequences` and ``docs/data.md``; or those sequences.
-        domain: ``traffic`` or ``crowd``; None: as the columns show.
+            :func:`nnode.sequences` and ``docs/data.md``; or the sequences that it returns.
+        domain: ``traffic`` or ``crowd``; None recognises it from the columns.
         walls: CSV with x1, y1, x2, y2, m.
-        model: see :class:`Calibrator`, as for the following.
-        leader: what the first vehicle does.
-        drivers: which parameters differ between drivers; None: as the data tell, for laws of
-            second order and positions with errors.
-        epochs: at most.
-        heldout: share of the sequences that the calibration does not see.
-        seed: of start values and of the division.
-        reading: how the table is read, as :func:`nnode.sequences` takes it: ``columns={...}``,
+        model, leader, drivers, epochs, seed: see :class:`Calibrator`.
+        heldout: share of the sequences that are held out.
+        reading: options for reading the table, as for :func:`nnode.sequences`: ``columns={...}``,
             ``position_unit="ft"``, ``faults="keep"``, ...
 
     Raises:
-        NNodeError: a table, a model or options that do not fit; the message says what to do.
+        NNodeError: invalid table, model or options; the message says what to do.
     """
     options = {"walls": None if walls is None else str(walls), **reading}
     if not isinstance(data, Sequences):

@@ -1,11 +1,10 @@
-"""What is handed over in Python in place of a configuration: tables, and choices by their names."""
+"""Arguments of the Python interface in place of a configuration: tables, and names of choices."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Sequence as ListLike
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException, ValidationError
 
 from nnode.app.cli.mistakes import unknown_option, wrong_value
+from nnode.app.cli.saved import options_of
 from nnode.app.cli.typed import plain_options, written
 from nnode.app.python.words import python_words
 from nnode.calibrate.checkpoint import Checkpoint
@@ -26,7 +26,7 @@ from nnode.data.readers.columns import Table as DataTable
 from nnode.data.readers.table import TableOptions
 from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, suggestion
 from nnode.model.laws import LAW_MODELS
 from nnode.program import configuration
 
@@ -55,8 +55,8 @@ def model_options(
 
     Args:
         model: a name as in ``conf/model``, or options with their ``term``.
-        leader: of a traffic model that does not say so itself; None: its default.
-        effects: in place of those that the options name.
+        leader: leader of a traffic model whose options have none; None takes the default.
+        effects: effects in place of those in the options.
 
     Raises:
         ConfigError: an unknown name, term or option.
@@ -67,41 +67,41 @@ def model_options(
     term = str(given.get("term", ""))
     schema = SCHEMAS.get(("model", f"{term}_schema"))
     if schema is None:
-        known = sorted({node.term for (group, _), node in SCHEMAS.items() if group == "model"})
-        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(known)}")
+        terms = sorted({node.term for (group, _), node in SCHEMAS.items() if group == "model"})
+        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(terms)}")
     if hasattr(schema, "leader") and leader is not None:
         given.setdefault("leader", leader)
     if effects:
         given["effects"] = list(effects)
-    found = OmegaConf.to_container(merged("model", schema, given), enum_to_str=True)
-    assert isinstance(found, dict)
-    return {str(key): value for key, value in found.items()}
+    options = OmegaConf.to_container(merged("model", schema, given), enum_to_str=True)
+    assert isinstance(options, dict)
+    return {str(key): value for key, value in options.items()}
 
 
 def merged(section: str, schema: Any, *given: Mapping[str, Any]) -> DictConfig:
-    """Options of a schema with the values that are given.
+    """Options of a schema with given values.
 
     Raises:
-        ConfigError: an option that there is not, or a value of another type.
+        ConfigError: an unknown option, or a value of the wrong type.
     """
     try:
         return cast(DictConfig, OmegaConf.merge(OmegaConf.structured(schema), *given))
     except OmegaConfBaseException as error:
-        said = str(error).splitlines()[0]
+        message = str(error).splitlines()[0]
         key = str(error.full_key or _culprit(schema, given))
-        known = OmegaConf.create({section: OmegaConf.structured(schema)})
+        config = OmegaConf.create({section: OmegaConf.structured(schema)})
         if not isinstance(error, ValidationError):
-            raise unknown_option(f"{section}.{key}", known, "nnode", "") from error
+            raise unknown_option(f"{section}.{key}", config, "nnode", "") from error
         every = OmegaConf.merge(*given)
         value = OmegaConf.select(every, key)
         full = f"{section}.{key}"
-        raise wrong_value(full, f"{full}={value}", said, known) from error
+        raise wrong_value(full, f"{full}={value}", message, config) from error
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{section}: {str(error).splitlines()[0]}") from error
 
 
 def _culprit(schema: Any, given: tuple[Mapping[str, Any], ...]) -> str:
-    """The option whose value is of another type than it must be."""
+    """The option whose value has the wrong type; empty for none."""
     for options in given:
         for key, value in options.items():
             try:
@@ -112,13 +112,13 @@ def _culprit(schema: Any, given: tuple[Mapping[str, Any], ...]) -> str:
 
 
 def choice(
-    group: str, chosen: str | Mapping[str, Any], more: Mapping[str, Any] | None = None
+    group: str, chosen: str | Mapping[str, Any], further: Mapping[str, Any] | None = None
 ) -> DictConfig:
     """Options of a solver, an optimiser or the trainer.
 
     Args:
-        chosen: a name, or options with their ``name``; of the trainer options alone.
-        more: further options.
+        chosen: a name, or options with their ``name``; for the trainer, options without a name.
+        further: further options.
 
     Raises:
         ConfigError: an unknown name or option.
@@ -128,11 +128,15 @@ def choice(
     given = {"name": chosen} if isinstance(chosen, str) else dict(chosen)
     if group == "trainer":
         return merged(group, TrainerOptions, given)
-    known = {key.removesuffix("_schema"): of for (own, key), of in SCHEMAS.items() if own == group}
+    schemas = {
+        key.removesuffix("_schema"): schema
+        for (section, key), schema in SCHEMAS.items()
+        if section == group
+    }
     name = str(given.get("name", ""))
-    if name not in known:
-        raise ConfigError(f"{group}={name} is unknown, expected one of {', '.join(known)}")
-    return merged(group, known[name], given, more or {})
+    if name not in schemas:
+        raise ConfigError(f"{group}={name} is unknown, expected one of {', '.join(schemas)}")
+    return merged(group, schemas[name], given, further or {})
 
 
 def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
@@ -156,19 +160,19 @@ def sequences(
 ) -> Sequences:
     """Trajectories of a table, or of a data set that nnode knows, as a list of sequences.
 
-    Columns and units of a table are recognised by their names and by what they hold, as
-    :func:`nnode.check` does; a line says what was recognised. What ``options`` say wins.
+    Columns and units of a table are recognised by their names and contents, as by
+    :func:`nnode.check`. A printed line states what was recognised. Given ``options`` have priority.
 
     Args:
-        table: a data frame, or the path of one; None for data sets that say where they are.
-        data: how it is read, a name as in ``conf/data``: ``table``, ``pairs``, ``vehicles``,
-            ``esimas``, ...; None: as the table shows.
-        options: of those data, as on the command line behind ``data.``: ``columns={...}``,
+        table: a data frame, or the path of a table; None for data sets with known places.
+        data: format, a name as in ``conf/data``: ``table``, ``pairs``, ``vehicles``, ``esimas``,
+            ...; None recognises it.
+        options: options of the data, as on the command line after ``data.``: ``columns={...}``,
             ``walls="walls.csv"``, ``recording="1-1_1"``, ``faults="keep"``, ...
 
     Raises:
-        NNodeError: unknown data or options, a table that does not fit, with the row, or one whose
-            columns or units may be two things; names both.
+        NNodeError: data or options are unknown; the table is invalid, with the row; or its columns
+            or units are ambiguous, with both possibilities.
     """
     with python_words():
         if isinstance(table, Sequences):
@@ -176,15 +180,15 @@ def sequences(
             return table
         if table is None and data is None:
             raise ConfigError("there is no table: give one, or name a data set: data='esimas'")
-        source, found = read_options(table, data, options)
-        return Sequences.of(source, found)
+        source, reading = read_options(table, data, options)
+        return Sequences.of(source, reading)
 
 
 def refuse_reading(data: str | None, options: Mapping[str, Any]) -> None:
-    """Refuse options of reading for what was read already.
+    """Refuse reading options for sequences that have been read.
 
     Raises:
-        ConfigError: names them.
+        ConfigError: an option is given.
     """
     given = [name for name, value in {"data": data, **options}.items() if value is not None]
     if given:
@@ -197,11 +201,11 @@ def refuse_reading(data: str | None, options: Mapping[str, Any]) -> None:
 def read_options(
     table: pd.DataFrame | str | Path | None, data: str | None, given: Mapping[str, Any]
 ) -> tuple[pd.DataFrame | DataTable | str | Path | None, DataOptions]:
-    """The options that read a table, and what they read: None the file that they name.
+    """The source and the options for reading a table. The source None is the options' path.
 
     Args:
-        data: the group of the options; None: as the table shows.
-        given: options that win over what is recognised.
+        data: group of the options; None recognises it.
+        given: options with priority over recognised ones.
 
     Raises:
         NNodeError: see :func:`sequences`.
@@ -210,67 +214,76 @@ def read_options(
         return None, data_options(str(data), given)
     if data is not None and (data not in NEEDED or has_columns(table, data, given)):
         return table, data_options(data, given, in_memory=True)
-    found = recognised(table, given.get("domain"), given)
-    if data not in (None, found.group):
+    recognition = recognised(table, given.get("domain"), given)
+    if data not in (None, recognition.group):
         return table, data_options(str(data), given, in_memory=True)
-    say_recognised(found)
-    values, own = plain_options(found.options), plain_options(type(found.options)())
-    known = {k: v for k, v in values.items() if v != own[k] and k != "name"}
-    more = {k: v for k, v in given.items() if k not in ("columns", "domain")}
-    options = data_options(found.group, {**known, **more}, in_memory=True)
-    return found.table, options
+    say_recognised(recognition)
+    values, defaults = (
+        plain_options(recognition.options),
+        plain_options(type(recognition.options)()),
+    )
+    recognised_options = {k: v for k, v in values.items() if v != defaults[k] and k != "name"}
+    given_options = {k: v for k, v in given.items() if k not in ("columns", "domain")}
+    options = data_options(
+        recognition.group, {**recognised_options, **given_options}, in_memory=True
+    )
+    return recognition.table, options
 
 
 def data_options(data: str, given: Mapping[str, Any], *, in_memory: bool = False) -> DataOptions:
     """Options of a data set by its name in ``conf/data``.
 
     Args:
-        given: those that are not left as they are there.
-        in_memory: whether the table is handed over, so that no path has to be given.
+        given: options that replace the file's.
+        in_memory: whether the table is in memory and needs no path.
 
     Raises:
-        ConfigError: an unknown data set or option, or one that must be given.
+        ConfigError: the data set or an option is unknown, or a mandatory option is missing.
     """
-    known = {path.stem for path in (configuration() / "data").glob("*.yaml")}
-    if data not in known:
-        near = get_close_matches(data, known, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
+    names = {path.stem for path in (configuration() / "data").glob("*.yaml")}
+    if data not in names:
         raise ConfigError(
-            f"data={data} is unknown, expected one of {', '.join(sorted(known))}{hint}"
+            f"data={data} is unknown, expected one of {', '.join(sorted(names))}"
+            f"{suggestion(data, names)}"
         )
-    schema, own = written("data", data)
-    found = merged("data", schema, own, given)
-    if in_memory and OmegaConf.is_missing(found, "path"):
-        found.path = ""
+    schema, defaults = written("data", data)
+    options = merged("data", schema, defaults, given)
+    if in_memory and OmegaConf.is_missing(options, "path"):
+        options.path = ""
     try:
-        return cast(DataOptions, OmegaConf.to_object(found))
+        return cast(DataOptions, options_of(options))
     except MissingMandatoryValue as error:
         raise ConfigError(f"data.{error.full_key} is not set; give it a value") from None
 
 
 def data_of(given: Sequences) -> DataOptions:
-    """The options that sequences were read with; of others those of a table without a path."""
-    reader, told = given.manifest.get("reader"), given.manifest.get("options")
-    schema = next((kind for kind in FORMATS if kind.__name__ == reader), None)
-    if schema is None or told is None:
-        return TableOptions(domain=given.domain, path="")
-    told = with_present_names(told)
-    return cast(DataOptions, OmegaConf.to_object(merged("data", schema, told)))
+    """The options with which sequences were read, or those of a table without a path."""
+    options = _saved_options(given.manifest, given.manifest.get("options"))
+    return options or TableOptions(domain=given.domain, path="")
+
+
+def _saved_options(
+    manifest: Mapping[str, Any], values: Mapping[str, Any] | None
+) -> DataOptions | None:
+    """Saved options of the reader that a manifest names; None if there is no such reader."""
+    schema = next((kind for kind in FORMATS if kind.__name__ == manifest.get("reader")), None)
+    if schema is None or values is None:
+        return None
+    return cast(DataOptions, options_of(merged("data", schema, with_present_names(values))))
 
 
 def data_used(checkpoint: Checkpoint) -> Source:
-    """The data that a run was calibrated to, read again from their files.
+    """The data of a run's calibration, read again from their files.
 
     Raises:
-        ConfigError: the run does not tell where they are.
-        DataError: they are no longer there.
+        ConfigError: the run's data were a table in memory.
+        DataError: the files are missing.
     """
-    reader, told = checkpoint.manifest.get("reader"), checkpoint.config["data"]
-    schema = next((kind for kind in FORMATS if kind.__name__ == reader), None)
-    if schema is None or told.get("path") == "":
+    values = checkpoint.config["data"]
+    in_memory = values.get("path") == ""
+    options = None if in_memory else _saved_options(checkpoint.manifest, values)
+    if options is None:
         raise ConfigError("the run's data were a table in memory; give it again, as data=TABLE")
-    told = with_present_names(told)
-    options = cast(DataOptions, OmegaConf.to_object(merged("data", schema, told)))
     if options.prepared is not None:
         return Store(Path(options.prepared).expanduser())
     return Sequences.of(None, options)
@@ -281,12 +294,12 @@ def table_options(
     domain: str | None,
     walls: str | Path | None,
     folder: Path | None,
-    more: Mapping[str, Any] | None = None,
+    further: Mapping[str, Any] | None = None,
 ) -> tuple[pd.DataFrame | DataTable | str | Path | None, DataOptions]:
-    """A table as a data set, see :func:`read_options`; a data frame becomes a file where there is
-    a folder for it."""
+    """A table as a data set, see :func:`read_options`. With ``folder``, a data frame is written to
+    a file."""
     given = {"domain": domain, "walls": None if walls is None else str(Path(walls).absolute())}
-    given = {**{k: v for k, v in given.items() if v is not None}, **(more or {})}
+    given = {**{k: v for k, v in given.items() if v is not None}, **(further or {})}
     table = data if isinstance(data, pd.DataFrame) else str(Path(data).expanduser().absolute())
     source, options = read_options(table, None, given)
     if isinstance(source, str | Path):

@@ -1,4 +1,4 @@
-"""What a diagnosis found, as an object."""
+"""The result of a diagnosis as an object."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Report:
-    """What a model lacks.
+    """The result of a diagnosis.
 
     Attributes:
-        diagnosis: all that was found; the properties are its most asked parts.
-        model: the model with what was named, calibrated; without, the calibrated model alone.
-        nearest: the same of the law that comes nearest, where another one was asked for.
-        draw: draws a figure by its name; None: the diagnosis was read, not made.
+        diagnosis: all results; the properties are the most important ones.
+        model: the calibrated model with the named effects.
+        nearest: the report of the nearest law, if it is not the requested one.
+        draw: draws a figure by its name; None if the report has no data.
     """
 
     diagnosis: Diagnosis
@@ -44,32 +44,32 @@ class Report:
 
     @property
     def effects(self) -> list[NamedEffect]:
-        """What was added, and confirmed on sealed clusters."""
+        """Effects that were added, and confirmed on held-back clusters."""
         return self.diagnosis.effects
 
     @property
     def leads(self) -> list[NamedEffect]:
-        """What was found, and not confirmed."""
+        """Effects that were found, but not confirmed."""
         return self.diagnosis.leads
 
     @property
     def places(self) -> list[Place]:
-        """Where simulation and measurement part."""
+        """Where the model deviates from the data."""
         return self.diagnosis.places
 
     @property
     def gap(self) -> Gap:
-        """Errors on sealed sequences, before and after."""
+        """Errors on held-back sequences, before and after adding effects."""
         return self.diagnosis.gap
 
     @property
     def clusters(self) -> Clusters:
-        """What is independent of what."""
+        """The independent clusters of the data."""
         return self.diagnosis.clusters
 
     @property
     def data_faults(self) -> list[DataFault]:
-        """Faults of the measurement that were left out."""
+        """Faults of the measurement that were excluded."""
         return self.diagnosis.data_faults
 
     @property
@@ -87,7 +87,7 @@ class Report:
                 by variable.
 
         Raises:
-            ConfigError: no such figure, or a report without the data behind it.
+            ConfigError: an unknown figure, or a report without data.
         """
         if self.draw is None:
             raise ConfigError("this report has no data to draw; use the one of nnode.diagnose")
@@ -127,7 +127,7 @@ class Report:
         return plain_report(self.diagnosis)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """A row per coefficient of what was named, and of what was not confirmed."""
+        """A row per coefficient of named and of unconfirmed effects."""
         rows = [
             {
                 "effect": effect.name,
@@ -149,14 +149,14 @@ class Report:
         return pd.DataFrame(rows, columns=[*columns, "p_value", "confirmed", "where"])
 
     def to_xarray(self) -> Dataset:
-        """The same along ``coefficient``, as ``effect.coefficient``.
+        """:meth:`to_dataframe` along the dimension ``coefficient``, as ``effect.coefficient``.
 
         Needs xarray: ``pip install 'nnode[xarray]'``.
         """
         table = self.to_dataframe()
         table.index = pd.Index(table.pop("effect") + "." + table.pop("coefficient"))
-        found: Dataset = xarray().Dataset.from_dataframe(table.rename_axis("coefficient"))
-        return found.assign_attrs(verdict=self.verdict, model=self.diagnosis.model)
+        dataset: Dataset = xarray().Dataset.from_dataframe(table.rename_axis("coefficient"))
+        return dataset.assign_attrs(verdict=self.verdict, model=self.diagnosis.model)
 
     def __repr__(self) -> str:
         lines = [f"{e.name}: {interval(e)}; {e.where}" for e in self.effects or self.leads]
@@ -171,7 +171,7 @@ class Report:
 
 
 def _table(title: str, rows: list[tuple[str, float, float, float, str]]) -> list[str]:
-    """Estimates with intervals of 95 %, under a title; nothing without rows."""
+    """Lines of a titled table of estimates with 95 % intervals; empty without rows."""
     if not rows:
         return []
     heads = "".join(f"{head:>12}" for head in ("estimate", "[0.025", "0.975]"))

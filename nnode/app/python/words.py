@@ -1,4 +1,4 @@
-"""Messages for who calls in Python: options as arguments, not as they are typed in a shell."""
+"""Error messages for Python, with options as arguments instead of overrides of a shell."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _GROUP = re.compile(r"(?<![\w./\\-])data=([a-z_]+)\b(?!['\"(])")
 
 @contextmanager
 def python_words() -> Iterator[None]:
-    """Name options in errors as arguments of :func:`nnode.fit` and its like.
+    """Rewrite options in error messages as arguments of functions such as :func:`nnode.fit`.
 
-    ``data.faults=keep`` is ``faults='keep'`` there, and ``data.columns.x=pos`` is
+    ``data.faults=keep`` becomes ``faults='keep'``, and ``data.columns.x=pos`` becomes
     ``columns={'x': 'pos'}``.
     """
     try:
@@ -34,13 +34,13 @@ def python_words() -> Iterator[None]:
 
 
 def as_arguments(text: str) -> str:
-    """Words in which options are written as in a shell, with options as arguments."""
+    """A text with overrides of a shell rewritten as arguments."""
     text = _OPTION.sub(_argument, text.replace("no option data.", "no option "))
     return _GROUP.sub(r"data='\1'", text)
 
 
-def _argument(found: re.Match[str]) -> str:
-    name, inner, value = found[1], found[2].strip("."), found[3]
+def _argument(match: re.Match[str]) -> str:
+    name, inner, value = match[1], match[2].strip("."), match[3]
     if (name, inner) == ("split", "heldout"):
         return "heldout" if value is None else f"heldout={value}"
     end = ""
@@ -57,7 +57,7 @@ _SPLIT = {one.name for one in fields(SplitOptions)}
 
 
 def _literal(value: str) -> str:
-    """A value of Hydra's grammar in Python's."""
+    """A value in Hydra's grammar as a Python literal."""
     words = {"null": "None", "true": "True", "false": "False"}
     plain = re.fullmatch(r"[+-]?\d[\d.]*(?:e[+-]?\d+)?|[A-Z_]+|['\"\[{].*", value)
     return words.get(value, value if plain else repr(value))

@@ -19,14 +19,14 @@ from nnode.model.system import System
 
 @dataclass
 class OptimizerOptions:
-    """What all optimisers share."""
+    """Options of all optimisers."""
 
     name: str = MISSING  # of the optimiser
 
 
 @dataclass
 class AdadeltaOptions(OptimizerOptions):
-    """The paper's: ADADELTA with decaying Gaussian noise."""
+    """The paper's optimiser: ADADELTA with decaying Gaussian noise."""
 
     name: str = "adadelta"
     lr: float = 1.0  # factor on the steps
@@ -49,7 +49,7 @@ class AdamOptions(OptimizerOptions):
 
 @dataclass
 class LbfgsOptions(OptimizerOptions):
-    """L-BFGS with a strong Wolfe line search; wants all sequences in one mini-batch."""
+    """L-BFGS with a strong Wolfe line search; requires all sequences in one mini-batch."""
 
     name: str = "lbfgs"
     lr: float = 1.0  # first length tried by the line search
@@ -79,7 +79,7 @@ def _lbfgs(model: System, o: dict[str, Any]) -> Optimizer:
     return torch.optim.LBFGS(_trained(model), **o, **line)
 
 
-#: Name to how it is built, of a model, options and a seed.
+#: Name to a function that builds the optimiser from a model, options and a seed.
 OPTIMIZERS: dict[str, Callable[[System, dict[str, Any], int], Optimizer]] = {
     "adadelta": lambda model, o, seed: NoisyAdadelta(_trained(model), **o, seed=seed),
     "adam": lambda model, o, _: torch.optim.Adam(
@@ -91,16 +91,16 @@ OPTIMIZERS: dict[str, Callable[[System, dict[str, Any], int], Optimizer]] = {
 
 
 def needs_full_batch(name: str) -> bool:
-    """Whether the optimiser compares costs of different steps, so that they must be of the
-    same sequences."""
+    """Whether the optimiser compares costs of different steps, which requires the same sequences
+    in every step."""
     return name in ("lbfgs", "gauss_newton")
 
 
 def build_optimizer(model: System, options: OptimizerOptions, seed: int = 0) -> Optimizer:
-    """The optimiser that ``options`` describe; random ones depend on ``seed`` alone.
+    """Build the optimiser that ``options`` describe. Random optimisers depend only on ``seed``.
 
     Raises:
-        ConfigError: unknown name, or a value outside its range.
+        ConfigError: an unknown name, or a value outside its range.
     """
     values = asdict(options)
     name = values.pop("name")

@@ -20,9 +20,9 @@ class NoisyAdadelta(Optimizer):
         delta = -lr sqrt(E[delta²] + eps) / (sqrt(E[g²]) + eps) g
         E[delta²] <- rho E[delta²] + (1 - rho) delta²
 
-    The paper prints E[g²] with the gradient of the step before; ADADELTA as published by
-    Zeiler (2012), and here, includes the present one, without which the first step has
-    nothing to divide by.
+    The paper prints E[g²] with the gradient of the step before. ADADELTA as published by Zeiler
+    (2012) includes the present gradient, without which the first step would divide by eps only.
+    This class follows Zeiler.
 
     Args:
         params: parameters, as for every torch optimiser.
@@ -30,7 +30,7 @@ class NoisyAdadelta(Optimizer):
         rho: decay rate of both averages.
         eps: keeps the quotient regular.
         eta1, eta2: variance of the noise; eta1 = 0 switches it off.
-        seed: of the noise. Its generator is part of the state, so that a resumed run
+        seed: seed of the noise. Its generator is part of the state, so that a resumed run
             continues the same stream.
 
     Source:
@@ -69,7 +69,7 @@ class NoisyAdadelta(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:  # type: ignore[override]
-        """One update; ``closure`` computes the cost and its gradient."""
+        """Update the parameters; ``closure`` computes the cost and its gradient."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -89,7 +89,7 @@ class NoisyAdadelta(Optimizer):
         gradient = p.grad
         assert gradient is not None
         if group["eta1"] > 0:
-            # drawn in float64 on the CPU: the same stream in every precision, on every device
+            # drawn in float64 on the CPU, for the same stream in every precision and device
             noise = torch.randn(p.shape, generator=self._generator, dtype=torch.float64)
             spread = math.sqrt(group["eta1"] / (1 + state["step"]) ** group["eta2"])
             gradient = gradient + spread * noise.to(p)
@@ -101,11 +101,11 @@ class NoisyAdadelta(Optimizer):
         state["step"] += 1
 
     def state_dict(self) -> dict[str, Any]:
-        """State with the noise generator's."""
+        """The state, with that of the noise generator."""
         return {**super().state_dict(), "generator": self._generator.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore state and noise generator."""
+        """Restore the state and the noise generator."""
         state_dict = dict(state_dict)
         self._generator.set_state(state_dict.pop("generator"))
         super().load_state_dict(state_dict)

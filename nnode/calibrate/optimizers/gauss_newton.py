@@ -1,4 +1,4 @@
-"""Gauss and Newton's method as an optimiser of the training loop, one damped step at a time."""
+"""The Gauss-Newton method as an optimiser of the training loop, one damped step at a time."""
 
 from __future__ import annotations
 
@@ -20,19 +20,18 @@ from nnode.simulation.base import Solver
 
 
 class GaussNewton(Optimizer):
-    """A damped step of Gauss and Newton's, refused steps with more damping.
+    """The damped Gauss-Newton method (Levenberg-Marquardt).
 
-    Derivatives are exact tangents of lanes, and differences of people.
-
-    It is told by :meth:`attach` what is minimised, in place of a closure.
+    Derivatives are exact tangents for lanes, and difference quotients for people. :meth:`attach`
+    defines the cost in place of a closure.
 
     Args:
-        system: the model; its calibrated parameters are changed in place.
-        damping: of the first step, relative to the curvature of each parameter.
-        tolerance: it has converged when a step lowers the cost by less than this share.
+        system: the model, whose calibrated parameters are changed in place.
+        damping: damping of the first step, relative to the curvature of each parameter.
+        tolerance: the method has converged when a step lowers the cost by less than this share.
 
     Attributes:
-        converged: whether no step lowers the cost any more.
+        converged: whether the last step lowered the cost by less than the tolerance.
 
     Source:
         Nocedal & Wright, Numerical Optimization, 2nd ed., section 10.3.
@@ -61,10 +60,10 @@ class GaussNewton(Optimizer):
         convention: Convention,
         starts: StartSpeeds = StartSpeeds.given,
     ) -> None:
-        """Say what the next step lowers.
+        """Define the cost of the next step.
 
         Raises:
-            ConfigError: another solver than the compiled one, or a model that is no formula.
+            ConfigError: the solver is not the compiled one, or the model is not a formula.
         """
         if self._batch is batch:
             return
@@ -76,26 +75,26 @@ class GaussNewton(Optimizer):
         if not isinstance(solver, FusedSolver):
             raise ConfigError("optimizer=gauss_newton needs solver=fused, which has exact tangents")
         self._problem = ResidualProblem(self.system, batch, solver, convention, starts)
-        self._problem.last_speeds = self.started(batch).v[0, ..., 0].double().numpy()
+        self._problem.last_speeds = self.with_start_speeds(batch).v[0, ..., 0].double().numpy()
         if self._problem.lane is None and not self._problem.physical.all():
             raise ConfigError(
                 "optimizer=gauss_newton needs a model of people whose terms are formulas without "
                 "networks, as model=sf; take another optimizer"
             )
 
-    def started(self, batch: Batch) -> Batch:
-        """A batch with the first speeds that were fitted to its sequences, if any were."""
-        known = self.param_groups[0]["starts"]
-        if not known:
+    def with_start_speeds(self, batch: Batch) -> Batch:
+        """A batch with the fitted first speeds of its sequences, if there are any."""
+        start_speeds = self.param_groups[0]["starts"]
+        if not start_speeds:
             return batch
         v = batch.v.clone()
         for b, name in enumerate(batch.names):
-            own = known.get(name, [])
-            v[0, b, : len(own), 0] = v.new_tensor(own)
+            speeds = start_speeds.get(name, [])
+            v[0, b, : len(speeds), 0] = v.new_tensor(speeds)
         return replace(batch, v=v)
 
     def step(self, closure: Callable[[], Any] | None = None) -> float:  # type: ignore[override]
-        """Take a step; returns the mean cost before it.
+        """Take a step, and return the mean cost before it.
 
         Raises:
             SimulationError: the model cannot be simulated with its present parameters.
@@ -105,15 +104,15 @@ class GaussNewton(Optimizer):
         problem, group = self._problem, self.param_groups[0]
         vector = ParameterVector(self.system, problem.vector.places)
         row = np.clip(vector.row.numpy(), problem.low, problem.high)
-        if not group.get("begun", True):  # states of earlier versions have begun
-            row, group["begun"] = problem.begin(row), True
-        found = pooled(problem, row, steps=1, damping=group["damping"])
-        now, value = float(found.before[0]), float(found.cost)
-        if not math.isfinite(now):
-            problem.complain(problem.costs(row))
-        vector.fill_(found.row)
-        if value < now:
-            group["damping"] = float(found.damping[0])
-        group["starts"] = problem.start_speeds(found.row)
-        group["converged"] = not now - value > self.tolerance * now
-        return now
+        if not group.get("begun", True):  # checkpoints without the key are past this fit
+            row, group["begun"] = problem.initial_fit(row), True
+        minimum = pooled(problem, row, steps=1, damping=group["damping"])
+        before, value = float(minimum.before[0]), float(minimum.cost)
+        if not math.isfinite(before):
+            problem.raise_blow_up(problem.costs(row))
+        vector.fill_(minimum.row)
+        if value < before:
+            group["damping"] = float(minimum.damping[0])
+        group["starts"] = problem.start_speeds(minimum.row)
+        group["converged"] = not before - value > self.tolerance * before
+        return before

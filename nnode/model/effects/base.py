@@ -1,4 +1,4 @@
-"""What an effect is: a term that a model may lack, with all that is needed to look for it."""
+"""Effects: terms that a model may lack, with what a diagnosis needs to search for them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from nnode.model.term import Interval, State, Term
 
 @dataclass(frozen=True)
 class Probe:
-    """An effect of small strength, whose trace in the simulated paths the data are searched for.
+    """A weak version of an effect. The data are searched for its change of the simulated paths.
 
     Attributes:
-        options: of the effect, with its strengths at their neutral values where it has these.
-        steps: strength to the amount by which it is varied. Each one gives one direction; the
-            directions of a probe are looked for together. Empty: the one direction is what the
-            effect with these options changes as a whole.
+        options: the effect's options, with strengths at their neutral values.
+        steps: strength to the amount by which it is varied. Each strength gives one direction,
+            and the directions of a probe are tested together. If empty, the one direction is the
+            whole change by the effect with these options.
     """
 
     options: dict[str, Any]
@@ -35,17 +35,16 @@ class Probe:
 
 @dataclass(frozen=True)
 class Strength:
-    """A parameter that is neutral where there is no effect, and to which its trace is
-    proportional as long as it is weak.
+    """A parameter with a neutral value, at which the effect vanishes. The change of simulated
+    paths is proportional to a small distance from it.
 
     Attributes:
-        neutral: its value without the effect.
-        step: a small but visible amount.
-        range: what is plausible; also the admissible set.
-        unit: of the parameter.
-        min_effect_size: the least distance from the neutral value that one would expect. Data in
-            which it would not stand out do not test the effect; None takes the farthest end of the
-            range.
+        neutral: the value without the effect.
+        step: a small amount that visibly changes paths.
+        range: plausible values; also the admissible set.
+        unit: unit of the parameter.
+        min_effect_size: the smallest distance from the neutral value that a diagnosis should be
+            able to detect; None takes the farthest end of the range.
     """
 
     neutral: float
@@ -56,24 +55,24 @@ class Strength:
 
     @property
     def expected(self) -> float:
-        """A distance from the neutral value that an effect should have to be worth a test."""
+        """The distance from the neutral value that a test must be able to detect."""
         if self.min_effect_size is not None:
             return self.min_effect_size
         return max(abs(self.range.low - self.neutral), self.range.high - self.neutral)
 
     def at(self, amount: float) -> float:
-        """The value that differs from the neutral one by an amount, or the nearest plausible."""
+        """The plausible value that is nearest to the neutral value plus an amount."""
         return float(np.clip(self.neutral + amount, self.range.low, self.range.high))
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A parameter without a neutral value: a place, a range, a time constant.
+    """A parameter without a neutral value, such as a place, a range or a time constant.
 
     Attributes:
-        value: where a search starts that knows nothing better.
-        range: what is plausible; also the admissible set.
-        unit: of the parameter.
+        value: default start value of a search.
+        range: plausible values; also the admissible set.
+        unit: unit of the parameter.
     """
 
     value: float
@@ -82,36 +81,36 @@ class Setting:
 
 
 class Effect(Term):
-    """A named effect: a term with strengths, settings, and the probes that are looked for.
+    """A named effect: a term with strengths, settings, and probes for a diagnosis.
 
-    A subclass states its class attributes, with a rule per order or :meth:`forward`; all parameters
-    are calibrated. The constructor takes each parameter by keyword.
+    A subclass defines the class attributes, and a rule per order or :meth:`forward`. All
+    parameters are calibrated. The constructor takes each parameter by keyword.
 
     Class attributes:
         domain: ``traffic`` or ``crowd``.
         strengths: parameter name to :class:`Strength`; may be empty, see :class:`Probe`.
         settings: parameter name to :class:`Setting`.
-        tried: one setting to the values, or one strength to the amounts, of a probe each; empty:
-            there is one probe, of all strengths at the settings' own values.
-        of_drivers: whether it says no more than that drivers differ.
-        acts_on: what of the laws of people it changes, ``force`` or ``drive``, see
-            :class:`nnode.model.terms.Rule`; empty: it acts on every model.
-        rank: place in the sum of terms; one that modifies the sum before it comes later.
-        confusable_group: name of the class of effects that data often cannot tell apart from it;
-            empty: none.
-        distinguishing_data: what data would.
+        tried: one setting to its values, or one strength to its amounts, with one probe each. If
+            empty, one probe has all strengths and the settings' default values.
+        of_drivers: whether the effect only describes differences between drivers.
+        acts_on: the part of a pedestrian law that it changes, ``force`` or ``drive``, see
+            :class:`nnode.model.terms.Rule`; empty if it acts on every model.
+        rank: position in the sum of terms. An effect with a greater rank is added later and
+            modifies the sum of the effects before it.
+        confusable_group: name of the group of effects that data often cannot distinguish from it;
+            empty for none.
+        distinguishing_data: data that would distinguish them.
         contains: names of effects that are special cases of this one.
-        consecutive: the probes are neighbouring intervals of one quantity, and an effect on
-            several of them is the sum of their traces. ``a`` and ``b`` are the interval's ends.
-        covariate: ``kind``, ``group`` or ``length``: the property of an agent by which it acts. It
-            may be fixed within every recording; then recordings are the units of evidence.
-        individual: every agent has a strength of its own, with mean zero over the agents; the
-            reported strength is their standard deviation.
-        searched_orders: orders of the laws in which a diagnosis looks for it.
-        built_into_laws: whether other laws of its domain contain something like it, so that finding
-            it in one of them is right where another law is nearer to the truth.
-        sets_desired_speed: whether it gives people a preferred speed, which some of their laws
-            have.
+        consecutive: whether the probes are neighbouring intervals of one quantity, with the ends
+            ``a`` and ``b``. The change by an effect on several intervals is the sum of theirs.
+        covariate: ``kind``, ``group`` or ``length``: the property of an agent by which it acts. If
+            it is constant within every recording, recordings are the units of evidence.
+        individual: whether every agent has a separate strength, with mean zero over the agents.
+            The reported strength is their standard deviation.
+        searched_orders: orders of the laws for which a diagnosis tests the effect.
+        built_into_laws: whether other laws of its domain contain a similar effect. A diagnosis
+            may then report it correctly where another law is closer to the truth.
+        sets_desired_speed: whether it gives people a preferred speed, as some pedestrian laws do.
     """
 
     domain: ClassVar[Domain]
@@ -134,7 +133,7 @@ class Effect(Term):
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         if "forward" in vars(cls) and "rules" not in vars(cls):
-            cls.rules = {}  # its code replaces the rules of the class that it derives from
+            cls.rules = {}  # the code replaces the inherited rules
 
     def __init__(self, **values: float) -> None:
         super().__init__()
@@ -145,18 +144,18 @@ class Effect(Term):
                 f"{', '.join([*self.strengths, *self.settings])}"
             )
         parameters: dict[str, Strength | Setting] = {**self.strengths, **self.settings}
-        for name, given in parameters.items():
-            # a time constant has no neutral value: the nearest plausible one is its default
-            usual = given.at(0.0) if isinstance(given, Strength) else given.value
-            self.declare(name, values.get(name, usual), unit=given.unit, bounds=given.range)
+        for name, declared in parameters.items():
+            # a strength's neutral value may be implausible, as 0 for a time constant
+            default = declared.at(0.0) if isinstance(declared, Strength) else declared.value
+            self.declare(name, values.get(name, default), unit=declared.unit, bounds=declared.range)
 
     def forward(self, state: State) -> Tensor:
-        """``(B, N, D + M)`` what its rule adds to the rate, and the rates of its M states.
+        """``(B, N, D + M)``: the rule's addition to the rate, then the rates of the M states.
 
-        An effect without a rule defines its own ``(B, N, D)``.
+        An effect without a rule overrides this method and returns ``(B, N, D)``.
 
         Raises:
-            ValueError: the model lacks the term that it acts on.
+            ValueError: the model lacks the term that the effect acts on.
         """
         if not self.finds(state.terms):
             names = [name for name, entry in entries().items() if entry.get(self.acts_on)]
@@ -170,23 +169,23 @@ class Effect(Term):
 
     @classmethod
     def remembers(cls) -> bool:
-        """Whether it adds states to the model's."""
+        """Whether it adds states to the model."""
         return any(rule.memory for rule in cls.rules.values())
 
     @classmethod
     def finds(cls, terms: Iterable[object]) -> bool:
-        """Whether these terms have what it acts on."""
+        """Whether one of the terms has the part that the effect acts on."""
         laws = (term for term in terms if isinstance(term, Law))
         return not cls.acts_on or any(getattr(law.formulas, cls.acts_on) for law in laws)
 
     @classmethod
     def applies(cls, batch: Batch, system: System) -> bool:
-        """Whether it can act on ``system``, and ``batch`` can show it."""
+        """Whether it can act on ``system`` and be detected in ``batch``."""
         return cls.finds(system.terms)
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
-        """What is looked for in the data of ``batch`` by ``system``; empty: it cannot act there."""
+        """The probes of the effect for ``batch`` and ``system``; empty if it cannot act there."""
         steps = {name: strength.step for name, strength in cls.strengths.items()}
         if not cls.applies(batch, system):
             return []
@@ -197,21 +196,21 @@ class Effect(Term):
         return [Probe({}, steps)]
 
     def options(self) -> dict[str, Any]:
-        """What builds this effect again, in plain numbers."""
+        """The constructor's arguments that rebuild this effect, as plain numbers."""
         return {
             name: float(getattr(self, name).detach()) for name in (*self.strengths, *self.settings)
         }
 
 
 class IndividualEffect(Effect):
-    """An effect with a number for every agent that is estimated beside the parameters.
+    """An effect with one estimated number per agent in addition to its parameters.
 
     Class attributes:
-        in_equation: whether its strengths stand in the equation; otherwise they describe the
-            distribution of the agents' numbers alone, and are not calibrated.
+        in_equation: whether its strengths occur in the equation. Otherwise they only describe the
+            distribution of the agents' numbers, and are not calibrated.
 
     Args:
-        people: sequence name to the numbers of its agents; without them there is no effect.
+        people: sequence name to the numbers of its agents; the effect vanishes without them.
         values: the parameters.
     """
 
@@ -220,7 +219,7 @@ class IndividualEffect(Effect):
 
     def __init__(self, people: dict[str, list[float]] | None = None, **values: float) -> None:
         super().__init__(**values)
-        self.people = {str(k): [float(own) for own in v] for k, v in (people or {}).items()}
+        self.people = {str(k): [float(number) for number in v] for k, v in (people or {}).items()}
         for name in () if self.in_equation else self.strengths:
             self.idle(name)
 
@@ -229,20 +228,23 @@ class IndividualEffect(Effect):
 
     @classmethod
     def directions(cls, options: dict[str, Any]) -> list[tuple[dict[str, Any], float]]:
-        """The amounts that are fitted to an agent; :meth:`person` makes his number of them.
+        """The directions along which amounts are fitted to each agent.
+
+        :meth:`person` computes the agent's number from the amounts.
 
         Args:
             options: settings.
 
         Returns:
-            Per amount the values of an effect, and an agent's number in it, with which the effect
-            on him is that of one unit of the amount. By default the number is the one amount.
+            Per direction the options of an effect and the agent's number, for which the effect on
+            the agent is that of one unit of the amount. By default there is one direction, and
+            the amount is the number.
         """
         return [(options, 1.0)]
 
     @classmethod
     def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
-        """An agent's number, from the amounts of the directions that were fitted to him."""
+        """An agent's number, from the amounts that were fitted to the agent."""
         return float(numbers[0])
 
     @classmethod
@@ -251,32 +253,32 @@ class IndividualEffect(Effect):
         return sigma
 
     def inputs(self, scene: Scene) -> dict[str, Tensor]:
-        """The rule's first input is the agents' numbers; a second one, where they are known."""
+        """The rule's first input is the agents' numbers, its second is 1 where they are known."""
         (rule, *_) = self.rules.values()
-        return dict(zip(rule.inputs, self.known(scene, scene.length), strict=False))
+        return dict(zip(rule.inputs, self.agent_numbers(scene, scene.length), strict=False))
 
-    def known(self, scene: Scene, like: Tensor) -> tuple[Tensor, Tensor]:
-        """``(B, N)`` the agents' numbers (0 where unknown), and 1 where they are known."""
-        # many simulations may share a name; the first row of the tables is nobody's
+    def agent_numbers(self, scene: Scene, like: Tensor) -> tuple[Tensor, Tensor]:
+        """``(B, N)``: the agents' numbers (0 where unknown), and 1 where they are known."""
+        # many simulations may share a name; row 0 is for sequences without numbers
         numbers = torch.zeros(len(self.people) + 1, scene.agent.shape[1], dtype=like.dtype)
-        known = torch.zeros_like(numbers)
+        is_known = torch.zeros_like(numbers)
         rows = {}
-        for row, (name, own) in enumerate(self.people.items(), start=1):
+        for row, (name, values) in enumerate(self.people.items(), start=1):
             rows[name] = row
-            numbers[row, : len(own)] = torch.tensor(own, dtype=like.dtype)[: numbers.shape[1]]
-            known[row, : len(own)] = 1.0
+            numbers[row, : len(values)] = torch.tensor(values, dtype=like.dtype)[: numbers.shape[1]]
+            is_known[row, : len(values)] = 1.0
         index = torch.tensor([rows.get(name, 0) for name in scene.names])
-        return numbers[index].to(like.device), known[index].to(like.device)
+        return numbers[index].to(like.device), is_known[index].to(like.device)
 
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Effects by name, in the order of their place in the sum."""
+    """The named effects."""
 
     effects: dict[str, type[Effect]] = field(default_factory=dict)
 
     def add(self, effect: type[Effect]) -> type[Effect]:
-        """Make an effect known; usable as a class decorator.
+        """Register an effect; usable as a class decorator.
 
         Raises:
             ValueError: its name is taken.
@@ -287,11 +289,11 @@ class Catalogue:
         return effect
 
     def of(self, domain: Domain, order: int = 1, *, every: bool = False) -> list[type[Effect]]:
-        """The effects of a domain that a diagnosis looks for in laws of an order, or every one."""
-        own = [effect for effect in self.effects.values() if effect.domain == domain]
-        found = [effect for effect in own if every or order in effect.searched_orders]
-        return sorted(found, key=lambda effect: effect.rank)
+        """The effects of a domain by rank: those searched in laws of an order, or every one."""
+        of_domain = [effect for effect in self.effects.values() if effect.domain == domain]
+        searched = [effect for effect in of_domain if every or order in effect.searched_orders]
+        return sorted(searched, key=lambda effect: effect.rank)
 
 
-#: Every effect that models can be given by name.
+#: The effects that models can have by name.
 CATALOGUE = Catalogue()

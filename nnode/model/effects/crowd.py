@@ -1,5 +1,5 @@
-"""Effects on people: of others, on the force between people, of places, and from person to
-person."""
+"""Effects on pedestrians: of others, on the force between people, of places, and differences
+between people."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from nnode.model.system import System
 from nnode.model.term import Interval
 from nnode.model.terms import Rule
 
-#: Places are looked for this far apart, m, but in no more than this many cells.
+#: Spacing of the grid of tested places, m, and largest number of its cells.
 SPACING, CELLS = 0.8, 170
 
 
 def heading(v: Tensor) -> Tensor:
-    """``(..., 2)``: the walking direction, a unit vector; 0 for someone who stands."""
+    """``(..., 2)``: the walking direction, a unit vector; 0 for a standing person."""
     return v / norm(v)[..., None]
 
 
@@ -113,7 +113,7 @@ class Alignment(PairEffect):
                 "pull_y": ("m/s", "-weight*dvy"),
             },
             where={"weight": "exp(-d/reach)"},
-            # the small number keeps someone without neighbours finite
+            # the small number keeps the quotient finite for people without neighbours
             constants={"reach": (2.0, "m"), "few": (1e-12, "1")},
         )
     }
@@ -150,14 +150,14 @@ class DensitySlowdown(PairEffect):
 
 
 def _force(x: str, y: str, where: Mapping[str, str] | None = None) -> dict[int, Rule]:
-    """What is added to the force of another person; a mean over people, as that of the force."""
+    """Rules of an addition to the force of another person, averaged over people as the force."""
     rate = ("more_x/(mass*people)", "more_y/(mass*people)")
     others = {"more_x": ("N", x), "more_y": ("N", y)}
     return {2: Rule(rate=rate, others=others, where=where or {})}
 
 
 class ForceEffect(PairEffect):
-    """An effect that adds to the force between people of the base law what changes of it."""
+    """An effect that changes the base law's force between people."""
 
     acts_on = "force"
     confusable_group = "pair_force"
@@ -201,7 +201,7 @@ class Anticipation(ForceEffect):
 
 @CATALOGUE.add
 class EvasiveRotation(ForceEffect):
-    """The force of those who come towards a person pushes him aside, not back.
+    """The force of oncoming people pushes a person sideways instead of back.
 
     The force is turned by theta (1 - cos gamma)/2, gamma the angle between the two walking
     directions: by theta for people who meet head on, not at all for people who walk the same
@@ -242,7 +242,7 @@ class WalkerHeterogeneity(CrowdEffect, IndividualEffect):
 
     @classmethod
     def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
-        """At least -1: below it a person would run away from his own destination."""
+        """The number, at least -1. Below -1 a person would move away from the destination."""
         return max(float(numbers[0]), -1.0)
 
 
@@ -295,8 +295,8 @@ class GaitSway(CrowdEffect, IndividualEffect):
 class SidePreference(PairEffect):
     """People step to one side, to the right for c > 0, when somebody comes towards them.
 
-    The weight of an encounter is how far the other is ahead, how straight he comes, and how near
-    he is.
+    The weight of an encounter increases with the alignment of the other person with the walking
+    direction, with the opposition of both walking directions, and with proximity.
     """
 
     name = "side_preference"
@@ -333,7 +333,7 @@ class GroupCohesion(CrowdEffect):
                 "way_x": ("m", "mate*dx"),
                 "way_y": ("m", "mate*dy"),
             },
-            # groups are numbered from 1; 0 is nobody's
+            # groups are numbered from 1; 0 is for people without a group
             where={"mate": "choose(group - 0.5, choose(0.5 - abs(group - group_j), 1, 0), 0)"},
             inputs={"group": "1"},
         )
@@ -423,7 +423,7 @@ class WallRepulsion(CrowdEffect):
 
 
 def places(batch: Batch) -> list[tuple[float, float]]:
-    """Middles of the cells of a coarse grid in which somebody walks, or that touch one."""
+    """Centres of the cells of a coarse grid in which people walk, and of their neighbours."""
     real = batch.valid & batch.agent
     walked = batch.x[real].reshape(-1, 2).cpu().numpy()
     spacing = SPACING

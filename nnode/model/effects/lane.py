@@ -1,4 +1,4 @@
-"""Effects in a lane: places, times, classes, gaps ahead, the speed ahead, and a driver's past."""
+"""Effects in a lane: places, times, classes, gaps, the speed ahead, delays and memory."""
 
 from __future__ import annotations
 
@@ -25,33 +25,27 @@ from nnode.model.system import System, Traffic
 from nnode.model.term import Interval
 from nnode.model.terms import Rule
 
-#: A zone begins and ends over this distance, m, and a period over this time, s, so that errors are
-#: differentiable in their ends. In a zone, the time per metre changes linearly: passing the edge
-#: takes as long as if it were sharp. Beside sharp edges at 350 and 450 m with alpha 0.65, platoons
-#: of :mod:`nnode.data.synthetic.platoons` gave 350.2, 449.8 and 0.648 with 12 m; 350.0, 450.0 and
-#: 0.650 with 6 m and with 3 m.
+#: Widths of the edges of a zone, m, and of a period, s. They make errors differentiable in the
+#: ends. At a zone's edge the time per metre changes linearly, so that passing it takes as long as
+#: passing a sharp edge. For a true zone with sharp edges at 350 and 450 m and alpha 0.65, platoons
+#: of :mod:`nnode.data.synthetic.platoons` gave 350.2, 449.8 and 0.648 with edges of 12 m; 350.0,
+#: 450.0 and 0.650 with 6 m and with 3 m.
 EDGE = {"m": 6.0, "s": 1.0}
-#: So many cells of a road or a time are looked at one by one.
+#: Number of the cells of a road or a time that are tested one by one.
 CELLS = 32
-#: Quantiles of the driven speeds, to which a desired speed is brought.
+#: Quantiles of the measured speeds that are tested as desired speeds.
 SPEEDS = (0.3, 0.7)
 _AHEAD = "reaction to the vehicle ahead"
 _EXCITATION = "leaders that brake and accelerate strongly, measured often and precisely"
 _LONGER = "the same drivers for a longer time"
 _FACTOR = Strength(1.0, -0.1, Interval(0.05, 3.0), "1", min_effect_size=0.1)
 _KAPPA = Strength(0.0, 0.05, Interval(-0.9, 0.95), "1", min_effect_size=0.2)
-#: In laws of second order kappa is a rate, per second.
+#: Unit of time: in laws of second order kappa/per is a rate.
 _PER = {"per": (1.0, "s")}
 
 
-def has_law(system: System) -> bool:
-    """Whether a model has a law of the gap; without one, an effect on it cannot be looked for."""
-    law = system.find(Law)
-    return law is not None and (law.of_gap or system.order > 1)
-
-
 def gaps(x: Tensor) -> Tensor:
-    """``(B, N)`` gaps to the vehicle ahead, m, of positions ``(B, N, 1)``; the last has none."""
+    """``(B, N)`` gaps to the vehicle ahead, m, of positions ``(B, N, 1)``; the last is padding."""
     gap = torch.diff(x[..., 0])
     return torch.cat([gap, gap.new_full((len(gap), 1), PADDING_GAP)], 1)
 
@@ -67,14 +61,17 @@ class LawEffect(LaneEffect):
 
     @classmethod
     def applies(cls, batch: Batch, system: System) -> bool:
-        return has_law(system)
+        law = system.find(Law)
+        return law is not None and (law.of_gap or system.order > 1)
 
 
 def _inside(
     at: str, unit: str, factor: str, setting: float
 ) -> tuple[dict[int, Rule], dict[str, Setting]]:
-    """Rules and settings of a factor on the desired speed where ``at`` lies in [a, b]: the share
-    is 1 inside, 0 outside, linear over the edge in between."""
+    """Rules and settings of a factor on the desired speed where ``at`` lies in [a, b].
+
+    The share is 1 inside, 0 outside, and linear over the edges.
+    """
     share = f"clip(({at} - a)/edge + 0.5, 0, 1)*clip((b - {at})/edge + 0.5, 0, 1)"
     first = Rule(
         rate="W*factor",
@@ -87,7 +84,7 @@ def _inside(
 
 
 class _Cells(LaneEffect):
-    """A factor on the desired speed in an interval; neighbouring cells of it are looked for."""
+    """A factor on the desired speed in an interval, tested for neighbouring cells."""
 
     strengths = {"alpha": _FACTOR}
     consecutive = True
@@ -95,7 +92,7 @@ class _Cells(LaneEffect):
 
     @classmethod
     def span(cls, batch: Batch) -> tuple[float, float]:
-        """The interval that data cover."""
+        """The interval that the data cover."""
         raise NotImplementedError  # pragma: no cover - both define their own
 
     @classmethod
@@ -113,21 +110,20 @@ class _Cells(LaneEffect):
 def _sizes(batch: Batch, system: System) -> list[float]:
     """Amounts by which the factor on a desired speed is varied.
 
-    An acceleration may not depend on its desired speed before that comes near to the driven
-    speeds, such as with a power of the one over the other; so factors that bring it there are tried
-    as well.
+    An acceleration may depend only weakly on a desired speed far above the measured speeds.
+    Therefore factors that bring the desired speed to measured speeds are tested as well.
     """
     v0 = [float(value.detach()) for k, (value, _) in system.physical().items() if k.endswith(".v0")]
     if system.order == 1 or not v0:
         return [_FACTOR.step]
     speeds = np.quantile(batch.v[..., 0][batch.valid].numpy(), SPEEDS)
-    found = [_FACTOR.at(float(speed) / v0[0] - 1) - 1 for speed in speeds]
-    return [_FACTOR.step, *(size for size in found if size < 2 * _FACTOR.step)]
+    factors = [_FACTOR.at(float(speed) / v0[0] - 1) - 1 for speed in speeds]
+    return [_FACTOR.step, *(size for size in factors if size < 2 * _FACTOR.step)]
 
 
 @CATALOGUE.add
 class SpeedZone(_Cells):
-    """A section of the road where everyone drives slower or faster than the law says."""
+    """A section of the road where all vehicles drive slower or faster than by the law."""
 
     name = "speed_zone"
     rules, settings = _inside("x", "m", "alpha/(alpha + (1 - alpha)*share)", 100.0)
@@ -143,7 +139,7 @@ class SpeedZone(_Cells):
 
 @CATALOGUE.add
 class SpeedPeriod(_Cells):
-    """A time of the clock when everyone drives slower or faster than the law says."""
+    """A period of the day in which all vehicles drive slower or faster than by the law."""
 
     name = "speed_period"
     rules, settings = _inside("clock", "s", "1 + (alpha - 1)*share", 60.0)
@@ -172,13 +168,13 @@ class Slope(LaneEffect):
     source = "mechanics: the part of gravity along the road, grades being small"
     strengths = {"grade": Strength(0.0, 0.01, Interval(-0.3, 0.3), "1", min_effect_size=0.02)}
     settings = SpeedZone.settings
-    rank = 65  # behind what drivers feel late
-    searched_orders = ()  # a driver makes up for it, and then it is a speed_zone
+    rank = 65  # after the delays of drivers
+    searched_orders = ()  # drivers compensate for it, which gives a speed_zone
 
 
 @CATALOGUE.add
 class VehicleClass(LaneEffect):
-    """Vehicles of one class drive slower or faster than the law says.
+    """Vehicles of one class drive slower or faster than by the law.
 
     Args:
         kind: the class.
@@ -223,7 +219,7 @@ class VehicleClass(LaneEffect):
 
 @CATALOGUE.add
 class DriverHeterogeneity(LaneEffect, IndividualEffect):
-    """Every driver has a pace of his own, with mean zero over the drivers.
+    """Drivers differ in their pace, with mean zero over the drivers.
 
     ``people`` holds their eta_i.
     """
@@ -272,7 +268,7 @@ class LeaderLength(LawEffect):
 
 @CATALOGUE.add
 class FreeFlowSpeed(LaneEffect):
-    """Nobody drives faster than a desired speed, however long the gap."""
+    """No vehicle drives faster than a desired speed, even for long gaps."""
 
     name = "free_flow_speed"
     rules = {1: Rule(rate="W - max(W - v_max, 0)")}
@@ -392,9 +388,9 @@ class AsymmetricResponse(LaneEffect):
     distinguishing_data = _EXCITATION
 
 
-#: Speed of the vehicle ahead at the start by its law; a leader's is measured. Measured speeds of
-#: followers contain disturbances that last for a while, and a state that starts with them would be
-#: taken for inertia.
+#: Rate of change of the gap at the start: the speed of the vehicle ahead, by its law or measured
+#: for a leader, less the speed by the law. Measured speeds of followers contain autocorrelated
+#: disturbances, and a state that starts with them would be mistaken for inertia.
 _OPENING = "(choose(second, law(gap=gap_1), v_1) - law())"
 
 
@@ -402,7 +398,7 @@ _OPENING = "(choose(second, law(gap=gap_1), v_1) - law())"
 class ReactionDelay(LawEffect):
     """Drivers react to the gap as it was some time ago.
 
-    In laws of second order they react to everything that late.
+    In laws of second order all reactions have this delay.
     The delay is a second-order all-pass filter of the gap u (Padé's approximation): with
     z'' T²/12 + z' T/2 + z = u the delayed gap is u - T z'. It is exact to a thousandth of a
     period for oscillations slower than 2 pi T.
@@ -410,7 +406,7 @@ class ReactionDelay(LawEffect):
 
     name = "reaction_delay"
     rules = {
-        # near zero a law may be steep; half the gap is the least that is remembered
+        # near zero a law may be steep, so the delayed gap is at least half the gap
         1: Rule(
             rate="W + law(gap=max(gap - slope, gap/2)) - law()",
             states={
@@ -438,7 +434,7 @@ class ReactionDelay(LawEffect):
 
 @CATALOGUE.add
 class Inertia(LawEffect):
-    """A vehicle needs time to reach the speed, or acceleration, that the law says."""
+    """A vehicle reaches the speed, or acceleration, of the law with a time lag."""
 
     name = "inertia"
     rules = {
@@ -459,7 +455,7 @@ class Inertia(LawEffect):
 class PureDelay(LaneEffect):
     """Drivers react exactly as they would have some time ago, at most 15 steps.
 
-    Every step hands the acceleration on to the next of 15 states. The acceleration's slope by T
+    Every step moves the acceleration to the next of 15 states. The acceleration's derivative by T
     jumps where T is a whole number of steps.
     """
 
@@ -468,10 +464,10 @@ class PureDelay(LaneEffect):
     source = "Treiber, Kesting & Helbing 2006 (reaction time)"
     settings = {"T": Setting(0.5, Interval(0.0, 1.5), "s")}
     rank = 36
-    searched_orders = ()  # a map from step to step; reaction_delay is looked for
+    searched_orders = ()  # a diagnosis tests reaction_delay instead
 
 
-#: The time gap of a driver in the first state.
+#: A driver's time gap in the first state.
 _FIRST_GAP = "clip((gap - length_1 - s0)/max(v, slowest), shortest, longest)"
 _GAPS = {"slowest": (2.0, "m/s"), "shortest": (0.1, "s"), "longest": (5.0, "s")}
 
@@ -503,7 +499,7 @@ class Memory(LaneEffect):
 
 @CATALOGUE.add
 class LastingTimeGap(LaneEffect):
-    """Every driver keeps a time gap of his own.
+    """Drivers differ permanently in their time gaps.
 
     It is estimated from the time gap of the first state, as ``memory`` defines it. The first state
     depends on temporary deviations as well, so a share of the difference is kept.

@@ -1,4 +1,4 @@
-"""Effects of the user's own: Python files named in an environment variable."""
+"""User-defined effects: Python files named in an environment variable."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 
 from nnode.errors import ConfigError
 
-#: Names files that define effects, separated as in PATH.
+#: Environment variable with the files that define effects, separated as in PATH.
 VARIABLE = "NNODE_EFFECTS"
 
 _loaded: set[Path] = set()
 
 
 def load_own() -> None:
-    """Run the files that :data:`VARIABLE` names, each once in a process.
+    """Run the files that :data:`VARIABLE` names, each once per process.
 
-    They add their effects to the catalogue. Only this variable leads to them: neither a
-    checkpoint nor an option can make the package run a file.
+    The files add their effects to the catalogue. No checkpoint and no option can make the package
+    run a file.
 
     Raises:
-        ConfigError: no such file, or one that fails.
+        ConfigError: a file does not exist or fails.
     """
     for name in filter(None, os.environ.get(VARIABLE, "").split(os.pathsep)):
         path = Path(name).expanduser().resolve()
@@ -41,7 +41,7 @@ def load_own() -> None:
         sys.modules[module_name] = module
         try:
             spec.loader.exec_module(module)
-        except Exception as error:  # whatever a user's file does
+        except Exception as error:  # user code may raise anything
             del sys.modules[module_name]
             raise ConfigError(
                 f"{path}, named in {VARIABLE}, fails: {type(error).__name__}: {error}"

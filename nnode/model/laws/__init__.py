@@ -1,5 +1,5 @@
-"""Laws: entries of formulas and parameters. The package's own are files in ``laws/``; a user's own
-come from ``model.law``."""
+"""Laws: entries of formulas and parameters. The package's laws are files in ``laws/``;
+user-defined laws come from ``model.law``."""
 
 from __future__ import annotations
 
@@ -36,25 +36,23 @@ from nnode.model.terms import (
     LaneDynamics,
     Rule,
     add_term,
-    own_values,
-    values_of,
+    parameter_values,
 )
 from nnode.model.units import in_si
 
-#: Quantities of a lane that are 0 where everybody drives at one speed, as far as a law may name
-#: them.
+#: Quantities of a lane that are set to 0 for the equilibrium of vehicles at one speed.
 _AT_REST = ("dv", "t", "clock", "x", "x_1", "x_2", "v_2", "length_1", "gap_1", "dx_1", "v", "v_1")
-#: The step that a map from step to step is shown with, s.
+#: The time step for figures of laws that map one step to the next, s.
 _STEP = 0.1
-#: No vehicle is faster, m/s.
+#: Largest speed of a vehicle, m/s.
 FASTEST = 100.0
-#: What the description of a user's own law may say, of a lane and of a crowd.
+#: Allowed keys of the description of a user-defined law, of a lane and of a crowd.
 _COMMON = ("parameters", "constants", "where")
 _KEYS = (*_COMMON, "delayed", "remembered", "states", "step", "rate", "source")
 _CROWD_KEYS = (*_COMMON, "rate", "source", *REDUCED)
 #: Entries that are mappings.
 _MAPPINGS = (*_COMMON, "delayed", "states", *REDUCED)
-#: A network that is added to a law, by its order: inputs are brought to the size of one, SI units.
+#: Order of a law to the network that is added to it; inputs are scaled to the size of 1, SI units.
 _ADDED = {1: "NN(gap/20)", 2: "NN(gap/20, v/10, dv/2)"}
 _PARAMETER = {"value", "low", "high", "unit"}
 _ENDS = {"low": "at least", "high": "at most"}
@@ -62,30 +60,31 @@ _ENDS = {"low": "at least", "high": "at most"}
 
 @cache
 def entries() -> dict[str, dict[str, Any]]:
-    """The package's laws by name, in the order of their ranks, as their files describe them.
+    """The package's laws by name, in the order of their ranks, from their files.
 
-    Beside the entries of a user's own law: ``about``, one line; ``formula`` as it is printed;
-    ``model``, the entries that make a model of this name, and ``options``, those that a law takes
-    from the options of the model; absent: the law is given as ``model.law``. ``settings``,
-    quantities that options give; ``networks``, submodule to the functions in formulas that are its
-    outputs; ``hidden``, neurons of their hidden layer; ``force``, ``drive``, see
-    :class:`nnode.model.terms.Rule`; ``variants``, option to the entries that it changes where it is
-    true. A parameter whose value is a list starts uniform between both.
+    In addition to the keys of a user-defined law, an entry may have: ``about``, a description in
+    one line; ``formula``, the printed formula; ``model``, the entries of the model of this name,
+    without which the law is given as ``model.law``; ``options``, the model's options that the law
+    takes; ``settings``, fixed quantities that options may set; ``networks``, submodule to the
+    functions in formulas that are its outputs; ``hidden``, neurons of their hidden layer;
+    ``force``, ``drive``, see :class:`nnode.model.terms.Rule`; ``variants``, option to the entries
+    that it changes if it is true. A parameter whose value is a list of two values starts uniform
+    between them.
     """
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    found = {
+    laws = {
         file.name.removesuffix(".yaml"): yaml.load(file.read_text("utf-8"), loader)
         for file in files("nnode.model.laws").iterdir()
         if file.name.endswith(".yaml")
     }
-    return dict(sorted(found.items(), key=lambda item: (item[1].get("rank", 100), item[0])))
+    return dict(sorted(laws.items(), key=lambda item: (item[1].get("rank", 100), item[0])))
 
 
 def _of_people(rate: Any) -> bool:
     return isinstance(rate, Mapping) and not {"vx", "vy", "y"}.isdisjoint(rate)
 
 
-def _described(people: bool) -> dict[str, dict[str, Any]]:
+def _descriptions(people: bool) -> dict[str, dict[str, Any]]:
     keys = _CROWD_KEYS if people else _KEYS
     return {
         name: {key: value for key, value in entry.items() if key in keys}
@@ -95,9 +94,9 @@ def _described(people: bool) -> dict[str, dict[str, Any]]:
 
 
 #: Name of a law to its description as ``model.law``.
-CAR_FOLLOWING_LAWS = _described(people=False)
-PEDESTRIAN_LAWS = _described(people=True)
-#: Neurons of the hidden layer of those that are networks.
+CAR_FOLLOWING_LAWS = _descriptions(people=False)
+PEDESTRIAN_LAWS = _descriptions(people=True)
+#: Neurons of the hidden layer of laws that are networks.
 NEURONS = {n: entries()[n]["hidden"] for n in CAR_FOLLOWING_LAWS if "hidden" in entries()[n]}
 #: Name of a law to the options of the model that consists of it.
 LAW_MODELS: dict[str, dict[str, Any]] = {
@@ -109,42 +108,43 @@ LAW_MODELS: dict[str, dict[str, Any]] = {
 class Law(Term):
     """A term that effects change: a law of vehicles or people, described by an entry.
 
-    A subclass may be code: it overrides ``speed`` (of a lane, first order) or ``forward``.
+    A subclass may define the law by code: it overrides ``speed`` (of a lane, first order) or
+    ``forward``.
 
     Args:
-        entry: name of the package's entry, or a description: ``parameters`` and ``rate`` at least.
-            Parameters are quantities with a unit, ``30 m/s``, or mappings of ``value``, ``low``
-            and ``high``. ``rate`` is ``{x: formula}``, m/s, or ``{v: formula}``, m/s², of a lane;
-            ``{vx: formula, vy: formula}``, m/s², or ``{x: formula, y: formula}``, m/s, of a crowd;
-            what they may name stands in :mod:`nnode.model.terms`.
-        name: of the term; by default the entry's.
-        hidden: neurons of the hidden layer of networks. Where formulas do not call NN, a network,
-            NN(gap/20, v/10, dv/2) is added to the rate, in SI units, and starts at 0. None: as the
-            entry says, or no network.
+        entry: name of the package's entry, or a description with at least ``parameters`` and
+            ``rate``. Parameters are quantities with a unit, ``30 m/s``, or mappings of ``value``,
+            ``low`` and ``high``. ``rate`` is ``{x: formula}``, m/s, or ``{v: formula}``, m/s², of
+            a lane; ``{vx: formula, vy: formula}``, m/s², or ``{x: formula, y: formula}``, m/s, of
+            a crowd. :mod:`nnode.model.terms` lists the names in formulas.
+        name: name of the term; by default the entry's.
+        hidden: neurons of the hidden layer of networks. If formulas do not call NN, the network
+            NN(gap/20, v/10, dv/2) in SI units is added to the rate and starts at 0. None takes
+            the entry's value, or no network.
         box: weights stay in [-box, box]; None leaves them free.
-        generator: of start values that are drawn.
+        generator: source of random start values.
         options: start values of parameters and values of settings, in SI units and by their names
-            (None: as the entry says), ``L_min`` for the low end of ``L``, and variants.
+            (None takes the entry's value), ``L_min`` for the low end of ``L``, and variants.
 
     Attributes:
-        order: 1: its rate is a speed; 2: an acceleration.
-        step: its own method of stepping, see :mod:`nnode.model.steps`; None: that of its order.
-            ``rk4`` is ballistic beside an effect that remembers step by step.
-        rule: what it does; None: its ``forward`` is code.
-        formulas: what its entry says.
+        order: 1 if its rate is a speed, 2 if it is an acceleration.
+        step: the law's method of stepping, see :mod:`nnode.model.steps`; None takes the default
+            of its order. With an effect that remembers steps, ``ballistic`` replaces ``rk4``.
+        rule: the law's formulas, which may call its code; None if its ``forward`` is code.
+        formulas: the entry's formulas.
 
-    A leader that drives by itself keeps the speed v0 in a law of first order, which must have
-    such a parameter then, and its first speed in one of second order.
+    A leader that drives by the law keeps the parameter v0 as its speed in a law of first order,
+    and its first speed in a law of second order.
 
     Raises:
-        ConfigError: what is missing, cannot be read, or has the wrong unit.
+        ConfigError: an entry that is missing, cannot be read, or has the wrong unit.
         ValueError: a setting that is not positive.
     """
 
     order = 2
     step: str | None = None
     formulas: Rule
-    #: Methods that replace formulas where a subclass defines them: what they replace, their inputs.
+    #: Methods of subclasses that replace formulas, to the replaced entry and the method's inputs.
     methods: ClassVar[dict[str, tuple[str, str]]] = {"speed": ("rate", "gap")}
     _calls: dict[str, Callable[..., Expr]]
 
@@ -160,47 +160,49 @@ class Law(Term):
     ) -> None:
         super().__init__()
         self.entry = entry if isinstance(entry, str) else ""
-        found = dict(entries()[entry] if isinstance(entry, str) else entry)
-        for option, changes in found.pop("variants", {}).items():
+        description = dict(entries()[entry] if isinstance(entry, str) else entry)
+        for option, changes in description.pop("variants", {}).items():
             setattr(self, option, bool(options.pop(option, False)))
             if getattr(self, option):
-                found |= {key: {**found[key], **value} for key, value in changes.items()}
+                description |= {
+                    key: {**description[key], **value} for key, value in changes.items()
+                }
         self.name = str(name or self.entry)  # type: ignore[misc]
-        self.source = str(found.get("source", getattr(type(self), "source", "")))  # type: ignore[misc]
+        self.source = str(description.get("source", getattr(type(self), "source", "")))  # type: ignore[misc]
         check_names("model.name", [self.name])
-        self.networks: dict[str, list[str]] = found.get("networks", {"network": ["NN"]})
+        self.networks: dict[str, list[str]] = description.get("networks", {"network": ["NN"]})
         self.network: FeedForward | None = None
-        self.formulas = _rule(found)
+        self.formulas = _rule(description)
         self.domain = "crowd" if self.formulas.of_crowd else "traffic"
-        self.order, self.step = self.formulas.order, found.get("step")
+        self.order, self.step = self.formulas.order, description.get("step")
         if self.step is not None and self.step not in METHODS:
             raise ConfigError(
                 f"model.law.step={self.step} is unknown, expected {', '.join(METHODS)}"
             )
-        self._declare(found["parameters"], options, generator)
-        for setting, quantity in found.get("settings", {}).items():
+        self._declare(description["parameters"], options, generator)
+        for setting, quantity in description.get("settings", {}).items():
             value = options.pop(setting, None)
             if value is not None and not value > 0:
                 raise ValueError(f"{setting}={value} must be positive")
             setattr(self, setting, in_si(quantity)[0] if value is None else value)
         if options:
             raise ValueError(f"the law {self.name} has no option {', '.join(options)}")
-        self._connect(found.get("hidden") if hidden is None else hidden, generator)
+        self._connect(description.get("hidden") if hidden is None else hidden, generator)
         if box is not None:
             for module in self.networks:
                 self.bound_all(f"{module}.", Interval(-box, box))
         text = self.formulas.rate if self.domain == "traffic" else ", ".join(self.formulas.rate)
-        self.formula = found.get("formula", getattr(type(self), "formula", text))  # type: ignore[misc]
+        self.formula = description.get("formula", getattr(type(self), "formula", text))  # type: ignore[misc]
         self._coded()
         self._key = repr(self.rule)
-        self.dynamics()  # says what is wrong with the formulas
+        self.dynamics()  # raises errors of the formulas
 
     def _declare(
         self, parameters: Mapping[str, Any], options: dict[str, Any], draws: torch.Generator | None
     ) -> None:
-        """Declare the parameters; takes their options."""
+        """Declare the parameters, and remove their start values from ``options``."""
         check_names("model.law.parameters", parameters)
-        given = {name: options.pop(name, None) for name in parameters}
+        start_values = {name: options.pop(name, None) for name in parameters}
         for name, quantity in parameters.items():
             if hasattr(self, name):
                 raise ConfigError(f"model.law.parameters: {name} cannot be the name of a parameter")
@@ -215,17 +217,17 @@ class Law(Term):
                 low, high = (in_si(str(end))[0] for end in entry["value"])
                 share = torch.rand((), generator=draws, dtype=torch.float64)
                 drawn, entry["value"] = float(low + (high - low) * share), entry["value"][0]
-            found = {key: in_si(str(value)) for key, value in entry.items()}
-            units = {own for _, own in found.values()}
+            quantities = {key: in_si(str(value)) for key, value in entry.items()}
+            units = {dimension for _, dimension in quantities.values()}
             if len(units) > 1:
-                said = ", ".join(f"{key} {value}" for key, value in entry.items())
+                stated = ", ".join(f"{key} {value}" for key, value in entry.items())
                 raise ConfigError(
-                    f"model.law.parameters.{name} has {said}: expected quantities with one kind of "
-                    f"unit, such as '3 {max(units - {'1'})}'"
+                    f"model.law.parameters.{name} has {stated}: expected quantities with one kind "
+                    f"of unit, such as '3 {max(units - {'1'})}'"
                 )
-            bounds = {key: value for key, (value, _) in found.items() if key != "value"}
+            bounds = {key: value for key, (value, _) in quantities.items() if key != "value"}
             within = Interval(**bounds)
-            if not within.low <= found["value"][0] <= within.high:
+            if not within.low <= quantities["value"][0] <= within.high:
                 ends = [f"{word} {entry[key]}" for key, word in _ENDS.items() if key in entry]
                 raise ConfigError(
                     f"model.law.parameters.{name}.value={entry['value']}: a start value of {name} "
@@ -233,16 +235,16 @@ class Law(Term):
                 )
             if "low" in bounds and options.get(f"{name}_min") is not None:
                 bounds["low"] = float(options.pop(f"{name}_min"))
-            start = found["value"][0] if drawn is None else drawn
+            start = quantities["value"][0] if drawn is None else drawn
             self.declare(
                 name,
-                start if given[name] is None else given[name],
+                start if start_values[name] is None else start_values[name],
                 unit=unit or units.pop(),
                 bounds=Interval(**bounds) if bounds else None,
             )
 
     def _connect(self, hidden: int | None, generator: torch.Generator | None) -> None:
-        """Make the networks, of as many inputs as the formulas give them."""
+        """Create the networks, with the number of inputs that the formulas give them."""
         inputs: dict[str, set[int]] = {name: set() for name in self.networks}
 
         def count(module: str, *values: Expr) -> Expr:
@@ -266,25 +268,25 @@ class Law(Term):
         for text in self.formulas.texts:
             if calls.search(text):
                 parse(text, None, {**dict.fromkeys(self.formulas.where, const(0)), **functions})
-        for module, found in inputs.items():
-            if len(found) != 1:
+        for module, counts in inputs.items():
+            if len(counts) != 1:
                 raise ConfigError(
                     f"model.law of {self.name}: {self.networks[module][0]} is called with "
-                    f"{sorted(found) or 'no'} inputs, expected the same number everywhere"
+                    f"{sorted(counts) or 'no'} inputs, expected the same number everywhere"
                 )
-            sizes = (found.pop(), int(hidden), len(self.networks[module]))
+            sizes = (counts.pop(), int(hidden), len(self.networks[module]))
             setattr(self, module, FeedForward(sizes, generator))
         if added:
             assert self.network is not None
             self.network.zero_output_()
 
     def _coded(self) -> None:
-        """Say by ``rule`` what the class says: formulas, or calls of its own code."""
+        """Set ``rule``: the formulas, with calls of the methods that a subclass overrides."""
         rule, self._calls = self.formulas, {}
         for method, (entry, inputs) in self.methods.items():
-            own = getattr(type(self), method) is not getattr(InteractionForce, method)
+            overridden = getattr(type(self), method) is not getattr(InteractionForce, method)
             replaced = getattr(rule, entry)
-            if not own or not replaced or (entry == "rate" and self.order == 2):
+            if not overridden or not replaced or (entry == "rate" and self.order == 2):
                 continue
             if isinstance(replaced, str):
                 self._calls[method] = partial(call, method)
@@ -305,7 +307,7 @@ class Law(Term):
 
     @property
     def _shape_called(self) -> tuple[Any, ...]:
-        """What its formula depends on where networks stay functions."""
+        """Key of the formula in which networks stay calls."""
         return (*super().shape, self.name, self._key, *self.units.items())
 
     def rule_for(self, order: int) -> Rule | None:
@@ -313,32 +315,33 @@ class Law(Term):
 
     @property
     def of_gap(self) -> bool:
-        """Whether it is a speed that depends on the gap alone."""
+        """Whether it is a speed that depends only on the gap."""
         if self.domain != "traffic" or self.order != 1 or self.formulas.memory:
             return False
         return _names_gap_alone(self.dynamics(called=True))
 
     def names(self, parameter: str) -> bool:
-        """Whether the rate of a vehicle names a parameter."""
+        """Whether the rate of a vehicle contains a parameter."""
         return f"{self.name}__{parameter}" in symbols([self.dynamics(called=True).law])
 
     def code(self) -> dict[str, Code]:
-        """What calls in its formulas stand for, by name."""
-        networks = {module: partial(_joined, getattr(self, module)) for module in self.networks}
+        """Name to the function that calls of this name in its formulas evaluate."""
+        networks = {
+            module: partial(_network_output, getattr(self, module)) for module in self.networks
+        }
         return {"speed": self.speed, **{str(k): itemgetter((..., k)) for k in (0, 1)}, **networks}
 
     def written(
         self, model: Any, owner: str, place: int, rule: Rule | None = None, called: bool = False
     ) -> Any:
-        """A model with this term.
+        """The formulas of a model with this term.
 
         Args:
-            model: its formulas so far.
-            owner: name of the term in the model; symbols begin with it.
-            place: of the term in the model.
-            rule: in place of its own.
-            called: whether networks stay functions; otherwise they are written out, neuron by
-                neuron.
+            model: the formulas without it.
+            owner: name of the term in the model; prefix of its symbols.
+            place: index of the term in the model.
+            rule: formulas in place of its own.
+            called: whether networks stay calls; otherwise they are written out, neuron by neuron.
         """
         rule = rule or self.rule or self.formulas
         parameters, owned, units = parameters_of(self, owner, place)
@@ -353,7 +356,8 @@ class Law(Term):
                 f"terms.{place}.{module}.",
             )
             functions |= {
-                name: partial(_neurons, network, label, path, k) for k, name in enumerate(names)
+                name: partial(_written_output, network, label, path, k)
+                for k, name in enumerate(names)
             }
             if any(re.search(rf"\b{name}\s*\(", t) for name in names for t in rule.texts):
                 _, weights = network.written([const(0)] * network.sizes[0], label, path)
@@ -362,55 +366,57 @@ class Law(Term):
         return add_term(model, owner, rule, parameters, owned, units, place, functions)
 
     def dynamics(self, called: bool = False) -> Any:
-        """Its formulas alone, as its entry says them; of a crowd flat."""
+        """The formulas of a model of only this law; flat for a crowd."""
         key = (called, *(self._shape_called if called else self.shape))
-        if key not in _KNOWN:
+        if key not in _FORMULAS:
             empty = CrowdDynamics() if self.domain == "crowd" else LaneDynamics(order=self.order)
-            found = self.written(empty, self.name, 0, self.formulas, called)
-            _KNOWN[key] = found.flat() if self.domain == "crowd" else found
-        return _KNOWN[key]
+            formulas = self.written(empty, self.name, 0, self.formulas, called)
+            _FORMULAS[key] = formulas.flat() if self.domain == "crowd" else formulas
+        return _FORMULAS[key]
 
     def computed(self, formulas: Sequence[Expr], values: Mapping[str, Tensor]) -> list[Tensor]:
-        """Formulas of its parameters, settings, networks and of other quantities."""
+        """The values of formulas of its parameters, settings, networks and other quantities."""
         law = self.dynamics(called=True)
-        own = dict(zip(law.owned, values_of(law, own_values([self], law)), strict=True))
+        law_values = parameter_values([self], law)
         like = next(iter(values.values()))
-        own |= {k: like.new_tensor(value) for k, value in settings_of([self], law).items()}
-        return computed(formulas, {**own, **values}, code=self.code())
+        law_values |= {k: like.new_tensor(value) for k, value in settings_of([self], law).items()}
+        return computed(formulas, {**law_values, **values}, code=self.code())
 
     def evaluated(self, values: Mapping[str, Tensor]) -> Tensor:
-        """The rate of a vehicle, of values of the quantities in it."""
+        """The rate of a vehicle from the values of the quantities in it."""
         return self.computed([_law_alone(self.dynamics(called=True))], values)[0]
 
     def speed(self, gap: Tensor) -> Tensor:
-        """Speed, m/s, at a gap, m, elementwise, where everybody drives at one speed; of a law of
-        second order the least such speed of an acceleration that is not negative at rest, up to
-        100 m/s."""
+        """Equilibrium speed, m/s, at a gap, m, elementwise, where all vehicles drive at one speed.
+
+        For a law of second order it is the zero of the acceleration by bisection between 0 and
+        100 m/s, or 0 if the acceleration at rest is not positive.
+        """
         if self.of_gap:
-            found = self.evaluated({"gap": gap})
-            return found if found.shape == gap.shape else found.expand_as(gap)
+            speed = self.evaluated({"gap": gap})
+            return speed if speed.shape == gap.shape else speed.expand_as(gap)
         zero = torch.zeros_like(gap)
-        known = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "x_1": gap, "dt": zero + _STEP}
+        at_rest = {**dict.fromkeys(_AT_REST, zero), "gap": gap, "x_1": gap, "dt": zero + _STEP}
         lane = self.dynamics(called=True).flat()
 
-        def says(v: Tensor) -> Tensor:
-            """The formula where everybody has driven at v for long."""
-            values = {**known, "v": v, "v_1": v, "dx_1": v, **dict.fromkeys(lane.starts, zero)}
-            begun = self.computed(list(lane.starts.values()), values)
-            values |= dict(zip(lane.starts, begun, strict=True))
+        def acceleration_at(v: Tensor) -> Tensor:
+            """The law's rate if all vehicles have driven at the speed v."""
+            values = {**at_rest, "v": v, "v_1": v, "dx_1": v, **dict.fromkeys(lane.starts, zero)}
+            start_values = self.computed(list(lane.starts.values()), values)
+            values |= dict(zip(lane.starts, start_values, strict=True))
             return self.evaluated(values).expand_as(gap)
 
         if self.order == 1:
-            return says(zero)
+            return acceleration_at(zero)
         low, high = zero, torch.full_like(gap, FASTEST)
         for _ in range(60):
-            half = (low + high) / 2
-            faster = says(half) > 0
-            low, high = torch.where(faster, half, low), torch.where(faster, high, half)
-        return torch.where(says(zero) > 0, low, zero)
+            middle = (low + high) / 2
+            faster = acceleration_at(middle) > 0
+            low, high = torch.where(faster, middle, low), torch.where(faster, high, middle)
+        return torch.where(acceleration_at(zero) > 0, low, zero)
 
     def forward(self, state: State) -> Tensor:
-        """By its formulas."""
+        """Its rate by its formulas."""
         if self.domain == "crowd":
             return rates_of([self], self.dynamics(called=True), state, self.code())
         if not self.of_gap:
@@ -420,12 +426,12 @@ class Law(Term):
         x, scene = state.x[..., 0], state.scene
         speed = self.speed(x[:, 1:] - x[:, :-1])
         ahead = torch.cat([speed, speed.new_zeros(len(speed), 1)], 1)
-        v0 = getattr(self, "v0", 0.0)  # without it leaders drive as measured
+        v0 = getattr(self, "v0", 0.0)  # without v0, leaders follow their measured paths
         return torch.where(scene.follower, ahead, v0 * scene.leader)[..., None]
 
     def alone(self) -> Law:
-        """The same law of people where nobody meets anybody, nor a wall."""
-        law, found = self.dynamics(), copy.copy(self)
+        """The same pedestrian law without other people and walls."""
+        law, law_alone = self.dynamics(), copy.copy(self)
         value = {SMALLEST: "nobody", LARGEST: "-nobody"}
         bare: dict[str, Any] = {
             over: {
@@ -434,13 +440,13 @@ class Law(Term):
             }
             for over in REDUCED
         }
-        found.rule = found.formulas = replace(self.formulas, **bare)
-        found._key = repr(found.rule)
-        return found
+        law_alone.rule = law_alone.formulas = replace(self.formulas, **bare)
+        law_alone._key = repr(law_alone.rule)
+        return law_alone
 
 
-#: Laws' shapes to their formulas.
-_KNOWN: dict[tuple[Any, ...], Any] = {}
+#: Shape of a law to its formulas.
+_FORMULAS: dict[tuple[Any, ...], Any] = {}
 
 
 @cache
@@ -455,9 +461,9 @@ def _names_gap_alone(lane: LaneDynamics) -> bool:
     return {"gap", *lane.owned}.issuperset(symbols([_law_alone(lane)]))
 
 
-def _joined(network: FeedForward, *inputs: Tensor) -> Tensor:
-    """A network, layer by layer."""
-    if len(inputs) == 1:  # as the paper's laws call it in every step
+def _network_output(network: FeedForward, *inputs: Tensor) -> Tensor:
+    """The outputs of a network, evaluated layer by layer."""
+    if len(inputs) == 1:  # faster, and the paper's laws have one input
         joined = inputs[0][..., None]
     else:
         joined = torch.stack(torch.broadcast_tensors(*inputs), -1)
@@ -466,17 +472,19 @@ def _joined(network: FeedForward, *inputs: Tensor) -> Tensor:
 
 
 def _output(name: str, number: int, *inputs: Expr) -> Expr:
-    """One output of code."""
+    """One output of a call of code."""
     return call(str(number), call(name, *inputs))
 
 
-def _neurons(network: FeedForward, label: str, path: str, number: int, *inputs: Expr) -> Expr:
-    """One output of a network that is written out."""
+def _written_output(
+    network: FeedForward, label: str, path: str, number: int, *inputs: Expr
+) -> Expr:
+    """One output of a network as a formula of its neurons."""
     return network.written(list(inputs), label, path)[0][number]
 
 
 class FollowTheLeader(Law):
-    """Base of laws of a lane that are code: a subclass defines ``name`` and ``speed``.
+    """Base class of lane laws that are code: a subclass defines ``name`` and ``speed``.
 
     dx_i/dt = W(x_{i+1} - x_i) for followers, dx_N/dt = v0.
 
@@ -499,18 +507,17 @@ class InteractionForce(Law):
     """Forces between people and from walls, averaged as in the paper.
 
     (1/m) mean over the N people of the pair force + (1/m) mean over the P wall points of the
-    wall force. A person exerts no force on himself unless the entry says so, but counts in N.
-    Forces are those of the entry; a subclass may define ``pair_force`` and ``wall_force`` in their
-    place.
+    wall force. A person counts in N, but exerts a force on itself only with ``self_interaction``.
+    The entry defines the forces; a subclass may override ``pair_force`` and ``wall_force``.
 
     Args:
         mass: m, kg.
-        walls: False leaves the walls out.
-        entry: name of the package's entry or a description; None: both forces are code.
-        options: of :class:`Law`.
+        walls: False omits the walls.
+        entry: name of the package's entry or a description; None if both forces are code.
+        options: options of :class:`Law`.
 
     Attributes:
-        self_interaction: whether the mean over people contains j = i as well.
+        self_interaction: whether the mean over people contains j = i.
     """
 
     mass: float
@@ -544,16 +551,19 @@ class InteractionForce(Law):
 
         return {**super().code(), "pair_force": pair}
 
-    def _force(self, over: str, seen: Mapping[str, Tensor]) -> Tensor:
+    def _force(self, over: str, vectors: Mapping[str, Tensor]) -> Tensor:
         """``(..., 2)`` N: the entry's summands over the others or over wall points.
 
         Args:
-            seen: vectors ``(..., 2)``; their names have {} for the axis.
+            over: kind of neighbours.
+            vectors: name with {} for the axis to vectors ``(..., 2)``.
         """
         sums = self.dynamics(called=True).sums[over]
         if not sums:
             raise NotImplementedError(f"{type(self).__name__} has no force from {over}")
-        parts = {name.format(c): seen[name][..., k] for name in seen for k, c in enumerate("xy")}
+        parts = {
+            name.format(c): vectors[name][..., k] for name in vectors for k, c in enumerate("xy")
+        }
         return torch.stack(self.computed([*sums.values()], parts), -1)
 
     def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
@@ -566,8 +576,8 @@ class InteractionForce(Law):
         return self._force(POINTS, {"d{}": dx, "v{}": v, "normal_{}": normal})
 
     def pairs(self, state: State) -> Tensor:
-        """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third),
-        0 where they are one."""
+        """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third
+        axis), 0 for i = j."""
         x, v, scene = state.x, velocity(state), state.scene
         other, speed = state.others
         dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
@@ -585,16 +595,16 @@ class InteractionForce(Law):
             force = self.wall_force(dx, v[:, :, None].expand_as(dx), normal.expand_as(dx))
             parts["wall"] = (force * real[..., None]).sum(2) / (self.mass * scene.wall_count)
         if self.self_interaction:
-            here = torch.zeros_like(x[:1, :1])
-            own = self.pair_force(here, here) / (self.mass * scene.count)
-            parts["pair"] = parts["pair"] + own
+            zero = torch.zeros_like(x[:1, :1])
+            self_force = self.pair_force(zero, zero) / (self.mass * scene.count)
+            parts["pair"] = parts["pair"] + self_force
         return parts
 
     def forward(self, state: State) -> Tensor:
         return sum(self.components(state).values(), torch.zeros_like(state.x))
 
 
-#: A force between people that is code.
+#: Entry of a force between people that is code.
 _FORCE: dict[str, Any] = {
     "parameters": {},
     "settings": {"mass": "1 kg"},
@@ -627,13 +637,14 @@ def law_from(
     """A law from its description in a configuration or a checkpoint.
 
     Args:
-        name: of the law.
-        network: neurons of the hidden layer of NN, a network; None: there is none.
+        name: name of the law.
+        description: mapping as of ``model.law``.
+        network: neurons of the hidden layer of the network NN; None for no network.
         box: weights stay in [-box, box]; None leaves them free.
-        generator: of the first weights.
+        generator: source of the initial weights.
 
     Raises:
-        ConfigError: an entry that is missing or unknown, or a formula that cannot be used.
+        ConfigError: an entry is missing or unknown, or a formula cannot be used.
     """
     if not isinstance(description, Mapping) or not {"parameters", "rate"} <= set(description):
         raise ConfigError(
@@ -652,17 +663,17 @@ def law_from(
         if not isinstance(description.get(key) or {}, Mapping):
             raise ConfigError(f"model.law.{key} must be a mapping of names, as {{v0: 30 m/s}}")
         check_names(f"model.law.{key}", description.get(key) or {})
-    found = {str(key): value for key, value in description.items()}
+    entry = {str(key): value for key, value in description.items()}
     if people:
-        return Law(found, name)
-    return Law(found, name, hidden=network, box=box, generator=generator)
+        return Law(entry, name)
+    return Law(entry, name, hidden=network, box=box, generator=generator)
 
 
 def _rule(entry: Mapping[str, Any]) -> Rule:
     """The formulas of an entry.
 
     Raises:
-        ConfigError: a rate that is neither of a lane nor of a crowd, or an entry of another form.
+        ConfigError: the rate has an invalid form.
     """
     rate = entry["rate"]
     states = sorted(map(str, rate)) if isinstance(rate, Mapping) else []
@@ -686,8 +697,8 @@ def _rule(entry: Mapping[str, Any]) -> Rule:
         rate=texts[0] if len(texts) == 1 else (texts[0], texts[1]),
         order=1 if "x" in states else 2,
         leader=leader.get("".join(states), ""),
-        states=_threes("states", "[unit, rate, start]", entry),
-        delayed=_threes("delayed", "[formula, unit, delay]", entry),
+        states=_triples("states", "[unit, rate, start]", entry),
+        delayed=_triples("delayed", "[formula, unit, delay]", entry),
         remembered=int(entry.get("remembered", 0)),
         where={str(k): str(v) for k, v in (entry.get("where") or {}).items()},
         constants={str(k): in_si(str(v)) for k, v in (entry.get("constants") or {}).items()},
@@ -698,21 +709,26 @@ def _rule(entry: Mapping[str, Any]) -> Rule:
     )
 
 
-def _threes(key: str, wanted: str, entry: Mapping[str, Any]) -> dict[str, tuple[str, str, str]]:
-    """The entries of ``states`` or ``delayed``."""
-    found = {}
+def _triples(key: str, wanted: str, entry: Mapping[str, Any]) -> dict[str, tuple[str, str, str]]:
+    """The entries of ``states`` or ``delayed``.
+
+    Raises:
+        ConfigError: an entry does not have three elements.
+    """
+    triples = {}
     for name, given in (entry.get(key) or {}).items():
         if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != 3:
             raise ConfigError(f"model.law.{key}.{name}={given} must be {wanted}")
         first, second, third = map(str, given)
-        found[str(name)] = first, second, third
-    return found
+        triples[str(name)] = first, second, third
+    return triples
 
 
 def parameters_of(
     term: Term, owner: str, place: int
 ) -> tuple[dict[str, Expr], dict[str, Any], dict[str, str]]:
-    """Of a term's scalar parameters: symbols by name, where they are, and their units."""
+    """A term's scalar parameters: name to symbol, symbol to place (see
+    :class:`nnode.model.terms.Dynamics`), and symbol to unit."""
     names = term.scalars
     parameters: dict[str, Expr] = {name: symbol(f"{owner}__{name}") for name in names}
     owned = {f"{owner}__{name}": (f"terms.{place}.{name}", 0, None) for name in names}

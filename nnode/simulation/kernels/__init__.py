@@ -1,4 +1,4 @@
-"""Simulations in compiled code that is made from formulas, with exact gradients."""
+"""Simulations in compiled code that is generated from formulas, with exact gradients."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from nnode.model.system import Crowd, System, Traffic
 
 
 def source(model: System) -> str:
-    """The code that simulates a model, to be read.
+    """The generated source code that simulates a model.
 
     Raises:
-        ValueError: the model has a term that is no formula.
+        ValueError: the model has a term that is not a formula.
     """
     from nnode.simulation.kernels.crowds import CrowdSource
     from nnode.simulation.kernels.lanes import LaneSource

@@ -1,13 +1,14 @@
-"""People who walk alone among the measured paths of the others, in compiled code.
+"""Accelerations of people among the measured paths of the others, in compiled code.
 
-A person is a number p; his surroundings are tables:
+The surroundings of person p are tables:
 
-* ``others`` ``(H, W, 4, N)``: positions and velocities of the N people of W windows at H moments;
-* ``window`` ``(P,)``: his window; ``meets`` ``(P, N)``: 1 for everyone he meets, else 0;
-* ``wall`` ``(P, 4, M)``: the wall points near him and their normals, the first ``points[p]`` of
-  them real;
-* ``have`` ``(P, F)``: what he has besides his state, see ``FIELDS``; ``q`` ``(R, U)``:
-  parameters of R runs.
+* ``others`` ``(H, W, 4, N)``: positions and velocities of the N people of W windows at H times;
+* ``window`` ``(P,)``: the person's window;
+* ``meets`` ``(P, N)``: 1 for everyone who acts on the person, else 0;
+* ``wall`` ``(P, 4, M)``: nearby wall points and their normals, of which the first ``points[p]``
+  are real;
+* ``have`` ``(P, F)``: the person's properties, see ``FIELDS``;
+* ``q`` ``(R, U)``: parameters of R runs.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def accelerations(
         )
     return out
 '''
-#: What a person has besides his state.
+#: Properties of a person in addition to the state.
 FIELDS = ("goal_x", "goal_y", "pace", "people", "points")
 _STATE = ("x", "y", "vx", "vy")
 _SUMS = (OTHERS, POINTS, WALLS)
@@ -80,7 +81,7 @@ _SUMS = (OTHERS, POINTS, WALLS)
 
 @dataclass(frozen=True)
 class WalkSource:
-    """Source of a model.
+    """Source code of a model.
 
     Attributes:
         law: flat, with sums over others, wall points and walls.
@@ -98,10 +99,10 @@ class WalkSource:
         """The module's source.
 
         Raises:
-            ConfigError: a name in the formulas that is no symbol.
+            ConfigError: a name in the formulas is not a valid symbol.
         """
         law = self.law
-        sums = [name for found in law.sums.values() for name in found]
+        sums = [name for sums_over in law.sums.values() for name in sums_over]
         check_symbols([*self.parameters, *sums, *law.symbols])
         label: dict[str, str] = {}
         formula = [f"dvx/dt = {plain(law.rate[0])}", f"dvy/dt = {plain(law.rate[1])}"]
@@ -110,8 +111,8 @@ class WalkSource:
             formula += [f"{n} = sum over {over} of {plain(s)}" for n, s in law.sums[over].items()]
         text = _HEAD.format(formula="\n".join(formula))
         for over in _SUMS:
-            found = list(law.sums[over].values())
-            text += self._function(f"of_{over}", (*SEEN[over], "vx", "vy"), found)
+            sums_over = list(law.sums[over].values())
+            text += self._function(f"of_{over}", (*SEEN[over], "vx", "vy"), sums_over)
         text += self._function("rate", (*_STATE, *label), list(law.rate))
         people, places, sides = ([label[name] for name in law.sums[over]] for over in _SUMS)
         return text + _DRIVE.format(
@@ -127,7 +128,7 @@ class WalkSource:
         )
 
     def _function(self, name: str, takes: Sequence[str], outputs: Sequence[Expr]) -> str:
-        """Formulas of numbers."""
+        """The source of a function that evaluates formulas of scalars."""
         loop = Loop(self.parameters)
         names = loop.names(outputs)
         used = symbols(outputs)

@@ -1,11 +1,11 @@
-"""Modules that are kept in a cache folder, so that Numba finds their compiled code again.
+"""Generated modules in a cache folder, where Numba reuses their compiled code.
 
-Numba stores compiled code beside the file that holds the function, and compiles again when this
-file changes; changes of what it imports go unseen. A kept file therefore carries a digest of
-everything that is compiled into it in its name.
+Numba stores compiled code next to the source file, and compiles again when this file changes. It
+does not notice changes of imported modules. The name of a stored file therefore contains a digest
+of everything that is compiled into it.
 
-A module and its compiled code are run as they lie there. Nobody else may therefore own the folder
-or write to it, and a file whose text is another one is written again.
+Stored modules and compiled code are executed. Therefore no other user may own the folder or write
+to it, and a file with a different text is written again.
 """
 
 from __future__ import annotations
@@ -37,33 +37,34 @@ from nnode.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
-#: Where Python and Numba keep compiled code, beside the module.
+#: Subfolder in which Python and Numba store compiled code.
 _COMPILED = "__pycache__"
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _WAY_OUT = "set the environment variable NNODE_CACHE to a folder of your own that can be written"
 
 
 def cache_folder() -> Path:
-    """The folder of kept modules: NNODE_CACHE, else the user's own cache."""
+    """The folder of stored modules: NNODE_CACHE, or else the user's cache folder."""
     chosen = os.environ.get("NNODE_CACHE")
     return (Path(chosen) if chosen else user_cache_path("nnode")) / "fused"
 
 
 def digest(text: bytes, compiled_in: Iterable[ModuleType]) -> str:
-    """Of a file's text, of the files of modules that are compiled into it, and of the tools."""
-    found = hashlib.sha256(text)
+    """Digest of a module's text, of the modules that are compiled into it, and of the versions of
+    the tools."""
+    hash_ = hashlib.sha256(text)
     for module in compiled_in:
         assert module.__file__ is not None
-        found.update(Path(module.__file__).read_bytes())
-    found.update(f"{numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
-    return found.hexdigest()[:16]
+        hash_.update(Path(module.__file__).read_bytes())
+    hash_.update(f"{numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
+    return hash_.hexdigest()[:16]
 
 
 def keep(name: str, text: bytes) -> ModuleType:
     """The module ``name`` with the source ``text``, imported from the cache folder.
 
-    Where the user's own cache cannot be used, a temporary folder of this process takes its place,
-    and a warning says so. A folder that NNODE_CACHE names is used, or refused.
+    If the user's cache folder cannot be used, a temporary folder of this process replaces it with
+    a warning. There is no replacement for a folder that NNODE_CACHE names.
 
     Raises:
         ConfigError: the cache folder cannot be written, or others own it or may write to it.
@@ -78,7 +79,11 @@ def keep(name: str, text: bytes) -> ModuleType:
 
 @cache
 def _temporary_folder(reason: str) -> Path:
-    """A folder that ends with the process; ``reason`` is what is wrong with the usual one."""
+    """A folder that is removed at the end of the process.
+
+    Args:
+        reason: why the default folder cannot be used, for the warning.
+    """
     try:
         folder = Path(tempfile.mkdtemp(prefix="nnode-"))
     except OSError as error:
@@ -89,7 +94,7 @@ def _temporary_folder(reason: str) -> Path:
 
 
 def _remove(folder: Path, process: int) -> None:
-    if os.getpid() == process:  # and not a fork of it
+    if os.getpid() == process:  # a fork must not remove it
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -100,9 +105,11 @@ def _kept(folder: Path, name: str, text: bytes) -> ModuleType:
         if not (path.is_file() and path.read_bytes() == text):
             _write(path, text)
         module = _imported(name, path)
-    except (OSError, RuntimeError) as error:  # the latter where Numba may not write anywhere
-        found = error.strerror if isinstance(error, OSError) else error
-        raise ConfigError(f"cannot keep compiled code in {folder}: {found}; {_WAY_OUT}") from error
+    except (OSError, RuntimeError) as error:  # Numba raises RuntimeError if it cannot write
+        problem = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(
+            f"cannot keep compiled code in {folder}: {problem}; {_WAY_OUT}"
+        ) from error
     for function in vars(module).values():
         if isinstance(function, Dispatcher):
             inner = cast(Any, function)
@@ -112,30 +119,30 @@ def _kept(folder: Path, name: str, text: bytes) -> ModuleType:
 
 
 def _make(folder: Path) -> None:
-    """Make the folder for its owner alone, or make sure that it is the owner's alone.
+    """Create the folder with access for its owner only, or check the access to it.
 
     Raises:
-        ConfigError: others own it or may write to it.
-        OSError: it cannot be made.
+        ConfigError: another user owns it or may write to it.
+        OSError: it cannot be created.
     """
     compiled = folder / _COMPILED
     for place in (*reversed(folder.parents), folder, compiled):
         if not place.is_dir():
-            # where nothing may be written, files that are there can still be read
+            # existing files can be used even if the folder is read-only
             with suppress(*[OSError] if place == compiled else []):
                 place.mkdir(mode=0o700, exist_ok=True)
     if not hasattr(os, "getuid"):
         return
     for place in (folder.parent, folder, compiled):
         with suppress(FileNotFoundError):
-            found = place.stat()
-            writes = found.st_mode & _OTHERS_WRITE
+            status = place.stat()
+            writes = status.st_mode & _OTHERS_WRITE
             if place == folder.parent:
-                # Groups of one's own are common, and in a folder such as /tmp nobody can put
-                # something else in the place of what is another's.
-                writes = 0 if found.st_mode & stat.S_ISVTX else found.st_mode & stat.S_IWOTH
-            if writes or found.st_uid not in (0, os.getuid()):
-                what = "others may write to" if writes else f"user {found.st_uid} owns"
+                # Groups with one user are common. In a folder with the sticky bit, such as /tmp,
+                # users cannot replace each other's files.
+                writes = 0 if status.st_mode & stat.S_ISVTX else status.st_mode & stat.S_IWOTH
+            if writes or status.st_uid not in (0, os.getuid()):
+                what = "others may write to" if writes else f"user {status.st_uid} owns"
                 remove = "" if place == folder.parent else f"remove {place}, or "
                 raise ConfigError(
                     f"compiled code in {folder} is not trusted, because {what} {place}; {remove}"
@@ -144,7 +151,7 @@ def _make(folder: Path) -> None:
 
 
 def _write(path: Path, text: bytes) -> None:
-    """Write a file at once: another process may want the same one."""
+    """Write a file atomically, because another process may write the same file."""
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
         try:
             file.write(text)
@@ -167,12 +174,12 @@ def _imported(name: str, path: Path) -> ModuleType:
 
 
 class _Compiled(FunctionCache):
-    """Compiled code in files: damaged ones are made again, and a full disk ends no simulation."""
+    """Numba's cache that replaces damaged files, and tolerates a full disk."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
-        except Exception as error:  # a damaged file leads to almost any error
+        except Exception as error:  # damaged files cause many kinds of errors
             log.info(
                 "compiled code in %s cannot be read (%s) and is made again", self.cache_path, error
             )

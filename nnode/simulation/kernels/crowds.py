@@ -1,11 +1,11 @@
-"""People who meet each other, wall points and walls, in compiled code.
+"""Simulations of crowds in compiled code.
 
 The simulation of a crowd and its exact gradient are generated as source text. A step of Euler's
-method has two parts: sums over the others, over wall points and over walls, in which everybody
-meets everybody, or his neighbours; and accelerations of these sums. The gradients of both are made
-from the formulas. Whoever acts and whom he acts on stand in rows of arrays; interactions are
-computed in a buffer of rows of SIZE numbers whose distances are known when it is compiled: only so
-can the compiler tell that nothing that it writes is something that it still has to read.
+method has two parts: sums over other people, wall points and walls, for all pairs or for
+neighbours; and accelerations from these sums. The gradients of both parts are generated from the
+formulas. Receivers and sources of interactions are rows of arrays. Interactions are computed in a
+buffer of rows of SIZE numbers, whose distances are compile-time constants. The compiler can then
+prove that writes do not overlap later reads, and vectorises the loops.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -34,13 +34,20 @@ from nnode.model.expression import (
     symbols,
     topological,
 )
-from nnode.model.formula import own_values, values_of
 from nnode.model.laws import InteractionForce
 from nnode.model.names import check_symbols
 from nnode.model.operations import FUNCTIONS
 from nnode.model.system import Crowd, System
-from nnode.model.term import Term
-from nnode.model.terms import NOBODY, OTHERS, POINTS, SEEN, SMALLEST, WALLS, CrowdDynamics
+from nnode.model.terms import (
+    NOBODY,
+    OTHERS,
+    POINTS,
+    SEEN,
+    SMALLEST,
+    WALLS,
+    CrowdDynamics,
+    parameter_values,
+)
 from nnode.model.text import plain
 from nnode.simulation.kernels.loops import Loop
 from nnode.simulation.kernels.runs import (
@@ -53,20 +60,20 @@ from nnode.simulation.kernels.runs import (
     shared_out,
 )
 
-#: From so many people on, social forces use cell lists. They are faster for 50 already; smaller
-#: crowds, and so most recordings, are exact to rounding instead.
+#: Smallest number of people for which social forces use cell lists. The lists are faster from 50
+#: people on, but smaller crowds, and so most recordings, are computed exactly up to rounding.
 LISTS_FROM = 200
-#: Numbers in a row of the buffer; ten rows of float32 stay in the first-level cache.
+#: Numbers in a row of the buffer; ten rows of float32 fit the first-level cache.
 SIZE = 512
-#: Rows are filled up to a multiple of this, so that loops leave nothing over.
+#: Rows are padded to a multiple of this, so that loops have no remainder.
 CHUNK = 16
 _STATE = ("x", "y", "vx", "vy")
 _FIELDS = ("goal_x", "goal_y", "pace", "people", "points", "start")
-#: Places of what is seen of others in the rows of states, and in the tables of walls.
+#: Kind of neighbours to the relative quantities in sums, in the order of the neighbours' rows.
 _APART = ("dx", "dy", "dvx", "dvy")
 _RELATIVE = {OTHERS: _APART, POINTS: ("dx", "dy"), WALLS: ("dx", "dy"), SMALLEST: _APART}
 _COUNT = {POINTS: "points", WALLS: "walls"}
-#: Who meets whom, in a driver: everybody everything, or pairs.
+#: Arguments that define the interactions in a driver: without cell lists, and with them.
 _PARTNERS = {
     False: {
         OTHERS: "length, own_mask, y, own_mask, width, first, shifts",
@@ -79,11 +86,11 @@ _PARTNERS = {
         WALLS: "solid, every, every.shape[1]",
     },
 }
-#: Where the numbers of receivers and sources stand: behind each other, or somewhere.
+#: Indices of receivers and sources: contiguous without cell lists, or from lists of pairs.
 _AT = {False: ("at + j", "to + j"), True: ("at[j]", "to[j]")}
-#: Sign, array, row and place of a number.
+#: Sign, array, row and index of a number.
 _Part = tuple[str, str, int, str]
-#: What a difference is made of: the receiver's part and the source's, of which one may be missing.
+#: A difference to the receiver's quantity and the source's quantity, of which one may be missing.
 _PARTS = {
     OTHERS: {"dx": ("x", "x"), "dy": ("y", "y"), "dvx": ("vx", "vx"), "dvy": ("vy", "vy")},
     POINTS: {
@@ -99,11 +106,12 @@ _PARTS = {
 
 @dataclass(frozen=True)
 class CrowdSource:
-    """Source of a model.
+    """Source code of a model.
 
     Attributes:
         law: flat.
-        near: whether people meet their neighbours only; not with smallest values over others.
+        near: whether cell lists restrict interactions to neighbours, which excludes minima over
+            others.
     """
 
     kind: ClassVar[str] = "crowd"
@@ -117,33 +125,33 @@ class CrowdSource:
 
     @cached_property
     def _split(self) -> tuple[CrowdDynamics, dict[str, dict[str, tuple[Expr, Expr]]]]:
-        # pair by pair there is little to save
+        # features do not reduce the cost of lists of pairs
         return (self.law, {}) if self.near else split(self.law, self.uniform)
 
     @property
     def features(self) -> dict[str, dict[str, tuple[Expr, Expr]]]:
-        """Numbers of receivers and sources whose differences sums are made of, if they are."""
+        """Features of receivers and sources, for sums over functions of features."""
         return self._split[1]
 
     @cached_property
     def fields(self) -> list[str]:
-        """What people have besides their states, in the rows behind those."""
+        """People's properties, in the rows after their states."""
         names = [*_FIELDS, *self.law.inputs]
         return [n for n in names if {n, f"{n}_j"} & self.law.symbols]
 
     @cached_property
-    def own(self) -> list[str]:
+    def person_rows(self) -> list[str]:
         """All rows of a person."""
         return [*_STATE, *self.fields]
 
     @cached_property
     def over(self) -> dict[str, dict[str, Expr]]:
-        """What sums run over, and these."""
+        """Kind of neighbours to the sums over them."""
         return {over: sums for over, sums in self._split[0].sums.items() if sums}
 
     @cached_property
     def formulas(self) -> dict[str, dict[str, Expr]]:
-        """The same, and under ``own`` both components of the acceleration."""
+        """The sums, and under ``own`` both components of the acceleration."""
         x, y = self._split[0].rate
         return {**self.over, "own": {"O_x": x, "O_y": y}}
 
@@ -153,12 +161,12 @@ class CrowdSource:
 
     @property
     def rows_of_sums(self) -> list[str]:
-        """These, and who attains smallest values."""
+        """The sums, and the indices of the people who attain minima."""
         return [*self.sums, *(f"who_{name}" for name in self.over.get(SMALLEST, ()))]
 
     @cached_property
     def antisymmetric(self) -> bool:
-        """Whether forces obey Newton's third law, so that each pair is computed once."""
+        """Whether the force is antisymmetric (Newton's third law): each pair is computed once."""
         pair = list(self.over.get(OTHERS, {}).values())
         if not pair or OTHERS in self.features:
             return False
@@ -166,7 +174,7 @@ class CrowdSource:
 
     @cached_property
     def kept(self) -> list[str]:
-        """Sums on which the gradient depends by itself."""
+        """Sums that the gradient needs, and that are therefore stored."""
         needed: list[Expr] = []
         for over in {"own", SMALLEST} & {*self.formulas}:
             stored, ends = self.loop.adjoints(
@@ -181,7 +189,7 @@ class CrowdSource:
         return Loop(self.uniform, options="LOOP", fixed=tuple(self.law.settings))
 
     def _slopes(self, over: str) -> dict[str, str]:
-        """Rows of adjoints to what they are of."""
+        """Row of an adjoint to its quantity."""
         names = [*_RELATIVE.get(over, ()), *_STATE, *self.sums]
         used = set(symbols(self.formulas[over].values()))
         return {f"D_{name}": name for name in names if name in used}
@@ -189,12 +197,12 @@ class CrowdSource:
     @cached_property
     def rows(self) -> list[str]:
         """All rows of the buffer."""
-        seen = dict.fromkeys(name for over in self.over for name in SEEN[over])
+        relative = dict.fromkeys(name for over in self.over for name in SEEN[over])
         features = [z for numbers in self.features.values() for z in numbers]
-        state = [*self.own, *seen, *(f"{n}_j" for n in self.law.inputs), *features]
+        state = [*self.person_rows, *relative, *(f"{n}_j" for n in self.law.inputs), *features]
         outputs = [*self.sums, "O_x", "O_y"]
         weights = [f"W_{name}" for name in (*outputs, *features)]
-        slopes = [f"D_{name}" for name in (*_STATE, *seen, *self.sums)]
+        slopes = [f"D_{name}" for name in (*_STATE, *relative, *self.sums)]
         return [*state, *outputs, *weights, *slopes]
 
     # -- text ------------------------------------------------------------------------------------
@@ -203,7 +211,7 @@ class CrowdSource:
         """The module's source.
 
         Raises:
-            ConfigError: a name in the formulas that is no symbol.
+            ConfigError: a name in the formulas is not a valid symbol.
         """
         law = self.law
         check_symbols([*self.rows, *self.uniform, *law.symbols])
@@ -238,50 +246,52 @@ class CrowdSource:
         return text + fill("crowd", "simulate", **self._drivers(whom))
 
     def _functions(self, name: str, formulas: dict[str, Expr], slopes: dict[str, str]) -> str:
-        """Formulas of rows, and their gradients."""
+        """Functions that compute formulas for rows, and their gradients."""
         vjp = self.loop.vjp(f"{name}_vjp", seeds(formulas, _weight), slopes, [])
         return self.loop.function(name, formulas) + vjp
 
     def _taken(self, over: str, near: bool) -> dict[str, list[_Part]]:
-        """Rows of the buffer to what they are the sum of."""
-        relative, seen = _RELATIVE.get(over, ()), [*SEEN.get(over, ())]
+        """Row of the buffer to the numbers whose sum it is."""
+        relative, neighbour_rows = _RELATIVE.get(over, ()), [*SEEN.get(over, ())]
         at, to = _AT[near]
         taken: dict[str, list[_Part]] = {}
         for n in symbols(self.formulas[over].values()):
             if n in relative:
                 c = relative.index(n)
                 taken[n] = [("", "own", c, at), ("-", "other", c, to)]
-            elif n in seen:
-                taken[n] = [("", "other", seen.index(n), to)]
-            elif n in self.own:
-                taken[n] = [("", "own", self.own.index(n), at)]
-            elif n[:-2] in self.own and n.endswith("_j"):
-                taken[n] = [("", "other", self.own.index(n[:-2]), to)]
+            elif n in neighbour_rows:
+                taken[n] = [("", "other", neighbour_rows.index(n), to)]
+            elif n in self.person_rows:
+                taken[n] = [("", "own", self.person_rows.index(n), at)]
+            elif n[:-2] in self.person_rows and n.endswith("_j"):
+                taken[n] = [("", "other", self.person_rows.index(n[:-2]), to)]
             elif n in self.sums and over in (SMALLEST, "own"):
                 taken[n] = [("", "sums", self.sums.index(n), at)]
         return taken
 
     def _scattered(self, over: str, near: bool, *arrays: str) -> list[str]:
-        """Adjoints out of the buffer to those of what was taken from some arrays."""
+        """Lines that add adjoints in the buffer to the adjoints of the source arrays."""
         taken = self._taken(over, near)
         return _scatter({n: taken[n] for n in self._slopes(over).values()}, *arrays)
 
     def _pairs(self, over: str, whom: str) -> str:
-        """Some pairs: what they add to sums, and their adjoints; and all of them."""
+        """Functions for the sums over pairs and their gradients, for a block and for all pairs."""
         at, to = _AT[self.near]
         antisymmetric = self.antisymmetric and over == OTHERS
-        mine, its = ("", "") if self.near else (f"other_mask[{to}] * ", f"own_mask[{at}] * ")
+        other_weight, own_weight = (
+            ("", "") if self.near else (f"other_mask[{to}] * ", f"own_mask[{at}] * ")
+        )
         add, weights = [], {}
         for n, summand in self.over[over].items():
             c = self.sums.index(n)
-            add.append(_increase("sums", c, at, f"+ {mine}buffer[_{n} + j]"))
-            weight = f"{mine}weight[{c}, {at}]"
+            add.append(_increase("sums", c, at, f"+ {other_weight}buffer[_{n} + j]"))
+            weight = f"{other_weight}weight[{c}, {at}]"
             if antisymmetric:
-                add.append(_increase("reaction", c, to, f"- {its}buffer[_{n} + j]"))
-                weight += f" - {its}weight[{c}, {to}]"
+                add.append(_increase("reaction", c, to, f"- {own_weight}buffer[_{n} + j]"))
+                weight += f" - {own_weight}weight[{c}, {to}]"
             if not summand.is_number():
                 weights[n] = weight
-        moving = ["other"] if over == OTHERS else []  # walls do not move
+        moving = ["other"] if over == OTHERS else []  # walls are constants
         text = fill(
             "crowd",
             "pairs",
@@ -291,14 +301,14 @@ class CrowdSource:
             weights=_weighted(weights),
             scatter=self._scattered(over, self.near, "own", *moving),
         )
-        for end, rest in (("", "sums, reaction"), ("_vjp", "weight, to_own, to_other")):
+        for end, arrays in (("", "sums, reaction"), ("_vjp", "weight, to_own, to_other")):
             text += fill(
-                "crowd", f"meet {whom}", name=over + end, rest=rest, antisymmetric=antisymmetric
+                "crowd", f"meet {whom}", name=over + end, rest=arrays, antisymmetric=antisymmetric
             )
         return text
 
     def _smallest(self) -> str:
-        """Smallest values over the others, and their gradients."""
+        """Functions for minima over the others, and their gradients."""
         names, first, who = [*self.over[SMALLEST]], self.sums.index, len(self.sums)
         return fill(
             "crowd",
@@ -324,16 +334,16 @@ class CrowdSource:
         )
 
     def _neurons(self, over: str) -> str:
-        """Features of receivers and of sources, sums of functions of their differences, and the
-        gradients."""
+        """Functions for features of receivers and sources, for sums of functions of their
+        differences, and for the gradients."""
         text, features = "", self.features[over]
         for side, whose in enumerate(("own", "other")):
             formulas = {z: feature[side] for z, feature in features.items()}
-            moves = over == OTHERS or whose == "own"  # walls do not move
+            moves = over == OTHERS or whose == "own"  # walls are constants
             columns = _STATE if moves else ("x", "y", "normal_x", "normal_y")
             used = set(symbols(formulas.values()))
             taken: dict[str, list[_Part]] = {
-                # from somebody's place on, for large numbers cost digits
+                # relative to a person's position, because large numbers lose digits
                 n: [("", "own", c, "at + j"), *([("-", "y", c, "0")] if c < 2 else [])]
                 for c, n in enumerate(columns)
                 if n in used
@@ -363,7 +373,7 @@ class CrowdSource:
         )
 
     def _rates(self) -> str:
-        """Accelerations of sums, and their gradient."""
+        """Functions for accelerations from sums, and their gradient."""
         return fill(
             "crowd",
             "rates",
@@ -374,7 +384,7 @@ class CrowdSource:
         )
 
     def _drivers(self, whom: str) -> dict[str, Any]:
-        """The pieces of the time loops."""
+        """Values of the template of the time loops."""
         near, number, second = self.near, len(self.rows_of_sums), self.law.order == 2
         barriers, meet, back = [], [], []
         for over in self.over:
@@ -418,7 +428,7 @@ class CrowdSource:
             call = "buffer, y, length, own_mask, width, q, time, dt, total, sums"
             meet.append(f"least({call})")
             back.insert(0, f"least_vjp({call}, to_sums, to_own, to_other)")
-        inner = {"width": len(self.own), "antisymmetric": self.antisymmetric}
+        inner = {"width": len(self.person_rows), "antisymmetric": self.antisymmetric}
         return {
             "scene": fill("crowd", f"scene {whom}", **inner).splitlines(),
             "arrange": fill("crowd", f"arrange {whom}", **inner).splitlines(),
@@ -446,13 +456,13 @@ def _increase(array: str, row: int, at: str, value: str) -> str:
 
 
 def _each(body: Iterable[str], numbers: str = "np.uint64(n)") -> list[str]:
-    """A loop over pairs for every line: several rows in one loop are too many for the compiler to
-    see that they do not overlap."""
+    """One loop over pairs per line. In a loop over several rows, the compiler cannot prove that
+    they do not overlap."""
     return [line for row in body for line in (f"for j in range({numbers}):", f"    {row}")]
 
 
 def _gather(taken: Mapping[str, Sequence[_Part]]) -> list[str]:
-    """Into the buffer."""
+    """Lines that fill rows of the buffer."""
     sums = {
         row: " ".join(f"{sign} {array}[{c}, {at}]" for sign, array, c, at in parts)
         for row, parts in taken.items()
@@ -461,7 +471,7 @@ def _gather(taken: Mapping[str, Sequence[_Part]]) -> list[str]:
 
 
 def _scatter(taken: Mapping[str, Sequence[_Part]], *arrays: str) -> list[str]:
-    """Adjoints out of the buffer to those of what was taken from some arrays."""
+    """Lines that add adjoints in the buffer to the adjoints of the source arrays."""
     return _each(
         _increase(f"to_{array}", c, at, f"{sign or '+'} buffer[_D_{row} + j]")
         for array in arrays
@@ -472,14 +482,14 @@ def _scatter(taken: Mapping[str, Sequence[_Part]], *arrays: str) -> list[str]:
 
 
 def _weighted(weights: Mapping[str, str]) -> list[str]:
-    """Weights into the buffer, and zeros behind them: of what does not exist."""
+    """Lines that fill rows of weights, with zeros for padding."""
     body = [f"buffer[_W_{row} + j] = {weight}" for row, weight in weights.items()]
     ends = [f"buffer[_W_{row} + j] = 0" for row in weights]
     return _each(body) + _each(ends, "np.uint64(n), np.uint64(padded(n))")
 
 
 def _opposite(pair: list[Expr], swapped: list[Expr]) -> bool:
-    """Whether formulas are each other's opposite, tried at eight places."""
+    """Whether formulas are each other's negative, tested numerically for eight random inputs."""
     generator = torch.Generator().manual_seed(0)
     values = {
         node.value: 0.5 * torch.randn(8, generator=generator, dtype=torch.float64)
@@ -500,25 +510,25 @@ def _opposite(pair: list[Expr], swapped: list[Expr]) -> bool:
 
 
 def supports(system: System, batch: Batch | None = None) -> CrowdDynamics | None:
-    """The formula of a model that is simulated in compiled code; None: it is not."""
+    """The formula of a model that compiled code covers; None for other models."""
     if type(system) is not Crowd or system.neighbours != "simulated":
         return None
     tensors: list[Tensor] = list(system.parameters())
     if batch is not None:
         tensors.append(batch.x)
         if batch.destination.requires_grad or batch.walls.requires_grad:
-            return None  # both are constants here
+            return None  # compiled code has no gradient by these
     law = system.formula
     if any(t.device.type != "cpu" for t in tensors) or law is None or without_partners(system):
-        return None  # where nobody meets anybody PyTorch is cheap
+        return None  # PyTorch is cheap without interactions
     force = system.find(InteractionForce)
-    # only the sums of the force are over oneself as well
+    # self-interaction must not apply to sums other than those of the force
     alone = len(law.sums[OTHERS]) == 2 or force is None or not force.self_interaction
     return law if alone else None
 
 
 def without_partners(system: System) -> bool:
-    """Whether nobody meets anybody in this model, so that a cutoff changes nothing."""
+    """Whether a crowd model has no interactions between people, so that a cutoff has no effect."""
     law = system.formula if isinstance(system, Crowd) else None
     return law is not None and not (law.sums[OTHERS] or law.sums[SMALLEST])
 
@@ -535,32 +545,30 @@ def simulate(
     """Simulate a crowd model with the formula ``law`` (see :func:`supports`), by Euler's method.
 
     The gradient with respect to the parameters and the initial state is that of the discrete
-    scheme. Simulations of fewer than LISTS_FROM people, and all models without a cutoff in which
-    more than a social force acts between people, let everybody meet everybody. Others use cell
-    lists: social forces that are smaller than ``cutoff_error`` times A are left out. See
-    :func:`nnode.simulation.kernels.crowds.cutoff_distance` for the bound of the sum.
+    scheme. Without a cutoff, all pairs are computed for fewer than LISTS_FROM people, and for
+    models in which other terms than a social force act between people. Other models use cell
+    lists, which omit social forces below ``cutoff_error`` times A. See
+    :func:`nnode.simulation.kernels.crowds.cutoff_distance` for the bound of their sum.
 
     Args:
         substeps: Euler steps in a sampling interval.
-        threads: at most so many threads compute blocks of simulations.
-        cutoff: m; pairs, and people and wall points, that are farther apart do not interact,
-            whatever the number of people. Where nothing makes a force decay, as that of a
-            network, this changes the model.
-        cutoff_error: largest force of one partner that is left out, in units of A; 0 lets
-            everybody meet everybody.
+        threads: largest number of threads for blocks of simulations.
+        cutoff: distance (m) beyond which people do not interact with each other and with wall
+            points. This changes the model if forces do not decay, as those of a network.
+        cutoff_error: largest omitted force of one partner, in units of A; 0 computes all pairs.
 
     Returns:
-        ``(K, B, N, M)`` states at the samples, m and m/s; positions alone of a law of first order.
-        Padding people stand still.
+        ``(K, B, N, M)`` states at the samples, m and m/s; only positions for a law of first order.
+        Padding people do not move.
 
     Raises:
-        ConfigError: a cutoff that is not positive or leaves out contacts, or of a law with
-            smallest values over others, or an error outside [0, 1).
+        ConfigError: a cutoff that is not positive or omits contacts, a cutoff for a law with
+            minima over others, or an error outside [0, 1).
     """
-    terms, scene = cast(list[Term], list(system.terms)), system.scene(batch)
+    terms, scene = system.term_list, system.scene(batch)
     y0 = system.initial(batch)
     if law.order == 1:
-        y0 = torch.cat([y0, torch.zeros_like(y0)], -1)  # rows of velocities stay empty
+        y0 = torch.cat([y0, torch.zeros_like(y0)], -1)  # the rows of velocities are unused
     kind = y0.dtype
     walls, wall_exists = walls_of(scene)
     counts = [_last(mask) for mask in (scene.agent, scene.wall_point, wall_exists)]
@@ -569,7 +577,7 @@ def simulate(
     source = CrowdSource(law, bool(distances))
     if WALLS not in source.over:
         counts[2] = 0 * counts[2]
-    # blocks of rows of about SIZE numbers, and work for every thread
+    # blocks with rows of about SIZE numbers, and at least one block per thread
     width = min(max(1, SIZE // max(people, 1)), -(-len(y0) // threads))
     width = 1 if distances else width // CHUNK * CHUNK if width > CHUNK else width
     order = np.argsort(-counts[0], kind="stable")
@@ -586,8 +594,7 @@ def simulate(
     force = system.find(InteractionForce)
     alone = force is None or not force.self_interaction
     inputs = people_of(terms, law, scene)
-    inputs |= dict(zip(("goal_x", "goal_y"), scene.destination.unbind(-1), strict=True))
-    # the last one, which is not taken, gives their shape where there are none
+    # the last row is dropped; it gives the shape if there are no fields
     fields = [inputs[name].to(kind).expand(scene.agent.shape) for name in source.fields]
     present = scene.agent.to(kind)
     plan = Plan(
@@ -602,7 +609,7 @@ def simulate(
             _table(scene.wall, scene.wall_normal, scene.wall_point, kind),
             _table(walls[..., :2], walls[..., 2:], wall_exists, kind),
             substeps * (batch.valid.any(-1).sum(0).numpy() - 1),
-            1 if alone else 0,  # 0 lets people meet themselves as well
+            1 if alone else 0,  # 0 includes interactions of people with themselves
             *(_scalar(y0, d) for d in distances or (0.0, 0.0)),
         ),
         stored=stored,
@@ -611,13 +618,13 @@ def simulate(
         padding=~scene.agent.numpy(),
     )
     fixed = [y0.new_tensor(value) for value in settings_of(terms, law).values()]
-    q = torch.stack([*values_of(law, own_values(terms, law)), *fixed]).to(kind)
+    q = torch.stack([*parameter_values(terms, law).values(), *fixed]).to(kind)
     y: Tensor = Simulate.apply(plan, y0.permute(2, 0, 1), q[None]).permute(1, 2, 3, 0).contiguous()
     return y[..., : 2 * law.order]
 
 
-def _table(place: Tensor, more: Tensor, exists: Tensor, kind: torch.dtype) -> np.ndarray:
-    table = torch.cat([place, more, exists.to(place.dtype)[..., None]], -1)
+def _table(place: Tensor, columns: Tensor, exists: Tensor, kind: torch.dtype) -> np.ndarray:
+    table = torch.cat([place, columns, exists.to(place.dtype)[..., None]], -1)
     return np.ascontiguousarray(table.to(kind).numpy())
 
 
@@ -626,7 +633,7 @@ def _scalar(like: Tensor, value: float) -> Any:
 
 
 def _last(mask: Tensor) -> np.ndarray:
-    """``(B,)`` one more than the index of the last True in every row."""
+    """``(B,)``: one more than the index of the last True in every row."""
     index = torch.arange(1, mask.shape[1] + 1)
     return np.asarray((index * mask).amax(1).numpy()) if mask.shape[1] else np.zeros(len(mask), int)
 
@@ -634,7 +641,7 @@ def _last(mask: Tensor) -> np.ndarray:
 def _distances(
     system: System, law: CrowdDynamics, cutoff: float | None, cutoff_error: float, people: int
 ) -> tuple[float, ...]:
-    """Cutoffs of pairs and of wall points, m; none where everybody meets everybody."""
+    """Cutoffs for pairs and for wall points, m; empty if all pairs are computed."""
     social: Any = system.find_law("social_force")
     check_cutoff(cutoff, cutoff_error, 2 * social.r if social else 0.0)
     if cutoff is not None:
@@ -644,7 +651,7 @@ def _distances(
                 "whoever attains one may stand farther away; set it to null"
             )
         return cutoff, cutoff
-    # nobody knows how far other sums reach
+    # the range of other sums is unknown
     others = len(law.sums[OTHERS]) > 2 or bool(law.sums[SMALLEST])
     if social is None or others or cutoff_error == 0 or people < LISTS_FROM:
         return ()
@@ -654,12 +661,12 @@ def _distances(
 
 
 def check_cutoff(cutoff: float | None, cutoff_error: float, touching: float = 0.0) -> None:
-    """Refuse what cannot be a cutoff.
+    """Check a cutoff.
 
     Args:
         cutoff: m, or None.
-        cutoff_error: largest force left out of one partner, in units of A.
-        touching: distance of people who touch, m; a cutoff must not leave out contacts.
+        cutoff_error: largest omitted force of one partner, in units of A.
+        touching: distance of people who touch, m; a cutoff must not omit contacts.
 
     Raises:
         ConfigError: ``cutoff`` is not a number larger than ``touching``, or ``cutoff_error``
@@ -678,26 +685,26 @@ def check_cutoff(cutoff: float | None, cutoff_error: float, touching: float = 0.
 
 
 def cutoff_distance(reach: float, decay: float, cutoff_error: float) -> float:
-    """Distance (m) beyond which a social force is left out.
+    """Distance (m) beyond which a social force is omitted.
 
-    The force of one partner at distance d is A exp((reach - d) / B) in the far field; contact
-    and friction end at d = reach. Beyond
+    The force of one partner at distance d is A exp((reach - d) / B) in the far field. Contact
+    forces and friction end at d = reach. Beyond
 
         reach + B log(1 / cutoff_error)
 
     one partner's force is below ``cutoff_error`` A, so with N people
 
-    * the sum of all that is left out on one person is below N ``cutoff_error`` A: 1e-6 of the
+    * the sum of the omitted forces on one person is below N ``cutoff_error`` A: 1e-6 of the
       force A of a single touching partner for 10,000 people and the default of 1e-10;
-    * the acceleration, a mean over the N people, is off by less than ``cutoff_error`` A / m.
+    * the error of the acceleration, a mean over the N people, is below ``cutoff_error`` A / m.
 
-    Both hold for every arrangement of people. At one person per square metre, those just beyond
+    Both bounds hold for every arrangement of people. At one person per square metre, people beyond
     the cutoff c contribute about 2 pi c B ``cutoff_error`` A, for any N.
 
     Args:
         reach: distance at which bodies touch, m.
         decay: B, m.
-        cutoff_error: largest force left out of one partner, in units of A.
+        cutoff_error: largest omitted force of one partner, in units of A.
 
     Raises:
         ConfigError: ``cutoff_error`` is not between 0 and 1.
@@ -715,27 +722,33 @@ def cutoff_distance(reach: float, decay: float, cutoff_error: float) -> float:
 def split(
     law: CrowdDynamics, uniform: Sequence[str]
 ) -> tuple[CrowdDynamics, dict[str, dict[str, tuple[Expr, Expr]]]]:
-    """A law whose sums are over functions of features, and these features by their symbols; those
-    sums for which this is not possible stay what they are.
+    """Rewrite sums over pairs as sums over functions of features, as for a network's neurons.
+
+    A feature is the difference of a number of the receiver and a number of the source, which are
+    computed once per person instead of once per pair.
 
     Args:
-        uniform: symbols that are the same for all.
-    """
-    known = {*uniform, "t"}
+        uniform: symbols with one value for all people.
 
-    def same(node: Expr) -> bool:
-        return known.issuperset(symbols([node]))
+    Returns:
+        The law with rewritten sums, where this is possible; and kind of neighbours to the symbols
+        of features and their (receiver's, source's) formulas.
+    """
+    uniform_symbols = {*uniform, "t"}
+
+    def is_uniform(node: Expr) -> bool:
+        return uniform_symbols.issuperset(symbols([node]))
 
     features: dict[str, dict[str, tuple[Expr, Expr]]] = {}
     if law.sums[SMALLEST]:
-        return law, features  # they may name the sums
+        return law, features  # minima may contain the sums
     for over, parts in _PARTS.items():
-        found = law.sums[over]
-        outer = {name: _weights(summand, same) for name, summand in found.items()}
+        summands = law.sums[over]
+        outer = {name: _weights(summand, is_uniform) for name, summand in summands.items()}
         inner = list(dict.fromkeys(g for _, weights in outer.values() for g in weights))
         if not inner or FUNCTIONS.get(inner[0].op) != 1 or len({g.op for g in inner}) > 1:
             continue
-        numbers = [_weights(g.args[0], same) for g in inner]
+        numbers = [_weights(g.args[0], is_uniform) for g in inner]
         if not all(s.op == "symbol" and s.value in parts for _, w in numbers for s in w):
             continue
         features[over], sums = {}, {f"{over}_one": const(1)}
@@ -755,34 +768,38 @@ def split(
 def _feature(
     parts: Mapping[str, tuple[str, str]], start: Expr, weights: Mapping[Expr, Expr]
 ) -> tuple[Expr, Expr]:
-    """The share of a feature that a person has of himself, and that which he has of the other."""
-    own, other = start, const(0)
+    """The receiver's and the source's part of a feature."""
+    receiver, source = start, const(0)
     for part, weight in weights.items():
-        mine, its = parts[part.value]
-        own = own + weight * symbol(mine) if mine else own
-        if its:
-            other = other + weight * symbol(its) if mine else other - weight * symbol(its)
-    return own, other
+        receiver_symbol, source_symbol = parts[part.value]
+        receiver = receiver + weight * symbol(receiver_symbol) if receiver_symbol else receiver
+        if source_symbol:
+            source = (
+                source + weight * symbol(source_symbol)
+                if receiver_symbol
+                else source - weight * symbol(source_symbol)
+            )
+    return receiver, source
 
 
-def _weights(node: Expr, same: Callable[[Expr], bool]) -> tuple[Expr, dict[Expr, Expr]]:
-    """A node as a number and a sum of other nodes with weights, which are the same for all."""
-    if same(node):
+def _weights(node: Expr, is_uniform: Callable[[Expr], bool]) -> tuple[Expr, dict[Expr, Expr]]:
+    """A node as a uniform constant and a weighted sum of other nodes, with uniform weights."""
+    if is_uniform(node):
         return node, {}
     if node.op in ("add", "sub"):
-        start, found = _weights(node.args[0], same)
-        more, others = _weights(node.args[1], same)
+        start, weights = _weights(node.args[0], is_uniform)
+        second_start, others = _weights(node.args[1], is_uniform)
         sign = 1.0 if node.op == "add" else -1.0
         for part, weight in others.items():
             weight = sign * weight
-            found[part] = found[part] + weight if part in found else weight
-        return start + sign * more, found
+            weights[part] = weights[part] + weight if part in weights else weight
+        return start + sign * second_start, weights
     if node.op == "neg":
-        start, found = _weights(node.args[0], same)
-        return -start, {part: -weight for part, weight in found.items()}
+        start, weights = _weights(node.args[0], is_uniform)
+        return -start, {part: -weight for part, weight in weights.items()}
     if node.op == "mul":
         for factor, other in (node.args, node.args[::-1]):
-            if same(factor):
-                start, found = _weights(other, same)
-                return factor * start, {part: factor * weight for part, weight in found.items()}
+            if is_uniform(factor):
+                start, weights = _weights(other, is_uniform)
+                return factor * start, {part: factor * weight for part, weight in weights.items()}
     return const(0), {node: const(1)}

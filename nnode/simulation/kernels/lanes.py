@@ -1,17 +1,17 @@
-"""Vehicles behind each other, in compiled code.
+"""Simulations of lanes in compiled code.
 
 The simulation of a lane and its exact gradient are generated as source text. A block of ``width``
-simulations is one row of numbers: vehicle i of simulation b stands at ``i * w + b``, w >= width.
-What stands ahead of everything is then the row itself, w further on, and every loop runs over
-neighbouring numbers. Numba cannot promise the compiler that two arrays do not overlap: all rows of
-a block therefore lie in one buffer, at distances that are numbers when it is compiled.
+simulations is one row of numbers: vehicle i of simulation b has the index ``i * w + b``, with
+w >= width. The values of the vehicles ahead are the same row shifted by w, so that every loop runs
+over contiguous numbers. With separate arrays, the compiler could not exclude that they overlap.
+Therefore all rows of a block are in one buffer, at distances that are compile-time constants.
 
 An increment of a state is
 
-    I = move * (the formula where somebody is ahead, the leader's speed elsewhere),
+    I = move * (the formula for followers, the leader's speed for leaders),
 
-and every step of every method adds increments; the gradient is made from this formula. Where a
-formula names the speed of the vehicle ahead, vehicles are computed one behind the other.
+and every step of every method adds increments. The gradient is generated from this formula. If a
+formula contains the speed of the vehicle ahead, vehicles are computed one after the other.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, cast
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -33,7 +33,6 @@ from nnode.model.names import check_symbols
 from nnode.model.steps import STAGES, stepped
 from nnode.model.system import System, Traffic, initial_with
 from nnode.model.tangent import with_tangents
-from nnode.model.term import Term
 from nnode.model.terms import LaneDynamics
 from nnode.model.text import plain
 from nnode.simulation.kernels.loops import Loop
@@ -52,28 +51,28 @@ TABLEAUS = {
     "euler": ((1.0,), (0.0,)),
     "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0)),
 }
-#: Rows are computed in multiples of this: four of the widest vectors of float32.
+#: Rows are computed in multiples of this, four of the widest vectors of float32.
 CHUNK = 64
-#: Bytes of one row: a handful of rows are to stay in the first-level cache.
+#: Bytes of one row, so that a few rows fit the first-level cache.
 _ROW_BYTES = 4800
-#: Rows of vehicles that are computed one behind the other are a multiple of this.
+#: Rows of vehicles that are computed one after the other have a multiple of this length.
 _PITCH = 16
-#: Gaps of one run from which it fills the registers by itself.
+#: Number of gaps from which one run uses vector instructions efficiently.
 _ENOUGH = 512
-#: Numbers of a row that no vehicle needs, behind the last one.
+#: Padding at the end of a row.
 _BEHIND = 2 * CHUNK
-#: Distances of rows; not powers of two: rows would compete for the same lines of the cache.
+#: Distances of rows. With powers of two, rows would compete for the same lines of the cache.
 _STRIDES = (1424, 5200, 20800, 83200)
 
 
 @dataclass(frozen=True)
 class LaneSource:
-    """Source of a model.
+    """Source code of a model.
 
     Attributes:
-        lane: flat, its rates those of a step.
+        lane: flat, with the rates of a step.
         stages: ``euler`` or ``rk4``.
-        own: whether every simulation has parameters of its own.
+        per_simulation: whether every simulation has separate parameters.
         stride: numbers between two rows.
         forward_only: without the gradient.
     """
@@ -81,7 +80,7 @@ class LaneSource:
     kind: ClassVar[str] = "lane"
     lane: LaneDynamics
     stages: str = "euler"
-    own: bool = False
+    per_simulation: bool = False
     stride: int = 1424
     forward_only: bool = False
 
@@ -94,8 +93,8 @@ class LaneSource:
         return list(self.lane.owned)
 
     @property
-    def _own(self) -> list[str]:
-        return self.parameters if self.own else []
+    def _simulation_parameters(self) -> list[str]:
+        return self.parameters if self.per_simulation else []
 
     @cached_property
     def recursive(self) -> bool:
@@ -103,7 +102,7 @@ class LaneSource:
 
     @cached_property
     def fields(self) -> list[str]:
-        """What vehicles have from the data."""
+        """Vehicles' properties from the data."""
         return [
             name for name in [*self.lane.inputs, "start", "length_1"] if name in self.lane.symbols
         ]
@@ -121,11 +120,11 @@ class LaneSource:
 
     @cached_property
     def loop(self) -> Loop:
-        return Loop([] if self.own else self.parameters)
+        return Loop([] if self.per_simulation else self.parameters)
 
     @cached_property
     def follower(self) -> dict[str, Expr]:
-        """Row to formula of everybody but the first row."""
+        """Row to formula for all vehicles except the first row."""
         behind, move = symbol("behind"), symbol("move")
         speed, rows = self._leader(), {}
         for s, rate in self.lane.rates.items():
@@ -137,27 +136,27 @@ class LaneSource:
 
     @cached_property
     def first(self) -> dict[str, Expr]:
-        """Row to formula of the first row, where nobody is behind anybody."""
+        """Row to formula for the first row, which has no followers."""
         speed, move = self._leader(), symbol("first_move")
         rows = {f"I_{s}": const(0) for s in self.states}
         rows["I_x"] = move * speed
-        rows |= {f"I_{s}": move * self._lead(s) for s in self.lane.leads}
+        rows |= {f"I_{s}": move * self._lead(s) for s in self.lane.leader_rates}
         return rows | {f"R_{s}": speed if s == "x" else self._lead(s) for s in self.lane.chained}
 
     def _lead(self, state: str) -> Expr:
-        """Rate of a leader's state other than its place."""
-        rate = self.lane.leads.get(state, const(0))
+        """Rate of a leader's state other than its position."""
+        rate = self.lane.leader_rates.get(state, const(0))
         return apply("choose", symbol("drives"), rate, const(0)) if self.recursive else rate
 
     def _leader(self) -> Expr:
-        """Speed of a leader; where its places are given it does not move by it."""
+        """Speed of a leader, which does not move a leader with measured positions."""
         if not self.recursive:
             return self.lane.leader
         return apply("choose", symbol("drives"), self.lane.leader, symbol("measured"))
 
     @cached_property
     def rows(self) -> list[str]:
-        """All rows, states first, then what is one after the other for every state."""
+        """All rows: states first, then groups with one row for every state."""
         every = list(self.states)
         back = () if self.forward_only else ("A", *(f"Y{i}" for i in range(4)))
         for group in ("I", "E", "B", "S", *back):
@@ -168,13 +167,17 @@ class LaneSource:
         every += self.fields
         if not self.forward_only:
             every += ["RBAR", *(f"D_{i}" for i in self.inputs if i not in self.states)]
-        return [*every, *self._own, *(f"G_{p}" for p in self._own)]
+        return [
+            *every,
+            *self._simulation_parameters,
+            *(f"G_{p}" for p in self._simulation_parameters),
+        ]
 
     def text(self) -> str:
         """The module's source.
 
         Raises:
-            ConfigError: a name in the formulas that is no symbol.
+            ConfigError: a name in the formulas is not a valid symbol.
         """
         check_symbols([*self.rows, *self.parameters, *self.lane.symbols])
         weights, times = TABLEAUS[self.stages]
@@ -194,8 +197,14 @@ class LaneSource:
             [line.format(row, i) for i, row in enumerate(rows)]
             for line, rows in (
                 ("load(buffer[_{}:], fields[{}], low, width, w)", self.fields),
-                ("spread(buffer[_{}:], every_q[:, {}], low, width, w, agents)", self._own),
-                ("    collect(buffer[_G_{}:], grad_q[:, {}], low, width, w, agents)", self._own),
+                (
+                    "spread(buffer[_{}:], every_q[:, {}], low, width, w, agents)",
+                    self._simulation_parameters,
+                ),
+                (
+                    "    collect(buffer[_G_{}:], grad_q[:, {}], low, width, w, agents)",
+                    self._simulation_parameters,
+                ),
             )
         )
         text += fill("lane", "rows") + self._gather() + self._rates()
@@ -216,21 +225,21 @@ class LaneSource:
         )
 
     def _gather(self) -> str:
-        """What stands ahead of everybody; something harmless where there is nobody."""
+        """The function that gathers values of the vehicles ahead; finite values without one."""
         body = [f"zero, safe = real(0, buffer[0]), real({SAFE!r}, buffer[0])"]
         for s, j in self.lane.ahead:
-            own, mask = (s, "behind") if j == 1 else (f"{s}_1", "second")
+            base, mask = (s, "behind") if j == 1 else (f"{s}_1", "second")
             body += [
                 f"source = buffer[_{s} + np.uint64(lo + {j} * w):]",
                 f"target = buffer[_{s}_{j} + np.uint64(lo):]",
             ]
             if s in self.lane.linear:
-                # nothing is chosen by them, and what they are where nobody is goes nowhere
+                # conditions do not depend on tangents, so unused values do no harm
                 body.append("copy(target, source, n)")
                 continue
             away = "own[k] + safe" if s == "x" else "own[k]"
             body += [
-                f"own, mask = buffer[_{own} + np.uint64(lo):], buffer[_{mask} + np.uint64(lo):]",
+                f"own, mask = buffer[_{base} + np.uint64(lo):], buffer[_{mask} + np.uint64(lo):]",
                 "for k in range(n):",
                 f"    target[k] = source[k] if mask[k] > zero else {away}",
             ]
@@ -242,12 +251,12 @@ class LaneSource:
 
     def _rates(self) -> str:
         text = self.loop.function("follow", self.follower) + self.loop.function("first", self.first)
-        rest = "q, t, dt, drives, total)"
-        last = f"first(buffer, (agents - 1) * w, {{}}, {rest}"
+        arguments = "q, t, dt, drives, total)"
+        last = f"first(buffer, (agents - 1) * w, {{}}, {arguments}"
         body = [
             "n = padded((agents - 1) * w)",
             "gather(buffer, 0, n, w)",
-            f"follow(buffer, 0, n, {rest}",
+            f"follow(buffer, 0, n, {arguments}",
             last.format("padded(w)"),
         ]
         if self.recursive:
@@ -255,16 +264,16 @@ class LaneSource:
                 last.format("w"),
                 "for i in range(agents - 2, -1, -1):",
                 "    gather(buffer, i * w, w, w)",
-                f"    follow(buffer, i * w, w, {rest}",
+                f"    follow(buffer, i * w, w, {arguments}",
             ]
         return text + _function("rates(buffer, q, t, dt, drives, w, agents, total)", *body)
 
     def _vjp(self) -> str:
-        """From adjoints A of increments to D, the adjoints of what they depend on."""
-        # a state's own adjoint is read once, and can be replaced at once
+        """The functions from adjoints A of increments to D, the adjoints of their inputs."""
+        # a state's adjoint is read once, so its row can be overwritten
         rows = {f"A_{s}": s for s in self.states}
         rows |= {f"D_{i}": i for i in self.inputs if i not in self.states}
-        grads = {f"G_{p}": p for p in self._own}
+        grads = {f"G_{p}": p for p in self._simulation_parameters}
         kept = [f"A_{s}" for s in self.states] if self.stages != "rk4" else []
 
         def weight(row: str) -> str:
@@ -273,42 +282,44 @@ class LaneSource:
         text = self.loop.vjp(
             "follow_vjp", seeds(self.follower, weight), {**rows, **grads}, [*kept, *grads]
         )
-        # of the first row only a leader's own speed can matter
-        mine = [f"A_{s}" for s in self.states if not kept or s in symbols(self.first.values())]
+        # the first row depends only on a leader's speed
+        first_rows = [
+            f"A_{s}" for s in self.states if not kept or s in symbols(self.first.values())
+        ]
         text += self.loop.vjp(
             "first_vjp",
             seeds(self.first, weight),
-            {**{row: row[2:] for row in mine}, **grads},
-            [*(row for row in mine if row in kept), *grads],
+            {**{row: row[2:] for row in first_rows}, **grads},
+            [*(row for row in first_rows if row in kept), *grads],
         )
-        rest = "q, t, dt, drives, total)"
+        arguments = "q, t, dt, drives, total)"
         if self.recursive:
             body = [
                 "rates(buffer, q, t, dt, drives, w, agents, total)",
                 "buffer[_RBAR:_RBAR + S] = 0",
                 "for i in range(agents - 1):",
-                f"    follow_vjp(buffer, i * w, w, {rest}",
+                f"    follow_vjp(buffer, i * w, w, {arguments}",
                 "    copy(buffer[_RBAR + np.uint64((i + 1) * w):], "
                 "buffer[_D_dx_1 + np.uint64(i * w):], w)",
-                f"first_vjp(buffer, (agents - 1) * w, w, {rest}",
+                f"first_vjp(buffer, (agents - 1) * w, w, {arguments}",
             ]
         else:
-            # followers' rows are computed in whole chunks, which reach into the first row: where
-            # adjoints are replaced, and not added to, those of the first row wait in rows I
+            # followers' rows are computed in whole chunks, which reach into the first row; if they
+            # overwrite adjoints, rows I store those of the first row in the meantime
             move = "copy(buffer[_{} + at:], buffer[_{} + at:], w)"
-            waiting = [(row, f"I_{row[2:]}") for row in mine if row not in kept]
+            waiting = [(row, f"I_{row[2:]}") for row in first_rows if row not in kept]
             body = [
                 "n, at = padded((agents - 1) * w), np.uint64((agents - 1) * w)",
                 "gather(buffer, 0, n, w)",
                 *(move.format(place, row) for row, place in waiting),
-                f"follow_vjp(buffer, 0, n, {rest}",
+                f"follow_vjp(buffer, 0, n, {arguments}",
                 *(move.format(row, place) for row, place in waiting),
-                f"first_vjp(buffer, (agents - 1) * w, padded(w), {rest}",
+                f"first_vjp(buffer, (agents - 1) * w, padded(w), {arguments}",
             ]
         return text + _function("vjp(buffer, q, t, dt, drives, w, agents, total)", *body)
 
     def _scatter(self) -> list[str]:
-        """Adjoints of states ahead to those whose states they are."""
+        """Lines that add adjoints of gathered states to the adjoints of the vehicles ahead."""
         body = []
         for s, j in reversed(self.lane.ahead):
             if j == 2:
@@ -332,11 +343,11 @@ def _function(signature: str, *body: str) -> str:
 
 
 def supports(system: System, batch: Batch) -> LaneDynamics | None:
-    """The formula of a model that is simulated in compiled code; None: it is not."""
+    """The formula of a model that compiled code covers; None for other models."""
     if batch.x.device.type != "cpu" or type(system) is not Traffic:
         return None
     if system.leader_measured and batch.x.requires_grad:
-        return None  # measured positions are constants here
+        return None  # compiled code has no gradient by measured positions
     lane = system.formula
     return lane if lane is not None and lane.is_formula else None
 
@@ -353,15 +364,15 @@ def simulate(
     """Simulate R runs of a lane.
 
     Args:
-        lane: of the system.
+        lane: the system's formula.
         substeps: steps in a sampling interval.
-        threads: at most so many threads work on it.
-        parameters: the system's parameters by name, each with a leading axis of R runs;
-            None makes one run with the system's own.
-        method: of :data:`nnode.model.steps.METHODS`; None: the law's own.
+        threads: largest number of threads.
+        parameters: name to values of the system's parameters with a leading axis of R runs; None
+            for one run with the system's values.
+        method: one of :data:`nnode.model.steps.METHODS`; None takes the law's method.
 
     Returns:
-        ``(K, R, B, N, M)`` states at the samples; it can be differentiated by the parameters
+        ``(K, R, B, N, M)`` states at the samples, differentiable with respect to the parameters
         and the start.
     """
     assert isinstance(system, Traffic)
@@ -374,16 +385,18 @@ def simulate(
     else:
         every = [{name: value[r] for name, value in parameters.items()} for r in range(runs)]
         step = batch.dt / substeps
-        y0 = torch.stack([initial_with(system, own, batch, step) for own in every])
+        y0 = torch.stack(
+            [initial_with(system, per_simulation, batch, step) for per_simulation in every]
+        )
     y0 = y0.to(batch.x.dtype).permute(3, 0, 1, 2)
     simulations, agents = y0.shape[2:]
-    if system.leader_measured:  # which carries no gradient
+    if system.leader_measured:  # the start of a measured leader has no gradient
         last = torch.arange(agents) == (batch.agent.sum(1) - 1)[:, None]
         y0 = torch.where(last, y0.detach(), y0)
-    own = runs > 1 and (agents - 1) * simulations < _ENOUGH
-    if own:
+    per_simulation = runs > 1 and (agents - 1) * simulations < _ENOUGH
+    if per_simulation:
         q = q.repeat_interleave(simulations, 0)
-    plan = _planned(system, lane, batch, substeps, threads, runs, own, method)
+    plan = _planned(system, lane, batch, substeps, threads, runs, per_simulation, method)
     out: Tensor = Simulate.apply(plan, y0.reshape(len(y0), -1, agents), q)
     return out.reshape(len(out), batch.n_samples, runs, simulations, agents).permute(1, 2, 3, 4, 0)
 
@@ -399,19 +412,19 @@ def tangents(
     method: str | None = None,
     given: Sequence[str] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Simulate a lane, and the derivatives of its states by parameters, exact for the method.
+    """Simulate a lane and the derivatives of its states by parameters, exact for the method.
 
     Args:
         names: P symbols among ``lane.owned``.
-        each: ``(B, G)`` values of parameters for every sequence, ``(1, G)`` for all; None: the
-            system's own.
-        given: symbols of the parameters in ``each``; None: those of ``names``.
+        each: ``(B, G)`` values of parameters for every sequence, or ``(1, G)`` for all; None takes
+            the system's values.
+        given: symbols of the parameters in ``each``; None takes ``names``.
 
     Returns:
-        ``(K, B, N, M)`` states and ``(P, K, B, N, M)`` their derivatives. A measured leader's
-        are 0.
+        ``(K, B, N, M)`` states and their derivatives ``(P, K, B, N, M)``, which are 0 for a
+        measured leader.
     """
-    x, terms = batch.x, cast(list[Term], list(system.terms))
+    x, terms = batch.x, system.term_list
     q = _row(lane, {name: p.detach()[None] for name, p in system.named_parameters()}).to(x.dtype)
     every = with_tangents(stepped(lane, method or system.step), tuple(names))
     if each is not None:
@@ -435,7 +448,7 @@ def tangents(
 
 
 def _row(lane: LaneDynamics, parameters: Mapping[str, Tensor]) -> Tensor:
-    """``(R, P)`` the parameters' symbols, in few operations: each is one more on the way back."""
+    """``(R, P)`` values of the parameters' symbols, in few operations for a fast gradient."""
     first: dict[str, int] = {}
     parts, total = [], 0
     for name, _, axes in lane.owned.values():
@@ -455,15 +468,15 @@ def _planned(
     substeps: int,
     threads: int,
     runs: int,
-    own: bool,
+    per_simulation: bool,
     method: str | None,
     tangents: tuple[str, ...] = (),
 ) -> Plan:
-    """How runs of a batch are computed: simulation b of run r is number ``r * B + b``.
+    """The plan of the runs of a batch. Sequence b of run r is simulation ``r * B + b``.
 
     Args:
-        own: whether every simulation has parameters of its own.
-        tangents: parameters by whose symbols tangents are wanted; there is no gradient then.
+        per_simulation: whether every simulation has separate parameters.
+        tangents: symbols of parameters by which tangents are simulated, without a gradient.
     """
     x = batch.x.detach()
     samples, simulations, agents = x.shape[:3]
@@ -472,11 +485,11 @@ def _planned(
     if tangents:
         lane = with_tangents(lane, tangents)
     number = runs * simulations
-    groups = [(0, number)] if own else [(r, simulations) for r in range(runs)]
+    groups = [(0, number)] if per_simulation else [(r, simulations) for r in range(runs)]
     steps = substeps * (samples - 1)
     blocks = _blocks(groups, agents, x.element_size(), threads, bool(lane.chained))
     size = agents * max(w for *_, w, _ in blocks)
-    source = LaneSource(lane, stages, own, _stride(size), forward_only=bool(tangents))
+    source = LaneSource(lane, stages, per_simulation, _stride(size), forward_only=bool(tangents))
     numbers = [len(source.states) * steps * agents * w for *_, w, _ in blocks]
     places = np.cumsum([0, *numbers])
 
@@ -485,7 +498,7 @@ def _planned(
 
     inputs: dict[str, Tensor] = {}
     if source.fields:
-        inputs = inputs_of(cast(list[Term], list(system.terms)), lane, system.scene(batch))
+        inputs = inputs_of(system.term_list, lane, system.scene(batch))
         inputs["start"] = batch.start[:, None].expand(-1, agents)
     fields = [tiled(inputs[name].to(x.dtype)) for name in source.fields]
     path = x.new_empty(2, 0, 0)
@@ -515,15 +528,15 @@ def _planned(
         ),
         stored=int(places[-1]),
         samples=samples,
-        owner=np.arange(number) if own else np.array([run for *_, run in blocks]),
+        owner=np.arange(number) if per_simulation else np.array([run for *_, run in blocks]),
     )
 
 
 def _blocks(
     groups: Sequence[tuple[int, int]], agents: int, itemsize: int, threads: int, recursive: bool
 ) -> list[tuple[int, int, int, int]]:
-    """Cut groups (run, number of simulations) into blocks: first simulation, number, distance,
-    run."""
+    """Cut groups (run, number of simulations) into blocks: first simulation, number of
+    simulations, distance of vehicles, run."""
     most = max(1, _ROW_BYTES // (itemsize * agents))
     if recursive:
         most = max(_PITCH, most // _PITCH * _PITCH)
@@ -531,7 +544,7 @@ def _blocks(
     for run, simulations in groups:
         number = -(-simulations // most)
         if len(groups) < threads:
-            # a block narrower than a chunk of vectors would only compute padding
+            # a narrower block than a chunk would compute mostly padding
             useful = max(1, (agents - 1) * simulations // CHUNK)
             number = max(number, min(threads, useful))
         width = -(-simulations // number)
@@ -545,7 +558,7 @@ def _blocks(
 
 
 def _stride(size: int) -> int:
-    """The distance of rows that hold so many numbers and what loops add to them."""
+    """The distance of rows for ``size`` numbers and their padding."""
     for stride in _STRIDES:
         if size + _BEHIND <= stride:
             return stride

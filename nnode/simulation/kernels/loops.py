@@ -1,7 +1,7 @@
 """Loops over rows of numbers, as source text for Numba.
 
-What does not vary along a row is computed once before the loop; the gradient by it is computed from
-sums over the loop, after the loop.
+Expressions that do not vary along a row are computed once before the loop. The gradient by them is
+computed after the loop, from sums over the loop.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from nnode.model.operations import OPERATIONS
 
 @dataclass(frozen=True)
 class Loop:
-    """What loops know.
+    """Generator of loops.
 
     Attributes:
-        uniform: symbols that are the same along a row, in the order of the array ``q``.
-        scalars: others of them, which the function's arguments are called.
-        options: of the compiler, by their name in the module.
-        fixed: uniform symbols by which nobody wants a gradient.
+        uniform: symbols with one value along a row, in the order of the array ``q``.
+        scalars: further such symbols, which are arguments of the function.
+        options: name of the compiler's options in the module.
+        fixed: uniform symbols without a gradient.
     """
 
     uniform: Sequence[str]
@@ -46,11 +46,11 @@ class Loop:
         sums: Mapping[str, Expr] | None = None,
         after: Sequence[str] = (),
     ) -> str:
-        """A function ``name(buffer, lo, n, q, t, dt, drives, total)`` that computes rows.
+        """Source of a function ``name(buffer, lo, n, q, t, dt, drives, total)`` for rows.
 
         Args:
-            rows: row to what is stored there.
-            sums: label to what is summed over the loop, in ``sum_label``.
+            rows: row to the formula that is stored there.
+            sums: label to a formula whose sum over the loop is the variable ``sum_label``.
             after: lines after the loop.
         """
         sums = sums or {}
@@ -78,20 +78,20 @@ class Loop:
         return head + "".join(f"    {line}\n" for line in body)
 
     def given(self, outputs: Iterable[Expr]) -> list[str]:
-        """Lines that name the uniform quantities that formulas need."""
+        """Lines that assign the uniform quantities in formulas."""
         needed = set(symbols(outputs))
         return [f"{p} = q[{j}]" for j, p in enumerate(self.uniform) if p in needed]
 
     def vjp(
         self, name: str, seeds: Mapping[Expr, Expr], rows: Mapping[str, str], onto: Sequence[str]
     ) -> str:
-        """A function that adds to ``total`` the gradient by the uniform quantities, and stores
-        that by others.
+        """Source of a function that adds the gradient by uniform quantities to ``total``, and
+        stores adjoints of others in rows.
 
         Args:
-            seeds: outputs to their weights.
+            seeds: output to its weight.
             rows: row to the symbol whose adjoint is stored there.
-            onto: rows whose adjoints are added to what they hold.
+            onto: rows to whose content the adjoint is added.
         """
         stored, ends = self.adjoints(seeds, rows)
         stored.update({row: symbol(row) + stored[row] for row in onto})
@@ -104,7 +104,7 @@ class Loop:
             for n, b in adjoints.items()
             if n.value in self.uniform and n.value not in self.fixed
         }
-        # what the chain behind the loop needs is computed there
+        # expressions of the gradient by uniform quantities are computed after the loop
         names = self.names(gradient.values(), "u")
         after = [*self.given(gradient.values()), *self.lines(names).values()]
         after += [f"total[{self.uniform.index(p)}] += {names[b]}" for p, b in gradient.items()]
@@ -113,8 +113,8 @@ class Loop:
     def adjoints(
         self, seeds: Mapping[Expr, Expr], rows: Mapping[str, str]
     ) -> tuple[dict[str, Expr], dict[Expr, Expr]]:
-        """What is stored in rows, and what is summed over the loop of every node that does not
-        vary in it."""
+        """Row to the stored adjoint, and uniform node to the adjoint that is summed over the
+        loop."""
         varies = self.varies([*seeds, *seeds.values()])
         bar = vjp(seeds, lambda node: not varies[node])
         stored = {row: bar.get(symbol(quantity), const(0)) for row, quantity in rows.items()}
@@ -123,17 +123,17 @@ class Loop:
         return stored, ends
 
     def of_numbers(self, name: str, formula: Expr) -> list[str]:
-        """Lines that compute a formula of numbers and give it a name."""
+        """Lines that assign a formula of scalars to a variable."""
         names = self.names([formula])
         return [*self.lines(names).values(), f"{name} = {names[formula]}"]
 
     def names(self, outputs: Iterable[Expr], prefix: str = "n") -> dict[Expr, str]:
-        """Names of nodes in code, each after what it is made of."""
+        """Node to its name in code, each after its arguments."""
         nodes = enumerate(topological(outputs))
         return {n: n.value if n.op == "symbol" else f"{prefix}{i}" for i, n in nodes}
 
     def lines(self, names: Mapping[Expr, str]) -> dict[Expr, str]:
-        """Lines that compute nodes."""
+        """Node to the line that computes it."""
         lines = {}
         for node, name in names.items():
             if node.op == "const":

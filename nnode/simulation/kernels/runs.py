@@ -1,4 +1,4 @@
-"""What lanes and crowds share: modules from templates, blocks, threads, and gradients."""
+"""Shared parts of lanes and crowds: modules from templates, blocks, threads, and gradients."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from nnode.model.expression import Expr, symbol
 from nnode.simulation.kernels import functions
 from nnode.simulation.kernels.cache import digest, keep
 
-#: Compiled into every module besides its own text.
+#: Modules that are compiled into every generated module.
 COMPILED_IN = (functions,)
 
 
 class Source(Protocol):
-    """What a module is generated from; equal sources are one module."""
+    """The generator of a module; equal sources give one module."""
 
     @property
     def kind(self) -> str:
@@ -41,7 +41,7 @@ def compiled(source: Source) -> ModuleType:
     """The module of a source.
 
     Raises:
-        ConfigError: a name in the formulas that is no symbol, or the cache folder cannot be
+        ConfigError: a name in the formulas is not a valid symbol, or the cache folder cannot be
             written.
     """
     text = source.text().encode()
@@ -61,12 +61,12 @@ def _sections(name: str) -> Mapping[str, str]:
 
 
 def fill(name: str, section: str, /, **values: Any) -> str:
-    """A section of a template file with values in place of ``$names``; lists of lines have the
-    indentation of the place where they stand."""
+    """A section of a template file with values in place of ``$names``. Lists of lines are indented
+    as the name that they replace."""
 
-    def inserted(found: re.Match[str]) -> str:
-        rows = values[found[2]]
-        return "".join(f"{found[1]}{row}\n" for row in rows) if type(rows) is list else found[0]
+    def inserted(match: re.Match[str]) -> str:
+        rows = values[match[2]]
+        return "".join(f"{match[1]}{row}\n" for row in rows) if type(rows) is list else match[0]
 
     text = re.sub(r"^( *)\$(\w+)\n", inserted, _sections(name)[section], flags=re.MULTILINE)
     return Template(text).substitute(values)
@@ -75,19 +75,18 @@ def fill(name: str, section: str, /, **values: Any) -> str:
 def head(
     name: str, formula: Sequence[str], chunk: int, places: list[str], /, **constants: Any
 ) -> str:
-    """The beginning of a module: its formula in words, imports and constants."""
-    own = fill(name, "constants", places=places, **constants)
-    return fill("shared", "head", formula="\n".join(formula), chunk=chunk, constants=own)
+    """The beginning of a module: a docstring with its formula, imports and constants."""
+    section = fill(name, "constants", places=places, **constants)
+    return fill("shared", "head", formula="\n".join(formula), chunk=chunk, constants=section)
 
 
 def seeds(formulas: Mapping[str, Expr], weight: Callable[[str], str]) -> dict[Expr, Expr]:
-    """Formulas of rows to the symbols of the rows of their weights, of which one formula may have
-    several; numbers have no gradient."""
+    """Formula to the sum of the weights' symbols of its rows; numbers have no gradient."""
     weights: dict[Expr, Expr] = {}
     for row, node in formulas.items():
         if not node.is_number():
-            own = symbol(weight(row))
-            weights[node] = weights[node] + own if node in weights else own
+            seed = symbol(weight(row))
+            weights[node] = weights[node] + seed if node in weights else seed
     return weights
 
 
@@ -96,18 +95,18 @@ def seeds(formulas: Mapping[str, Expr], weight: Callable[[str], str]) -> dict[Ex
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything of a simulation that carries no gradient.
+    """The arguments of a simulation that have no gradient.
 
     Attributes:
         module: the compiled functions ``forward`` and ``backward``.
-        jobs: for every thread its blocks, rows of: first simulation, simulations, their distance
-            or number of people, place in the stored states, row of the gradient's sums, run, and
-            what else a block of the kind has.
-        constants: what the compiled functions take between jobs and parameters.
-        stored: numbers of stored states.
+        jobs: blocks of every thread, with the columns: first simulation, number of simulations,
+            their distance or the number of people, index in the stored states, row of the
+            gradient's sums, run, and further columns of the kind of source.
+        constants: arguments of the compiled functions between jobs and parameters.
+        stored: number of stored values of states.
         samples: K.
-        owner: row of parameters that a row of the gradient's sums belongs to.
-        padding: ``(B, N)`` True for whoever stays where he is; None: there is nobody.
+        owner: row of the parameters for every row of the gradient's sums.
+        padding: ``(B, N)`` True for padding, which does not move; None for none.
     """
 
     module: Any
@@ -120,8 +119,8 @@ class Plan:
 
 
 def shared_out(blocks: Iterable[Sequence[int]], threads: int) -> list[np.ndarray]:
-    """Jobs of every thread. Blocks that come sorted by size are dealt out in turn, so that every
-    thread has its share of large ones."""
+    """Jobs of every thread. Blocks are assigned in turn, so that every thread gets large ones if
+    they are sorted by size."""
     table = np.array(list(blocks), dtype=np.int64)
     number = min(threads, len(table))
     return [np.ascontiguousarray(table[i::number]) for i in range(number)]
@@ -133,7 +132,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def _run(function: Callable[..., None], plan: Plan, *arrays: np.ndarray) -> None:
-    """Run a compiled function, which releases Python's lock, on the jobs of every thread."""
+    """Run a compiled function on the jobs of every thread. It releases Python's global lock."""
 
     def call(jobs: np.ndarray) -> None:
         function(jobs, *plan.constants, *arrays)
@@ -146,15 +145,15 @@ def _run(function: Callable[..., None], plan: Plan, *arrays: np.ndarray) -> None
 
 
 class Simulate(torch.autograd.Function):
-    """A method's steps and the exact gradient of what it computes.
+    """A compiled simulation and its exact gradient.
 
-    From the start ``(M, B, N)`` and parameters ``(R, P)`` to states ``(M, K, B, N)``.
+    It maps the start ``(M, B, N)`` and parameters ``(R, P)`` to states ``(M, K, B, N)``.
     """
 
     @staticmethod
     def forward(ctx: Any, plan: Plan, y0: Tensor, q: Tensor) -> Tensor:
         start, values = (np.ascontiguousarray(t.detach().numpy()) for t in (y0, q))
-        # NumPy asks for huge pages, which are far faster to touch for the first time
+        # NumPy requests huge pages, whose first access is much faster
         states = np.empty(plan.stored if any(ctx.needs_input_grad) else 0, start.dtype)
         out = np.empty((len(start), plan.samples, *start.shape[1:]), start.dtype)
         if plan.padding is not None:
@@ -169,7 +168,7 @@ class Simulate(torch.autograd.Function):
         plan: Plan = ctx.plan
         grad_out = np.ascontiguousarray(grads[0].numpy())
         grad_y0 = np.zeros((len(grad_out), *grad_out.shape[2:]), grad_out.dtype)
-        # sums over all steps are kept in float64 whatever the precision of the states
+        # sums over all steps are float64 for every precision of the states
         sums = np.zeros((len(plan.owner), ctx.values.shape[1]))
         _run(plan.module.backward, plan, ctx.values, ctx.states, grad_out, grad_y0, sums)
         if plan.padding is not None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import config as benchmark_config
-from nnode.app.cli.help import help_text, remarks, said_of
+from nnode.app.cli.help import first_comment, help_text, remarks
 from nnode.config import SCHEMAS
 from nnode.program import words
 from tests.app.conftest import CONF, ROOT, Script, composed, environment, examples
@@ -57,7 +57,7 @@ def test_every_option_and_every_choice_says_what_it_means() -> None:
         silent = {field.name for field in fields(kind)} - set(remarks(kind)) - groups
         assert not silent, f"{key}: a comment beside {silent} becomes their line of the help"
     for path in CONF.glob("*/*.yaml"):
-        assert re.fullmatch(r".+\.", said_of(path)), path
+        assert re.fullmatch(r".+\.", first_comment(path)), path
 
 
 def test_a_script_prints_its_help_with_choices_of_one_s_own(script: Script, tmp_path: Path) -> None:

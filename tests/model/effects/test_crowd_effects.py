@@ -291,7 +291,7 @@ def test_others_are_where_they_were_measured(name: str) -> None:
     """Moving the others' simulated states changes nothing once they are measured."""
     effect, model = effect_of(name)
     now = state(model)
-    now.seen = (BATCH.x[0], BATCH.v[0])
+    now.measured_others = (BATCH.x[0], BATCH.v[0])
     before = effect(now)
     now.x, now.v = BATCH.x[0].clone(), BATCH.v[0].clone()
     now.x[0, 1:] += 0.3
