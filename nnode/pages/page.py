@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +33,23 @@ _CODE = re.compile(
     re.M | re.S,
 )
 
+#: Tables with more rows are folded.
+ROWS = 12
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 @dataclass
 class Heading:
-    """Begins a section; level 2 is the highest, below the page's title."""
+    """Begins a section; level 2 is the highest, below the page's title.
+
+    A folded section is opened by its heading, by a link into it, and when the page is printed. In
+    Markdown it is an ordinary section.
+    """
 
     text: str
     level: int = 2
+    folded: bool = False
 
 
 @dataclass
@@ -62,6 +70,7 @@ class TableBlock:
         bold: which cells are set in bold.
         digits: after the point, for all columns or by column.
         full: what the CSV holds, where that is more than what is shown.
+        heads: headings of columns whose name in the CSV is another one.
     """
 
     name: str
@@ -70,10 +79,11 @@ class TableBlock:
     bold: pd.DataFrame | None = None
     digits: dict[str, int] | int = tables.DIGITS
     full: pd.DataFrame | None = None
+    heads: dict[str, str] = field(default_factory=dict)
 
     def grid(self) -> tables.Grid:
         """The table as text."""
-        return tables.grid(self.frame, digits=self.digits, bold=self.bold)
+        return tables.grid(self.frame, digits=self.digits, bold=self.bold, heads=self.heads)
 
     def csv(self) -> str:
         """The table in full."""
@@ -220,7 +230,10 @@ def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
 
 def _markdown_table(block: TableBlock) -> str:
     grid = block.grid()
-    names = [tables.markdown(tables.one_name(name)) for name in block.frame.columns]
+    names = [
+        tables.markdown(block.heads.get(name, tables.one_name(name)))
+        for name in block.frame.columns
+    ]
     labels = [
         tables.markdown(cell.text) for cell in grid.head[-1][: len(grid.head[-1]) - len(names)]
     ]
@@ -255,11 +268,24 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
     taken: Counter[str] = Counter()
     parts: list[dict[str, Any]] = []
     contents: list[dict[str, Any]] = []
-    for block in blocks:
+    fold: int | None = None  # level of the folded section that is open
+    for block in [*blocks, None]:
+        if fold and (block is None or (isinstance(block, Heading) and block.level <= fold)):
+            parts.append({"kind": "end of fold"})
+            fold = None
         match block:
-            case Heading(words, level):
+            case Heading(words, level, folded):
                 slug = _slug(words, taken)
-                parts.append({"kind": "heading", "text": words, "level": level, "id": slug})
+                fold = level if folded and fold is None else fold
+                parts.append(
+                    {
+                        "kind": "heading",
+                        "text": words,
+                        "level": level,
+                        "id": slug,
+                        "folded": fold == level,
+                    }
+                )
                 if level <= 3:
                     contents.append(parts[-1])
             case Text(markdown):
@@ -271,6 +297,7 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
                         "name": block.name,
                         "caption": Markup(text.renderInline(block.caption.strip())),
                         "grid": block.grid(),
+                        "folded": len(block.frame) > ROWS,
                         "csv": _base64(block.csv().encode()),
                     }
                 )
@@ -310,6 +337,7 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
         title=title,
         subtitle=Markup(text.renderInline(subtitle)),
         parts=parts,
+        folds=any(part.get("folded") for part in parts),
         contents=contents,
         facts=_facts(blocks),
     )

@@ -82,7 +82,11 @@ def number(value: Any, digits: int = DIGITS) -> str:
 
 
 def grid(
-    frame: pd.DataFrame, *, digits: Mapping[str, int] | int, bold: pd.DataFrame | None
+    frame: pd.DataFrame,
+    *,
+    digits: Mapping[str, int] | int,
+    bold: pd.DataFrame | None,
+    heads: Mapping[str, str] | None = None,
 ) -> Grid:
     """A frame as text; its index becomes the labels of the rows.
 
@@ -92,6 +96,7 @@ def grid(
         frame: of numbers, strings, or both.
         digits: after the point, for all columns or by column.
         bold: of the same shape; true cells are set in bold.
+        heads: headings of columns that are not their names.
 
     Raises:
         ValueError: ``bold`` has other rows or columns than the frame.
@@ -115,7 +120,8 @@ def grid(
         ([column[i] for column in beside], [column[i] for column in columns])
         for i in range(len(frame))
     ]
-    return Grid(_head(frame, list(labels.columns), columns), rows)
+    shown = frame.rename(columns=dict(heads or {}))
+    return Grid(_head(shown, list(labels.columns), columns), rows)
 
 
 def _label(value: Any) -> str:

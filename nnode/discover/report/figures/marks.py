@@ -24,7 +24,7 @@ AFTER: dict[str, Any] = {"color": OKABE_ITO["blue"], "marker": "o"}
 
 
 def place_curves(places: Sequence[Place], unit: str) -> Figure:
-    """Mean deviation by variable, with its standard errors and the interval that stands out.
+    """Missing term by variable, with its standard errors and the significant interval.
 
     Args:
         places: one panel each.
@@ -50,11 +50,11 @@ def place_curves(places: Sequence[Place], unit: str) -> Figure:
                 elinewidth=0.8,
                 markersize=4,
             )
-        share = f"{100 * place.share:.0f} % of the excess" if np.isfinite(place.share) else ""
+        share = f"{100 * place.share:.0f} % of the error" if np.isfinite(place.share) else ""
         dress(
             ax,
             x=_with_unit(place.variable, place.unit),
-            y=f"deviation ({unit})" if n % columns == 0 else "",
+            y=f"missing term ({unit})" if n % columns == 0 else "",
             title=share.replace("-", "−"),
         )
     for ax in axes.flat[len(places) :]:
@@ -94,6 +94,7 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
             [0], [f"{effect.name}\n{name}{f' ({c.unit})' if c.unit not in ('', '1') else ''}"]
         )
         dress(ax, grid=False)
+        ax.ticklabel_format(axis="x", useOffset=False)
         ax.tick_params(axis="y", length=0)
         ax.margins(x=0.15)
         for side in ("top", "right", "left"):
@@ -128,14 +129,12 @@ def confirmation_costs(
     handles = [Line2D([], [], linestyle="", label=label, **style) for label, _, style in shown]
     if np.isfinite(floor) and floor > 0:
         ax.axhline(floor, color="black", linestyle="--", linewidth=0.9)
-        handles.append(
-            Line2D([], [], color="black", linestyle="--", label="noise of the measurement")
-        )
+        handles.append(Line2D([], [], color="black", linestyle="--", label="measurement noise"))
     if len(order) <= NAMED:
         ax.set_xticks(place, [names[i] for i in order], rotation=40, ha="right")
     else:
         ax.set_xticks([])
-    dress(ax, x="sealed sequence", y="mean square error (m²)")
+    dress(ax, x="confirmation sequence", y="mean square error (m²)")
     figure.legend(
         handles=handles, loc="outside upper center", ncols=3, frameon=False, fontsize=SMALL_FONT
     )
@@ -149,7 +148,7 @@ def flexible_curve(structure: Structure, unit: str) -> Figure:
     ax.axhline(0, color=GREY, linewidth=0.8)
     ax.plot(structure.curve["at"], structure.curve["deviation"], color=OKABE_ITO["blue"])
     variable = structure.variables[0] if structure.variables else "variable"
-    dress(ax, x=_with_unit(variable, structure.unit), y=f"missing ({unit})")
+    dress(ax, x=_with_unit(variable, structure.unit), y=f"missing term ({unit})")
     return figure
 
 
