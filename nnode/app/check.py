@@ -27,7 +27,7 @@ from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page
 
 #: Stands before what is printed of each level.
-_SIGNS = {"error": "ERROR", "warning": "look", "note": "note"}
+_SIGNS = {"error": "ERROR", "warning": "WARN", "note": "note"}
 
 
 @dataclass(frozen=True, repr=False)
@@ -118,7 +118,7 @@ def sentence(found: Examination) -> str:
     """What there is, in a sentence."""
     levels = [one.level for one in found.findings]
     errors, looks = levels.count("error"), levels.count("warning")
-    wrong = f"{errors} error{'s' * (errors != 1)}, {looks} thing{'s' * (looks != 1)} to look at"
+    wrong = f"{errors} error{'s' * (errors != 1)} and {looks} warning{'s' * (looks != 1)}"
     who = "people" if found.scale.domain == "crowd" else "vehicles"
     return (
         f"{len(set(found.rows.agent.tolist()))} {who}, {len(found.rows)} positions, sampled "
@@ -137,8 +137,8 @@ def summary(found: Examination, lines: list[str]) -> str:
         text.append(f"format: {found.raw.native}, whose reader knows its units")
     text += [f"{_SIGNS[one.level]:>5}  {one.kind}: {one.text}" for one in found.findings]
     words = " ".join(lines)
-    text += ["", "to read it:", f"  nnode prepare_data {words}"]
-    text += ["to calibrate a model, and to diagnose it:"]
+    text += ["", "to prepare the data:", f"  nnode prepare_data {words}"]
+    text += ["to calibrate and to diagnose a model:"]
     text += [f"  {line}" for line in _next(found, words)]
     text += ["in Python:", *(f"  {line}" for line in python_lines(found))]
     return "\n".join(printable(line) for line in text)
@@ -202,15 +202,15 @@ def _units(found: Examination) -> str:
 
 
 def blocks(found: Examination, lines: list[str]) -> list[Block]:
-    """The page: what is wrong, how to read it, what it holds."""
+    """The page: findings, commands, and the content of the file."""
     return [
-        Heading("What was found"),
+        Heading("Findings"),
         *_findings(found.findings),
-        Heading("To read it"),
+        Heading("Commands"),
         Text(_usage(found, lines)),
         *_columns(found),
         *_units_blocks(found),
-        Heading("What it holds"),
+        Heading("Speeds, sampling and presence"),
         *_figures(found),
     ]
 
@@ -222,11 +222,13 @@ def _rows(findings: list[Finding]) -> pd.DataFrame:
 
 def _findings(findings: list[Finding]) -> list[Block]:
     if not findings:
-        return [Text("Nothing.")]
+        return [Text("There are no findings.")]
     caption = (
-        "*error*: results would be wrong. *warning*: look at it before you go on. *note*: to know."
+        "*Error*: results would be wrong. *Warning*: check the data before you continue. *Note*: "
+        "information."
     )
-    return [TableBlock("findings", _rows(findings), caption)]
+    heads = {"what": "kind", "in words": "finding"}
+    return [TableBlock("findings", _rows(findings), caption, heads=heads)]
 
 
 def _usage(found: Examination, lines: list[str]) -> str:
@@ -242,9 +244,9 @@ def _columns(found: Examination) -> list[Block]:
         return []
     frame = found.raw.table.frame
     how = {
-        "named": "has the name of its meaning",
-        "like": "by its name",
-        "holds": "by what it holds",
+        "named": "column name",
+        "like": "similar column name",
+        "holds": "content",
     }
     by = {one.column: (meaning, one) for meaning, one in found.meanings.items()}
     rows = {}
@@ -262,19 +264,27 @@ def _columns(found: Examination) -> list[Block]:
             "empty": int(cells.isna().sum()),
         }
     table = pd.DataFrame(rows).T.rename_axis("column")
-    return [Heading("Columns"), TableBlock("columns", table, "What each column is taken for.")]
+    heads = {
+        "because": "recognised by",
+        "least": "minimum",
+        "greatest": "maximum",
+        "different": "distinct values",
+        "empty": "missing values",
+    }
+    caption = "Recognised meaning of each column."
+    return [Heading("Columns"), TableBlock("columns", table, caption, heads=heads)]
 
 
 def _units_blocks(found: Examination) -> list[Block]:
     scale, known = found.scale, found.known
     usual = USUAL[scale.domain]
     values = {
-        "speed of those that move (m/s)": (known.speed * scale.metres / scale.seconds, "speed"),
-        "distance to the nearest (m)": (known.nearest * scale.metres, "nearest"),
+        "speed of moving agents (m/s)": (known.speed * scale.metres / scale.seconds, "speed"),
+        "distance to the nearest agent (m)": (known.nearest * scale.metres, "nearest"),
         "length (m)": (known.length * scale.metres, "length"),
         "sway (1/s)": (known.sway / scale.seconds, "sway"),
         "sampling interval (s)": (known.dt * scale.seconds, INTERVAL),
-        "speed by positions over speed in the file": (
+        "speed from positions / speed in the file": (
             known.ratio * scale.metres / (scale.per_second * scale.seconds),
             AGREE,
         ),
@@ -290,8 +300,13 @@ def _units_blocks(found: Examination) -> list[Block]:
             }
     blocks: list[Block] = [
         Heading("Units and time scale"),
-        Text(f"Taken: {_units(found)}: {certainty(share(found.scales))}."),
-        TableBlock("medians", pd.DataFrame(rows).T, "Medians in SI units, and what is usual."),
+        Text(f"Assumed: {_units(found)} ({certainty(share(found.scales))})."),
+        TableBlock(
+            "medians",
+            pd.DataFrame(rows).T,
+            "Medians in SI units, and usual ranges.",
+            heads={"here": "median", "usual": "usual range"},
+        ),
     ]
     if len(found.scales) > 1:
         table = pd.DataFrame(
@@ -311,10 +326,11 @@ def _units_blocks(found: Examination) -> list[Block]:
             TableBlock(
                 "units",
                 table.head(6),
-                "Combinations of units by how well these medians agree with what is usual; all of "
-                "them in the CSV.",
+                "Combinations of units by the agreement of these medians with the usual ranges. "
+                "The CSV file contains all combinations.",
                 digits={"probability": 3},
                 full=table,
+                heads={"of": "domain"},
             )
         )
     return blocks
@@ -329,13 +345,13 @@ def _figures(found: Examination) -> list[Block]:
         FigureBlock(
             "speeds",
             plots.speeds(rows, USUAL[domain]["speed"]),
-            "Speeds over ten samples, and steps in time. Shaded: what is usual.",
+            "Speeds over ten samples, and sampling steps. Shaded: usual range.",
             "Histograms of speeds in m/s and of sampling steps in s.",
         ),
         FigureBlock(
             "presence",
             plots.presence(rows, domain),
-            "Above, where agents are over time, of many a part; below, how many there are.",
+            "Positions of a part of the agents over time (top), and number of agents (bottom).",
             "Paths over time, and the number of agents over time.",
         ),
     ]
@@ -344,8 +360,8 @@ def _figures(found: Examination) -> list[Block]:
             FigureBlock(
                 "faults",
                 faults_figure(found.sequences, found.faults, domain, 10),
-                f"Sequences that data={found.source.group} makes, with faults marked; the first 10 "
-                f"of {len(found.faults)}.",
+                f"Sequences of data={found.source.group} with marked faults; the first 10 of "
+                f"{len(found.faults)}.",
                 "Positions over time of faulty sequences, faults marked.",
             )
         )

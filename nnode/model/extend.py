@@ -51,4 +51,4 @@ def effects_of(system: System) -> list[Effect]:
 def beside(system: System) -> str:
     """What a figure of a model's law or force alone leaves out, in words; empty: nothing."""
     names = [effect.name for effect in effects_of(system)]
-    return f"without its effects {', '.join(names)}" if names else ""
+    return f"without {', '.join(names)}" if names else ""

@@ -23,7 +23,7 @@ from nnode.discover.report.figures.marks import (
     flexible_curve,
     place_curves,
 )
-from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
+from nnode.discover.report.figures.paths import as_drawn, trajectories
 from nnode.discover.report.files import amount, individual, interval
 from nnode.discover.report.replay import AFTER, BEFORE, player, scenes
 from nnode.errors import ConfigError
@@ -237,11 +237,4 @@ def _paths(outcome: DiagnosisOutcome, options: DiscoverOptions) -> list[FigureBl
             f"Paths of the sequence {s.name}; {errors}.",
         ),
         *moving,
-        FigureBlock(
-            "moments",
-            film_strip(s, simulated),
-            "Moments of the same sequence. Open marks are measured and filled marks simulated "
-            "positions; lines connect the two positions of an agent.",
-            f"Moments of the sequence {s.name}; {errors}.",
-        ),
     ]

@@ -186,7 +186,11 @@ def _shown(drawn: Figures) -> list[Block]:
 
 
 def _places(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
-    found = [tables.places_table(d, unit)] if d.places else [Text("No variable is significant.")]
+    found = (
+        [tables.places_table(d, unit)]
+        if d.places
+        else [Text("No curve over a variable is significant.")]
+    )
     return [Heading("Deviations by variable"), *found, *drawn.places]
 
 
@@ -299,7 +303,10 @@ def _provenance(d: Diagnosis, inputs: Inputs) -> Provenance:
         f"exploration: {_names(d.split.get('open', []))}; "
         f"confirmation: {_names(d.split.get('sealed', []))}"
     )
-    facts["Time"] = ", ".join(f"{what} {seconds:.1f} s" for what, seconds in d.seconds.items())
+    facts["Time"] = ", ".join(
+        f"{'confirm' if what == 'sealed' else what} {seconds:.1f} s"
+        for what, seconds in d.seconds.items()
+    )
     return Provenance(facts)
 
 

@@ -333,19 +333,18 @@ def confirmation_table(d: Diagnosis) -> TableBlock:
 def base_table(d: Diagnosis) -> TableBlock:
     """The change of the model's parameters when effects are added."""
     short = short_names(d.base)
-    return _table(
-        "parameters",
-        d.base.items(),
-        {
-            "parameter": lambda row: short[row[0]],
-            "alone": lambda row: amount(row[1].get("before"), 4),
-            "with effects": lambda row: amount(row[1].get("after"), 4),
-            "unit": lambda row: in_unit(row[1].get("unit", "")).strip() or NOTHING,
-        },
-        f"Parameters of {d.model}, calibrated without and with the effects. A parameter that "
-        "changes compensated for the missing effect.",
-        heads={"alone": "without effects"},
-    )
+    columns: dict[str, Column] = {
+        "parameter": lambda row: short[row[0]],
+        "alone": lambda row: amount(row[1].get("before"), 4),
+        "with effects": lambda row: amount(row[1].get("after"), 4),
+        "unit": lambda row: in_unit(row[1].get("unit", "")).strip() or NOTHING,
+    }
+    caption = f"Calibrated parameters of {d.model}."
+    if d.effects:
+        caption += " A parameter that changes with the effects compensated for their absence."
+    else:
+        columns.pop("with effects")
+    return _table("parameters", d.base.items(), columns, caption, heads={"alone": "value"})
 
 
 def faults_table(d: Diagnosis) -> TableBlock:

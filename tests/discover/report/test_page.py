@@ -105,7 +105,6 @@ def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
         "faults",
         "map",
         "map_beside",
-        "moments",
         "sealed",
         "trajectories",
         "unknown",

@@ -122,9 +122,10 @@ def confirmation_costs(
     shown = [("without effects", b, BEFORE), ("with effects", a, AFTER)][: 1 + (after is not None)]
     for _, values, style in shown:
         ax.plot(place, values, linestyle="", markersize=5.5, **style)
-    positive = np.concatenate([b, a])
-    if (positive > 0).all():
+    levels = np.concatenate([b, a, [floor] if floor > 0 else []])
+    if (levels > 0).all():
         ax.set_yscale("log")
+        ax.set_ylim(0.7 * np.nanmin(levels), 1.4 * np.nanmax(levels))
         ax.tick_params(which="minor", labelsize=SMALL_FONT, width=0.6, color=GREY)
     handles = [Line2D([], [], linestyle="", label=label, **style) for label, _, style in shown]
     if np.isfinite(floor) and floor > 0:
