@@ -34,7 +34,7 @@ def test_a_speed_curve_says_which_effects_it_leaves_out() -> None:
     title = speed_curves({"plain": plain, "lin+": extended}).axes[0].get_title(loc="left")
     assert title.endswith("lin+: law without relative_speed, inertia")
     many = {f"m{i}": extended for i in range(3)}
-    assert "3 models have effects" in speed_curves(many).axes[0].get_title(loc="left")
+    assert "effects of 3 models are not drawn" in speed_curves(many).axes[0].get_title(loc="left")
 
 
 def test_force_figures_say_which_effects_they_leave_out() -> None:

@@ -39,15 +39,14 @@ def test_notebooks_show_a_figure() -> None:
 def test_failed_save_keeps_the_old_file_and_leaves_nothing(tmp_path: Path, monkeypatch) -> None:
     path = save(_figure(), tmp_path / "a.png")
     before = path.read_bytes()
-    figure = _figure()
 
-    def half(target, **_):
+    def half(image, target, *_, **__):
         Path(target).write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(figure, "savefig", half)
+    monkeypatch.setattr("PIL.Image.Image.save", half)
     with pytest.raises(ConfigError, match=r"a\.png.*No space left"):
-        save(figure, path)
+        save(_figure(), path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
