@@ -20,6 +20,9 @@ from nnode.files import csv_text
 _MARKS = re.compile(r"[\\`*\[!|]|(?<!\w)_|_(?!\w)")
 _ENTITY = re.compile(r"&(?=#?\w+;)")
 
+#: A number, an interval or a number with its error, as text.
+_NUMBER = re.compile(r"[+\-−±≤≥<>~ ]*\d[\d.,%±+\-−≤≥<>~\[\] e∞]*(to [\d.]+)?")
+
 #: Digits after the point where nothing else is asked for.
 DIGITS = 2
 
@@ -158,9 +161,9 @@ def _head(frame: pd.DataFrame, labels: list[str], columns: list[list[Cell]]) -> 
 
 
 def _like_number(value: Any) -> bool:
-    """Whether a value stands well at the right: a number, or text that begins like one."""
+    """Whether a value stands well at the right: a number, also as text."""
     if isinstance(value, str):
-        return value.lstrip("+-−±≤≥<>~ ")[:1].isdigit() or value in ("", NOTHING)
+        return value in ("", NOTHING) or _NUMBER.fullmatch(value) is not None
     return value is None or isinstance(value, Real) or value is pd.NA
 
 

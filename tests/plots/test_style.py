@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
+from PIL import Image
 
 from nnode.errors import ConfigError
 from nnode.plots.style import DPI, OKABE_ITO, SEQUENTIAL, curve_style, dress, new_figure, save
@@ -39,12 +41,15 @@ def test_notebooks_show_a_figure() -> None:
 def test_failed_save_keeps_the_old_file_and_leaves_nothing(tmp_path: Path, monkeypatch) -> None:
     path = save(_figure(), tmp_path / "a.png")
     before = path.read_bytes()
+    whole = Image.Image.save
 
-    def half(image, target, *_, **__):
+    def half(image, target, *values, **names):
+        if isinstance(target, io.BytesIO):
+            return whole(image, target, *values, **names)
         Path(target).write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("PIL.Image.Image.save", half)
+    monkeypatch.setattr(Image.Image, "save", half)
     with pytest.raises(ConfigError, match=r"a\.png.*No space left"):
         save(_figure(), path)
     assert path.read_bytes() == before
