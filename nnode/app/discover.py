@@ -99,7 +99,7 @@ def discover(config: DictConfig, folder: Path) -> None:
         paths = [write() for write in reversed(written)][::-1]
     _print(done[0][1], paths[0], time.monotonic() - start)
     if len(done) > 1:
-        print(f"\nthe law that comes nearest, {done[1][0].name}:")
+        print(f"\nthe best law, {done[1][0].name}:")
         _print(done[1][1], paths[1], time.monotonic() - start)
     if guard.requested:
         name = signal.Signals(guard.requested).name
@@ -310,8 +310,8 @@ def _print(found: DiagnosisOutcome, paths: Mapping[str, Path], seconds: float) -
         print(f"  {effect.name}: {interval(effect)}")
         print(f"    {effect.formula}; {effect.where}")
         for other in effect.alternatives:
-            number = f", or about {other.clusters} open clusters" if other.clusters else ""
-            print(f"    not to be told from {other.name}: {other.separated_by}{number}")
+            number = f", or about {other.clusters} exploration clusters" if other.clusters else ""
+            print(f"    not distinguishable from {other.name} without {other.separated_by}{number}")
     for what, path in paths.items():
         print(f"{what}: {path}")
     print(f"time: {seconds:.1f} s")

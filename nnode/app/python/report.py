@@ -1,4 +1,4 @@
-"""What a diagnosis found, as an object."""
+"""The result of a diagnosis as an object."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Report:
-    """What a model lacks.
+    """The result of a diagnosis.
 
     Attributes:
-        diagnosis: all that was found; the properties are its most asked parts.
-        model: the model with what was named, calibrated; without, the calibrated model alone.
-        nearest: the same of the law that comes nearest, where another one was asked for.
+        diagnosis: the whole result; the properties are its main parts.
+        model: the calibrated model with the named effects.
+        nearest: the report of the best law, if another one was diagnosed.
         draw: draws a figure by its name; None: the diagnosis was read, not made.
     """
 
@@ -44,32 +44,32 @@ class Report:
 
     @property
     def effects(self) -> list[NamedEffect]:
-        """What was added, and confirmed on sealed clusters."""
+        """The effects that were added and confirmed."""
         return self.diagnosis.effects
 
     @property
     def leads(self) -> list[NamedEffect]:
-        """What was found, and not confirmed."""
+        """Hypotheses that were not confirmed."""
         return self.diagnosis.leads
 
     @property
     def places(self) -> list[Place]:
-        """Where simulation and measurement part."""
+        """Where the model deviates from the data."""
         return self.diagnosis.places
 
     @property
     def gap(self) -> Gap:
-        """Errors on sealed sequences, before and after."""
+        """Errors on confirmation sequences, before and after."""
         return self.diagnosis.gap
 
     @property
     def clusters(self) -> Clusters:
-        """What is independent of what."""
+        """Numbers and definition of independent clusters."""
         return self.diagnosis.clusters
 
     @property
     def data_faults(self) -> list[DataFault]:
-        """Faults of the measurement that were left out."""
+        """Faults of the measurement; their sequences were excluded."""
         return self.diagnosis.data_faults
 
     @property
@@ -82,9 +82,9 @@ class Report:
 
         Args:
             which: ``map``: measured minus simulated speed in space and time, or acceleration by
-                place, before and after the effects were added; ``sealed``: errors of the held-back
-                sequences, before and after; ``coefficients`` of the effects; ``where``: deviations
-                by variable.
+                position, before and after the effects were added; ``sealed``: errors of the
+                confirmation sequences, before and after; ``coefficients`` of the effects;
+                ``where``: deviations by variable.
 
         Raises:
             ConfigError: no such figure, or a report without the data behind it.
@@ -100,14 +100,17 @@ class Report:
         lines = [
             self.sentence,
             "",
-            f"{'Model':<34}{d.model}",
-            f"{'Clusters, searched and held back':<34}{d.clusters.open} and {d.clusters.sealed}",
-            f"{'Error before, held-back data (m²)':<34}{amount(gap.before)}",
-            f"{'Error after, held-back data (m²)':<34}{amount(gap.after)}",
-            f"{'Noise floor (m²)':<34}{noise}",
-            f"{'Share of the gap that is closed':<34}{closed(d)}",
+            f"{'Model':<36}{d.model}",
+            f"{'Exploration, confirmation clusters':<36}{d.clusters.open}, {d.clusters.sealed}",
+            f"{'Error before, confirmation (m²)':<36}{amount(gap.before)}",
+            f"{'Error after, confirmation (m²)':<36}{amount(gap.after)}",
+            f"{'Noise floor (m²)':<36}{noise}",
+            f"{'Removed error above the noise floor':<36}{closed(d)}",
         ]
-        for title, effects in (("Effects", self.effects), ("Not confirmed", self.leads)):
+        for title, effects in (
+            ("Effects", self.effects),
+            ("Not confirmed", self.leads),
+        ):
             rows = [
                 (f"{effect.name}.{name}", c.value, c.low, c.high, c.unit)
                 for effect in effects
@@ -118,7 +121,7 @@ class Report:
         lines += _table("Differences between drivers and disturbances", drivers)
         absent = [(a.name, a.detectable, a.unit) for a in d.absences if a.testable]
         if absent:
-            lines += ["", "Not found; an effect of this strength is detected with 80 % power"]
+            lines += ["", "Not found; detectable strength with 80 % power"]
             lines += [f"{name:<28}{amount(size):>12}  {unit}" for name, size, unit in absent]
         return "\n".join(line.rstrip() for line in lines)
 
@@ -127,7 +130,7 @@ class Report:
         return plain_report(self.diagnosis)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """A row per coefficient of what was named, and of what was not confirmed."""
+        """A row per coefficient of named effects and of hypotheses."""
         rows = [
             {
                 "effect": effect.name,

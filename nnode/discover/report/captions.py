@@ -148,9 +148,10 @@ def _places(outcome: DiagnosisOutcome) -> list[FigureBlock]:
                 "where",
                 place_curves(curves, unit),
                 f"Term ({unit}) that is missing from the model without effects, by variable, with "
-                "standard errors. It is estimated to first order and together with the model's "
-                "parameters, so it may exceed the difference of measured and simulated rates. The "
-                "interval of the table is shaded.",
+                "standard errors, estimated to first order together with the model's parameters. "
+                "These parameters can compensate for a part of a curve, often a constant. A curve "
+                "therefore shows the shape of the missing term, and may differ from measured minus "
+                "simulated rates in size and sign. The interval of the table is shaded.",
                 "; ".join(
                     f"{p.variable} {amount(p.low)} to {amount(p.high)} {p.unit}: "
                     f"{amount(p.deviation)} ± {amount(p.error, 2)} {unit}"

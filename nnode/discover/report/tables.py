@@ -183,8 +183,8 @@ def agents_table(d: Diagnosis) -> TableBlock:
 
 
 _VARIATIONS = {
-    "push": "acceleration noise",
-    "push_time": "correlation time of the noise",
+    "push": "process noise",
+    "push_time": "correlation time of the process noise",
     "measurement": "measurement error of positions",
 }
 
@@ -206,8 +206,8 @@ def drivers_table(d: Diagnosis) -> TableBlock:
             "left open per driver": lambda row: _percent(row.shrinkage),
         },
         "Standard deviations between drivers and over time, estimated together with the law. "
-        "Parameters that are not listed do not differ significantly between drivers. The noise "
-        "acts on speeds in laws of first order and on accelerations in laws of second order. "
+        "Parameters that are not listed do not differ significantly between drivers. The process "
+        "noise acts on speeds (laws of first order) or accelerations (second order). "
         "*Posterior variance*: of a driver's parameter, relative to the variance between drivers "
         "(median).",
         heads={
@@ -339,12 +339,16 @@ def base_table(d: Diagnosis) -> TableBlock:
         "with effects": lambda row: amount(row[1].get("after"), 4),
         "unit": lambda row: in_unit(row[1].get("unit", "")).strip() or NOTHING,
     }
-    caption = f"Calibrated parameters of {d.model}."
-    if d.effects:
-        caption += " A parameter that changes with the effects compensated for their absence."
-    else:
+    if not d.effects:
         columns.pop("with effects")
-    return _table("parameters", d.base.items(), columns, caption, heads={"alone": "value"})
+    return _table(
+        "parameters",
+        d.base.items(),
+        columns,
+        f"Calibrated parameters of {d.model}. A parameter that changes when effects are added "
+        "compensated for their absence.",
+        heads={"alone": "without effects"},
+    )
 
 
 def faults_table(d: Diagnosis) -> TableBlock:
