@@ -149,8 +149,8 @@ def _summary(report: Report, nothing: Report, truth: SlowZone) -> list[Block]:
             "calibrated law without and with the effect that the diagnosis adds. Dashed lines are "
             "the edges of the hidden zone, which are unknown to the diagnosis. All drivers are "
             "simulated with the parameters of the typical driver for two seconds at a time, so "
-            "differences between drivers remain. The law without the effect was also fitted to data "
-            "in the zone, so it deviates outside the zone as well. Grey: no vehicle.",
+            "differences between drivers remain. The law without the effect was also fitted to "
+            "data in the zone, so it deviates outside the zone as well. Grey: no vehicle.",
             f"Two space-time maps; {errors}.",
         ),
     ]

@@ -151,9 +151,8 @@ def verdict(d: Diagnosis) -> str:
             )
         case "unconfirmed":
             return (
-                f"Not confirmed: in the open data the model {d.model} seems to lack "
-                f"{_listed([e.name for e in d.leads])}, but {d.confirmation.reason}. It is not "
-                "added to the model."
+                f"Not confirmed: {_listed([e.name for e in d.leads])} would extend the model "
+                f"{d.model}, but {d.confirmation.reason}. It is not added to the model."
             )
         case "not_testable":
             c = d.clusters

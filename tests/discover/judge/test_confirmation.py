@@ -80,11 +80,9 @@ def test_what_is_not_confirmed_is_not_in_the_model_that_is_written(unconfirmed: 
 
 def test_the_page_says_first_that_nothing_is_confirmed(unconfirmed: Path) -> None:
     page = html.unescape((unconfirmed / "run" / "report.html").read_text())
-    first = page.index(
-        "Not confirmed: in the open data the model lin seems to lack relative_speed,"
-    )
-    assert first < page.index("It is not added to the model.") < page.index("What is missing</h2>")
-    assert "Found, not confirmed</h3>" in page
+    first = page.index("Not confirmed: relative_speed would extend the model lin, but")
+    assert first < page.index("It is not added to the model.") < page.index("Coefficients</h2>")
+    assert "Hypotheses that were not confirmed</h3>" in page
 
 
 def test_four_sealed_clusters_confirm_nothing_however_much_better_they_are() -> None:
@@ -92,7 +90,10 @@ def test_four_sealed_clusters_confirm_nothing_however_much_better_they_are() -> 
     d = found.diagnosis
     assert (d.verdict, d.effects, d.clusters.sealed) == ("unconfirmed", [], 4)
     assert [one.name for one in d.leads] == ["relative_speed"]
-    why = "4 sealed clusters are independent of the open ones, and it takes 5 to confirm anything"
+    why = (
+        "4 confirmation clusters are independent of the exploration clusters, and a confirmation "
+        "requires 5"
+    )
     assert d.confirmation.reason == why
     assert f"but {why}. It is not added to the model." in sentence(d)
     assert effects_of(found.extended) == []
@@ -107,9 +108,8 @@ def test_with_too_few_clusters_nothing_is_named_and_it_says_how_many_would_do() 
     effects = [one for one in CATALOGUE.of("traffic") if not one.individual]
     assert d.clusters.open == 8 < d.clusters.least == least_number(0.05, hypotheses=len(effects))
     assert not any(one.testable for one in d.absences if one.name in {e.name for e in effects})
-    assert "there are 8 open " in sentence(d)
-    assert " 3 sealed " in sentence(d)
-    assert f"about {d.clusters.enough} in all would do. Nothing is named." in sentence(d)
+    assert "8 exploration clusters and 3 confirmation clusters" in sentence(d)
+    assert f"about {d.clusters.enough} clusters are needed" in sentence(d)
     # so many would do, and not many fewer
     for number, do in ((d.clusters.enough, True), (d.clusters.enough - 3, False)):
         parts = divide(platoons(number=number, seconds=1.0), DiscoverOptions())
