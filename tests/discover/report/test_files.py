@@ -103,7 +103,7 @@ def test_an_estimate_has_the_digits_that_its_interval_leaves(
         ("none", "none of the catalogue improves the model stand-in significantly"),
         ("unknown", "The model stand-in deviates from the data, beyond speed_zone,"),
         ("indistinguishable", "the data cannot distinguish speed_zone from inertia"),
-        ("unconfirmed", "inertia, but the sealed clusters are no better"),
+        ("unconfirmed", "but the sealed clusters are no better"),
         ("not_testable", "The data are too few for a test: "),
     ],
 )
