@@ -59,7 +59,7 @@ def divide(
     index = index_of(sequences)
     label = clusters(index, options.gap, together=together)
     why = f"sequences of a site that {relation(index, options.gap)}"
-    why += " or are there at one time" if together else ""
+    why += " or overlap in time" if together else ""
     number = int(label.max()) + 1
     wanted = round(options.sealed * number)
     if number > 1:

@@ -102,7 +102,7 @@ def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
         found = divide(sequences, DiscoverOptions(), together=together)
         assert_sound(found, sequences)
         assert found.number([*found.exploration, *found.confirmation]) == number
-        assert found.why.endswith("or are there at one time") == together
+        assert found.why.endswith("or overlap in time") == together
     assert len(found.confirmation) == 10
 
 

@@ -81,9 +81,9 @@ def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -
 
 
 _ERRORS = {
-    "traffic": "Mean square error of whole sequences in exploration clusters that were left out of "
+    "traffic": "mean square error of whole sequences in exploration clusters that were left out of "
     "the calibration.",
-    "crowd": "Mean square error in the exploration clusters, which were used in the calibration.",
+    "crowd": "mean square error in the exploration clusters, which were used in the calibration.",
 }
 
 
@@ -345,7 +345,7 @@ def base_table(d: Diagnosis) -> TableBlock:
         "parameters",
         d.base.items(),
         columns,
-        f"Calibrated parameters of {d.model}. A parameter that changes when effects are added "
+        f"Calibrated parameters of {d.model}. If effects are added, a parameter changes that "
         "compensated for their absence.",
         heads={"alone": "without effects"},
     )

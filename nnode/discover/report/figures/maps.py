@@ -15,6 +15,8 @@ from nnode.plots.style import DIVERGING, FONT, GREY, SEQUENTIAL, SMALL_FONT, dre
 #: Smallest and largest number of cells along a side of a coloured map, with about PER_CELL values
 #: in each.
 CELLS, PER_CELL = (12, 48), 3
+#: Largest height of a map of a plane, inches.
+TALL = 6.5
 #: A mean of fewer values is not shown in maps of arrows.
 LEAST = 3
 #: The scale of colours and arrows ends at this percentile of the map before.
@@ -155,7 +157,7 @@ def _arrows(
     wide = (high - low)[0] > 1.6 * (high - low)[1]
     rows, columns = (len(panels), 1) if wide else (1, len(panels))
     ratio = float(np.clip((high - low)[1] / max((high - low)[0], 1e-6), 0.25, 1.6))
-    width = 8.0 / columns if columns > 1 else 7.2
+    width = min(8.0 / columns if columns > 1 else 7.2, TALL / ratio)
     figure = new_figure(width * columns + 1.0, (0.92 * width * ratio + 0.5) * rows + 0.3)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     fields = []

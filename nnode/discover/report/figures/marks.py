@@ -116,6 +116,8 @@ def confirmation_costs(
         np.asarray(costs, float)[order] for costs in (before, before if after is None else after)
     )
     place = np.arange(len(order))
+    recordings = {name.rpartition("/")[0] for name in names}
+    shared = f"{recordings.pop()}/" if len(recordings) == 1 and "" not in recordings else ""
     figure = new_figure(7.2, 3.2)
     ax = figure.subplots()
     ax.vlines(place, np.minimum(b, a), np.maximum(b, a), color=GREY, linewidth=1)
@@ -132,10 +134,12 @@ def confirmation_costs(
         ax.axhline(floor, color="black", linestyle="--", linewidth=0.9)
         handles.append(Line2D([], [], color="black", linestyle="--", label="measurement noise"))
     if len(order) <= NAMED:
-        ax.set_xticks(place, [names[i] for i in order], rotation=40, ha="right")
+        short = [names[i].removeprefix(shared) for i in order]
+        ax.set_xticks(place, short, rotation=40, ha="right")
     else:
         ax.set_xticks([])
-    dress(ax, x="confirmation sequence", y="mean square error (m²)")
+    of = f" of {shared.rstrip('/')}" if shared else ""
+    dress(ax, x=f"confirmation sequence{of}", y="mean square error (m²)")
     figure.legend(
         handles=handles, loc="outside upper center", ncols=3, frameon=False, fontsize=SMALL_FONT
     )

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nnode.data.sequence import Sequence
-from nnode.discover.report.figures.maps import draw_walls
+from nnode.discover.report.figures.maps import TALL, draw_walls
 from nnode.discover.report.figures.marks import AFTER, BEFORE
 from nnode.pages.replay import Scene
 from nnode.plots.style import GREY, SMALL_FONT, dress, new_figure
@@ -148,7 +148,7 @@ def _planes(
         figure = new_figure(side, (0.9 * side * ratio + 0.45) * number + 0.6)
         grid = figure.subplots(number, 1, sharex=True, sharey=True, squeeze=False)
     else:
-        width = side / number
-        figure = new_figure(side + 0.6, 0.9 * width * ratio + 1.1)
+        width = min(side / number, TALL / ratio)
+        figure = new_figure(width * number + 0.6, 0.9 * width * ratio + 1.1)
         grid = figure.subplots(1, number, sharex=True, sharey=True, squeeze=False)
     return figure, list(grid.ravel())
