@@ -269,6 +269,11 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
     parts: list[dict[str, Any]] = []
     contents: list[dict[str, Any]] = []
     fold: int | None = None  # level of the folded section that is open
+
+    def add(kind: str, block: TableBlock | FigureBlock | ReplayBlock, **content: Any) -> None:
+        caption = Markup(text.renderInline(block.caption.strip()))
+        parts.append({"kind": kind, "name": block.name, "caption": caption, **content})
+
     for block in [*blocks, None]:
         if fold and (block is None or (isinstance(block, Heading) and block.level <= fold)):
             parts.append({"kind": "end of fold"})
@@ -277,55 +282,22 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
             case Heading(words, level, folded):
                 slug = _slug(words, taken)
                 fold = level if folded and fold is None else fold
-                parts.append(
-                    {
-                        "kind": "heading",
-                        "text": words,
-                        "level": level,
-                        "id": slug,
-                        "folded": fold == level,
-                    }
-                )
+                part = {"kind": "heading", "text": words, "level": level, "id": slug}
+                parts.append({**part, "folded": folded and fold == level})
                 if level <= 3:
                     contents.append(parts[-1])
             case Text(markdown):
                 parts.append({"kind": "text", "html": Markup(text.render(markdown))})
             case TableBlock():
-                parts.append(
-                    {
-                        "kind": "table",
-                        "name": block.name,
-                        "caption": Markup(text.renderInline(block.caption.strip())),
-                        "grid": block.grid(),
-                        "folded": len(block.frame) > ROWS,
-                        "csv": _base64(block.csv().encode()),
-                    }
-                )
+                grid, csv = block.grid(), _base64(block.csv().encode())
+                add("table", block, grid=grid, csv=csv, folded=len(block.frame) > ROWS)
             case FigureBlock():
                 width, height = (round(_PIXELS * side) for side in block.figure.get_size_inches())
-                parts.append(
-                    {
-                        "kind": "figure",
-                        "name": block.name,
-                        "caption": Markup(text.renderInline(block.caption.strip())),
-                        "alt": block.alt.strip(),
-                        "png": _base64((folder / FIGURES / f"{block.name}.png").read_bytes()),
-                        "width": width,
-                        "height": height,
-                    }
-                )
+                png = _base64((folder / FIGURES / f"{block.name}.png").read_bytes())
+                add("figure", block, alt=block.alt.strip(), png=png, width=width, height=height)
             case ReplayBlock():
                 data, said = block.data()
-                parts.append(
-                    {
-                        "kind": "replay",
-                        "name": block.name,
-                        "caption": Markup(text.renderInline(block.caption.strip())),
-                        "alt": block.alt.strip(),
-                        "data": Markup(data),
-                        "said": said,
-                    }
-                )
+                add("replay", block, alt=block.alt.strip(), data=Markup(data), said=said)
     environment = Environment(
         loader=PackageLoader("nnode.pages", "template"),
         autoescape=True,
