@@ -154,9 +154,11 @@ def _arrows(
     # squares of about a step's length, at most 24 along the longer side
     side = max(size / 24, 0.4)
     edges = tuple(np.arange(a - side / 2, b + side, side) for a, b in zip(low, high, strict=True))
-    wide = (high - low)[0] > 1.6 * (high - low)[1]
+    ends = np.vstack([[low, high], np.empty((0, 2)) if walls is None else walls.reshape(-1, 2)])
+    across, along = np.ptp(ends, axis=0)
+    wide = across > 1.6 * along
     rows, columns = (len(panels), 1) if wide else (1, len(panels))
-    ratio = float(np.clip((high - low)[1] / max((high - low)[0], 1e-6), 0.25, 1.6))
+    ratio = float(np.clip(along / max(across, 1e-6), 0.25, 1.6))
     width = min(8.0 / columns if columns > 1 else 7.2, TALL / ratio)
     figure = new_figure(width * columns + 1.0, (0.92 * width * ratio + 0.5) * rows + 0.3)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
