@@ -54,8 +54,8 @@ def player(name: str, every: list[Scene], what: str, total: int) -> ReplayBlock:
     return ReplayBlock(
         name,
         every,
-        f"{what} Outlines are where agents were measured; arrows, the residuals, go there from "
-        "where they are simulated.",
+        f"{what} Outlines are measured agents. Arrows lead from the simulated to the measured "
+        "position. The player opens on the sequence with the median error.",
         f"Player of {len(every)} sequences: agents as measured and as simulated.",
         total=total,
     )

@@ -26,8 +26,8 @@ from nnode.errors import ConfigError, NNodeError, printable
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page
 
-#: Level of a finding to its printed label.
-_SIGNS = {"error": "ERROR", "warning": "look", "note": "note"}
+#: Stands before what is printed of each level.
+_SIGNS = {"error": "ERROR", "warning": "WARN", "note": "note"}
 
 
 @dataclass(frozen=True, repr=False)
@@ -117,12 +117,10 @@ def command(examination: Examination) -> list[str]:
 
 
 def sentence(examination: Examination) -> str:
-    """The content of the file and the number of findings in a sentence."""
-    levels = [finding.level for finding in examination.findings]
-    errors, warnings = levels.count("error"), levels.count("warning")
-    wrong = (
-        f"{errors} error{'s' * (errors != 1)}, {warnings} thing{'s' * (warnings != 1)} to look at"
-    )
+    """What there is, in a sentence."""
+    levels = [one.level for one in examination.findings]
+    errors, looks = levels.count("error"), levels.count("warning")
+    wrong = f"{errors} error{'s' * (errors != 1)} and {looks} warning{'s' * (looks != 1)}"
     who = "people" if examination.scale.domain == "crowd" else "vehicles"
     return (
         f"{len(set(examination.rows.agent.tolist()))} {who}, {len(examination.rows)} positions, "
@@ -146,8 +144,8 @@ def summary(examination: Examination, lines: list[str]) -> str:
         for finding in examination.findings
     ]
     words = " ".join(lines)
-    text += ["", "to read it:", f"  nnode prepare_data {words}"]
-    text += ["to calibrate a model, and to diagnose it:"]
+    text += ["", "to prepare the data:", f"  nnode prepare_data {words}"]
+    text += ["to calibrate and to diagnose a model:"]
     text += [f"  {line}" for line in _next_commands(examination, words)]
     text += ["in Python:", *(f"  {line}" for line in python_lines(examination))]
     return "\n".join(printable(line) for line in text)
@@ -222,15 +220,15 @@ def _units(examination: Examination) -> str:
 
 
 def blocks(examination: Examination, lines: list[str]) -> list[Block]:
-    """The blocks of the page: findings, commands, columns, units and figures."""
+    """The page: findings, commands, and the content of the file."""
     return [
-        Heading("What was found"),
+        Heading("Findings"),
         *_findings(examination.findings),
-        Heading("To read it"),
+        Heading("Commands"),
         Text(_usage(examination, lines)),
         *_columns(examination),
         *_units_blocks(examination),
-        Heading("What it holds"),
+        Heading("Speeds, sampling and presence"),
         *_figures(examination),
     ]
 
@@ -244,11 +242,13 @@ def _rows(findings: list[Finding]) -> pd.DataFrame:
 
 def _findings(findings: list[Finding]) -> list[Block]:
     if not findings:
-        return [Text("Nothing.")]
+        return [Text("There are no findings.")]
     caption = (
-        "*error*: results would be wrong. *warning*: look at it before you go on. *note*: to know."
+        "*Error*: results would be wrong. *Warning*: check the data before you continue. *Note*: "
+        "information."
     )
-    return [TableBlock("findings", _rows(findings), caption)]
+    heads = {"what": "kind", "in words": "finding"}
+    return [TableBlock("findings", _rows(findings), caption, heads=heads)]
 
 
 def _usage(examination: Examination, lines: list[str]) -> str:
@@ -264,9 +264,9 @@ def _columns(examination: Examination) -> list[Block]:
         return []
     frame = examination.raw.table.frame
     reasons = {
-        "named": "has the name of its meaning",
-        "like": "by its name",
-        "holds": "by what it holds",
+        "named": "column name",
+        "like": "similar column name",
+        "holds": "content",
     }
     by = {guess.column: (meaning, guess) for meaning, guess in examination.meanings.items()}
     rows = {}
@@ -284,19 +284,27 @@ def _columns(examination: Examination) -> list[Block]:
             "empty": int(cells.isna().sum()),
         }
     table = pd.DataFrame(rows).T.rename_axis("column")
-    return [Heading("Columns"), TableBlock("columns", table, "What each column is taken for.")]
+    heads = {
+        "because": "recognised by",
+        "least": "minimum",
+        "greatest": "maximum",
+        "different": "distinct values",
+        "empty": "missing values",
+    }
+    caption = "Recognised meaning of each column."
+    return [Heading("Columns"), TableBlock("columns", table, caption, heads=heads)]
 
 
 def _units_blocks(examination: Examination) -> list[Block]:
     scale, measured = examination.scale, examination.known
     ranges = USUAL[scale.domain]
     values = {
-        "speed of those that move (m/s)": (measured.speed * scale.metres / scale.seconds, "speed"),
-        "distance to the nearest (m)": (measured.nearest * scale.metres, "nearest"),
+        "speed of moving agents (m/s)": (measured.speed * scale.metres / scale.seconds, "speed"),
+        "distance to the nearest agent (m)": (measured.nearest * scale.metres, "nearest"),
         "length (m)": (measured.length * scale.metres, "length"),
         "sway (1/s)": (measured.sway / scale.seconds, "sway"),
         "sampling interval (s)": (measured.dt * scale.seconds, INTERVAL),
-        "speed by positions over speed in the file": (
+        "speed from positions / speed in the file": (
             measured.ratio * scale.metres / (scale.per_second * scale.seconds),
             AGREE,
         ),
@@ -312,8 +320,13 @@ def _units_blocks(examination: Examination) -> list[Block]:
             }
     blocks: list[Block] = [
         Heading("Units and time scale"),
-        Text(f"Taken: {_units(examination)}: {certainty(share(examination.scales))}."),
-        TableBlock("medians", pd.DataFrame(rows).T, "Medians in SI units, and what is usual."),
+        Text(f"Assumed: {_units(examination)} ({certainty(share(examination.scales))})."),
+        TableBlock(
+            "medians",
+            pd.DataFrame(rows).T,
+            "Medians in SI units, and usual ranges.",
+            heads={"here": "median", "usual": "usual range"},
+        ),
     ]
     if len(examination.scales) > 1:
         table = pd.DataFrame(
@@ -333,10 +346,11 @@ def _units_blocks(examination: Examination) -> list[Block]:
             TableBlock(
                 "units",
                 table.head(6),
-                "Combinations of units by how well these medians agree with what is usual; all of "
-                "them in the CSV.",
+                "Combinations of units by the agreement of these medians with the usual ranges. "
+                "The CSV file contains all combinations.",
                 digits={"probability": 3},
                 full=table,
+                heads={"of": "domain"},
             )
         )
     return blocks
@@ -351,13 +365,13 @@ def _figures(examination: Examination) -> list[Block]:
         FigureBlock(
             "speeds",
             plots.speeds(rows, USUAL[domain]["speed"]),
-            "Speeds over ten samples, and steps in time. Shaded: what is usual.",
+            "Speeds over ten samples, and sampling steps. Shaded: usual range.",
             "Histograms of speeds in m/s and of sampling steps in s.",
         ),
         FigureBlock(
             "presence",
             plots.presence(rows, domain),
-            "Above, where agents are over time, of many a part; below, how many there are.",
+            "Positions of a part of the agents over time (top), and number of agents (bottom).",
             "Paths over time, and the number of agents over time.",
         ),
     ]
@@ -366,8 +380,8 @@ def _figures(examination: Examination) -> list[Block]:
             FigureBlock(
                 "faults",
                 faults_figure(examination.sequences, examination.faults, domain, 10),
-                f"Sequences that data={examination.source.group} makes, with faults marked; the "
-                f"first 10 of {len(examination.faults)}.",
+                f"Sequences of data={examination.source.group} with marked faults; the first 10 of "
+                f"{len(examination.faults)}.",
                 "Positions over time of faulty sequences, faults marked.",
             )
         )

@@ -1,8 +1,8 @@
 """The demonstration: ``python -m nnode.app.demo FOLDER``, which ``make demo`` runs.
 
-It checks a table of platoons, calibrates a law, and diagnoses it for a table with a hidden effect
-and for a table without one. Then networks learn the forces in a crowd. All printed and displayed
-values are results of this run.
+A table of platoons is checked, a law is calibrated, and a diagnosis finds the effect that the law
+lacks. A second diagnosis uses a table without a hidden effect, and networks learn the forces in a
+crowd. All printed and shown values come from the results of this run.
 """
 
 from __future__ import annotations
@@ -74,14 +74,14 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
     raw = demo_data(folder / "raw", seed, platoons)
     _step("1/6 A table of platoons")
     data = _data(raw["table"], truth, platoons)
-    _step("2/6 What does the table hold?")
+    _step("2/6 Check of the table")
     checked = _checked(raw["table"], folder)
-    _step("3/6 Calibration, with nothing hidden: truth beside estimate")
+    _step("3/6 Calibration without a hidden effect: truth and estimate")
     calibration = _calibration(raw["nothing_hidden"], truth, folder)
-    _step("4/6 What does the law lack? A slow zone is hidden")
+    _step("4/6 Diagnosis with a hidden slow zone")
     report = _diagnosed(raw["table"], folder / "diagnosis")
     lacking = _lacking(report, truth)
-    _step("5/6 The same table with nothing hidden")
+    _step("5/6 Diagnosis without a hidden effect")
     nothing = _diagnosed(raw["nothing_hidden"], None)
     absent = _absent(nothing)
     _step("6/6 Forces between people, learned by networks")
@@ -101,7 +101,7 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
             Provenance({**facts, "Seed of the data": f"{seed}", "Time": f"{seconds:.0f} s"}),
         ],
         folder,
-        title="nnode: what a law lacks, found in a table of platoons",
+        title="nnode: a missing effect, found in a table of platoons",
         subtitle=_headline(report, nothing),
         stem=PAGE,
     )
@@ -127,7 +127,7 @@ def _summary(report: Report, nothing: Report, truth: SlowZone) -> list[Block]:
     gap = report.gap
     lines = [
         f"**With a hidden slow zone:** {report.sentence}",
-        f"**With nothing hidden:** {nothing.sentence} {_missed(nothing)}",
+        f"**Without a hidden effect:** {nothing.sentence} {_missed(nothing)}",
     ]
     if report.effects:
         hidden = f"alpha = {truth.alpha:g}, a = {truth.a:g} m, b = {truth.b:g} m"
@@ -136,7 +136,7 @@ def _summary(report: Report, nothing: Report, truth: SlowZone) -> list[Block]:
     for ax in figure.axes[: 1 + bool(report.effects)]:
         for place in (truth.a, truth.b):
             ax.axhline(place, color="black", linewidth=0.9, linestyle="--")
-    errors = f"error on held-back platoons: {amount(gap.before)} m²"
+    errors = f"error on confirmation platoons: {amount(gap.before)} m²"
     if report.effects:
         errors += f" before, {amount(gap.after)} m² after; noise floor {amount(gap.noise_floor)} m²"
     figure.suptitle(errors, fontsize=10)
@@ -145,12 +145,12 @@ def _summary(report: Report, nothing: Report, truth: SlowZone) -> list[Block]:
         FigureBlock(
             "map",
             figure,
-            "Measured minus simulated speed of all platoons by time and place, for the calibrated "
-            "law alone and with the effect that the diagnosis adds. Dashed lines are the edges of "
-            "the hidden zone, which the diagnosis is not told. Every driver is simulated as the "
-            "typical driver, for two seconds at a time, so differences between drivers remain on "
-            "the right. The law alone was fitted to the zone as well, so it deviates outside it "
-            "too. Grey: nobody was there.",
+            "Measured minus simulated speed of all platoons by time and position, for the "
+            "calibrated law without and with the effect that the diagnosis adds. Dashed lines are "
+            "the edges of the hidden zone, which are unknown to the diagnosis. All drivers are "
+            "simulated with the parameters of the typical driver for two seconds at a time, so "
+            "differences between drivers remain. The law without the effect was also fitted to "
+            "data in the zone, so it deviates outside the zone as well. Grey: no vehicle.",
             f"Two space-time maps; {errors}.",
         ),
     ]
@@ -160,8 +160,8 @@ def _headline(report: Report, nothing: Report) -> str:
     names = ", ".join(effect.name for effect in report.effects) or "nothing"
     other = ", ".join(effect.name for effect in nothing.effects) or "nothing"
     return (
-        "A stretch of road is secretly slower in one table of synthetic platoons: the diagnosis "
-        f"names **{names}**. The second table hides nothing: the diagnosis names **{other}**."
+        "One table of synthetic platoons contains a hidden slow zone, and the diagnosis names "
+        f"**{names}**. The second table contains none, and the diagnosis names **{other}**."
     )
 
 
@@ -178,15 +178,15 @@ def _data(path: Path, truth: SlowZone, platoons: int) -> list[Block]:
         f"{platoons} platoons of {table.agent.nunique() // platoons} cars, {len(table)} positions. "
         f"Each car follows dx/dt = v0 (1 − L/gap) with L = {truth.L:g} m; drivers differ in v0 "
         f"(mean {truth.v0:g} m/s, standard deviation {100 * truth.drivers:g} %). Positions carry "
-        f"an error of {truth.noise:g} m. Between {truth.a:g} and {truth.b:g} m all cars drive at "
-        f"{truth.alpha:g} times that speed: this is hidden."
+        f"an error of {truth.noise:g} m. The hidden zone lies between {truth.a:g} and "
+        f"{truth.b:g} m, where all cars drive at {truth.alpha:g} times this speed."
     )
     print(words)
     print(table.head(3).to_string(index=False))
     return [
         Heading("The table"),
-        Text(words + " A second table has the same drivers, leaders and errors, and no zone."),
-        TableBlock("rows", table.head(3), "The first rows: times in s, positions in m."),
+        Text(words + " A second table has the same drivers, leaders and errors without a zone."),
+        TableBlock("rows", table.head(3), "First rows. Times are in s, positions in m."),
     ]
 
 
@@ -194,17 +194,14 @@ def _checked(path: Path, folder: Path) -> list[Block]:
     check = nnode.check(path)
     check.write(folder / "check")
     print(check)
-    rows = [
-        {"level": finding.level, "what": finding.kind, "finding": finding.text}
-        for finding in check.findings
-    ]
+    rows = [{"level": one.level, "kind": one.kind, "finding": one.text} for one in check.findings]
     return [
-        Heading("What does the table hold?"),
+        Heading("Check"),
         Text(f"```sh\nnnode check {path}\n```"),
         TableBlock(
             "findings",
             pd.DataFrame(rows),
-            "What `check` finds before anything is computed; its own page is `check/check.html`.",
+            "Findings of `nnode check`. The page `check/check.html` contains the details.",
         ),
     ]
 
@@ -235,40 +232,38 @@ def _calibration(path: Path, truth: SlowZone, folder: Path) -> list[Block]:
         Heading("Calibration"),
         Text(
             "```python\nrun = nnode.fit(table, 'traffic', model='lin', leader='measured', "
-            f"drivers='auto')\n```\n\nThe table without a zone, so that the law is the right one. "
-            f"All {run.fit.sequences} platoons are used. `auto` finds by the marginal likelihood "
-            f"that drivers differ in {' and '.join(run.drivers.differ) or 'nothing'}."
+            "drivers='auto')\n```\n\nThe law is correct for the table without a zone. All "
+            f"{run.fit.sequences} platoons are used. Parameters that differ between drivers, "
+            f"selected by the marginal likelihood: {', '.join(run.drivers.differ) or 'none'}."
         ),
         TableBlock(
             "estimates",
             estimates,
-            "Truth beside estimate, with intervals of 95 % by platoons. *Covered*: the truth lies "
-            "in the interval.",
+            "Truth and estimate with 95 % intervals by platoons. *Covered*: the interval contains "
+            "the truth.",
             digits=3,
         ),
         FigureBlock(
             "law",
             law,
-            "The law of the median driver, read from its checkpoint, over the measured gaps.",
+            "Speed of the median driver by gap, and the measured gaps.",
             "Speed against gap, with a histogram of measured gaps.",
         ),
-        Heading("Beside SciPy", 3),
+        Heading("Comparison with SciPy", 3),
         Text(
-            "The same problem of least squares for both: two parameters that all drivers share, "
-            "the differences between simulated and measured positions of all followers, cars "
-            "simulated together behind the measured leader from their first measured positions, "
-            "Euler's scheme with the same step, the same start (v0 = 30 m/s, L = 5 m). SciPy's "
-            "`least_squares` has its default method (trust region) and tolerances, a simulation in "
-            "NumPy that advances all platoons at once, and differences for the Jacobian; nnode has "
-            "Gauss and Newton's method with compiled exact derivatives. Both wall times are from "
-            "the data in memory to the result; that of nnode includes intervals."
+            "Both programs solve the same least-squares problem: two parameters that all drivers "
+            "share, residuals of the positions of all followers, platoons simulated behind the "
+            "measured leader from the first measured positions, Euler's method with the same step, "
+            "and the same start (v0 = 30 m/s, L = 5 m). SciPy's `least_squares` uses its default "
+            "method (trust region) and tolerances, a vectorised simulation in NumPy, and finite "
+            "differences. nnode uses the Gauss–Newton method with compiled exact derivatives. Wall "
+            "times are measured from the data in memory to the result, for nnode with intervals."
         ),
         TableBlock(
             "scipy",
             compared,
-            "Two programs, one problem; one run each. *First call*: with the compilation, or with "
-            "loading what an earlier run compiled. Here all drivers share their parameters; the "
-            "calibration above lets them differ.",
+            "Results of one run each. *First call*: includes compilation, or loading of earlier "
+            "compiled code. All drivers share their parameters, unlike in the calibration above.",
             digits={"v0 (m/s)": 4, "L (m)": 4, "RMSE (m)": 5},
         ),
     ]
@@ -385,43 +380,40 @@ def _lacking(report: Report, truth: SlowZone) -> list[Block]:
             rows["v0 between drivers (%)"] = (100 * truth.drivers, *values)
     table = _with_truth(rows)
     print(table.to_string())
-    words = (
-        "Estimates with the effects, beside what was put into the data; intervals of 95 % by "
-        "platoons."
-    )
+    words = "Truth and estimates with the effects, with 95 % intervals by platoons."
     if zone is not None and "no" in list(table["covered"]):
         words += (
-            " An interval allows for errors of measurement and for drivers, and takes the form of "
-            f"the effect for granted, `{zone.formula}`. The hidden zone ends in a step. Estimates "
-            "of its strength and ends shift by what the two forms differ, and of all other "
-            "intervals one in twenty misses the truth by chance."
+            " Intervals account for measurement errors and drivers and assume the form of the "
+            f"effect, `{zone.formula}`. The hidden zone has sharp edges, which shifts the "
+            "estimates of its strength and edges. Of the other intervals, 5 % do not contain the "
+            "truth by chance."
         )
     at = next((p for p in d.places if p.variable == "position"), None)
     where = ""
     if at is not None:
         where = (
-            f" Alone, the law deviates most between {at.low:.0f} and {at.high:.0f} m, by "
-            f"{amount(at.deviation)} ± {amount(at.error, 2)} m/s (mean and standard error)."
+            f" The largest missing term of the law lies between {at.low:.0f} and {at.high:.0f} m "
+            f"({amount(at.deviation)} ± {amount(at.error, 2)} m/s to first order)."
         )
         print(where.strip())
     clusters = report.clusters
     return [
-        Heading("What does the law lack?"),
+        Heading("Diagnosis with a hidden zone"),
         Text(
             "```python\nreport = nnode.diagnose(table, 'traffic', model='lin', folder='runs/mine')"
-            f"\n```\n\n{clusters.open} platoons are searched, {clusters.sealed} are held back to "
-            f"test what was found.{where} The catalogue has {len(d.absences) + len(d.effects)} "
-            "effects for this law and these data; the slow zone is one of them. The diagnosis in "
-            "full is `diagnosis/report.html`, the map is at the head of this page."
+            f"\n```\n\nThe search uses {clusters.open} exploration platoons, and the test uses "
+            f"{clusters.sealed} confirmation platoons.{where} The catalogue contains "
+            f"{len(d.absences) + len(d.effects)} effects for this law and these data, including "
+            "slow zones. The page `diagnosis/report.html` contains the full diagnosis."
         ),
         TableBlock("effects", table, words, digits=4),
         FigureBlock(
             "sealed",
             report.plot("sealed"),
-            f"Every held-back platoon before and after; mean {amount(gap.before)} m² before, "
-            f"{amount(gap.after)} m² after. {gap.definition} The law and the effects are those of "
-            "the searched platoons; a driver's own deviation is estimated from the held-back one.",
-            "Mean square errors of held-back platoons, in pairs.",
+            f"Errors of the confirmation platoons; mean {amount(gap.before)} m² before, "
+            f"{amount(gap.after)} m² after. {gap.definition} Law and effects are calibrated on "
+            "exploration platoons, and the deviation of a driver on the confirmation platoon.",
+            "Mean square errors of confirmation platoons, in pairs.",
         ),
     ]
 
@@ -440,16 +432,17 @@ def _absent(report: Report) -> list[Block]:
         for absence in report.diagnosis.absences
     ]
     return [
-        Heading("The same table with nothing hidden"),
+        Heading("Diagnosis without a hidden zone"),
         Text(f"{report.sentence} {missed}"),
         TableBlock(
             "absences",
             pd.DataFrame(rows),
-            "*Found from*: the smallest change of the coefficient, or the setting of an effect "
-            "without a strength, that is named and confirmed on held-back platoons with a "
-            "probability of 80 %. The search has a level of "
-            f"{100 * DiscoverOptions().alpha:g} % over all effects: where nothing is hidden, it "
-            "may find something in about that share of tables.",
+            "Effects that were not found. *Detectable*: smallest change of the coefficient, or "
+            "setting of an effect without a strength, that is named and confirmed with a power of "
+            f"80 %. The search has a level of {100 * DiscoverOptions().alpha:g} % over all "
+            "effects, so about this share of tables without a hidden effect yields a false "
+            "hypothesis.",
+            heads={"found from": "detectable"},
         ),
     ]
 
@@ -460,12 +453,11 @@ def _missed(report: Report) -> str:
     if zone is None:
         return ""
     if not zone.testable:
-        return f"A slow zone may have been missed: {zone.reason}."
+        return f"A slow zone cannot be excluded: {zone.reason}."
     size = amount(100 * (zone.detectable or 0))
     return (
-        f"A zone that changes speeds by {size} % or more would have been "
-        f"named with a probability of at least 80 % ({zone.reason}); a weaker one may have "
-        "been missed."
+        f"A zone that changes speeds by {size} % or more is named with a power of at least 80 % "
+        f"({zone.reason})."
     )
 
 
@@ -490,12 +482,12 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
     reach = 2 * forces.r + forces.B * np.log(forces.A / _WEAK)
     command = f"nnode train experiment=demo_crowd data.source={path.parents[1]}"
     return [
-        Heading("Forces between people"),
+        Heading("Forces in a crowd"),
         Text(
             f"```sh\n{command}\ntensorboard --logdir {folder}\n```\n\nThe paper's model of a crowd:"
-            " networks with one hidden layer are the forces from people and from walls, calibrated "
-            "by the gradient of the trajectory error through the simulation. The mean cost of a "
-            f"training sequence falls from {amount(costs['cost_start'])} to "
+            " networks with one hidden layer represent the forces from people and from walls. They "
+            "are calibrated with the gradient of the trajectory error. The mean cost of a training "
+            f"sequence decreases from {amount(costs['cost_start'])} to "
             f"{amount(costs['cost_train'])} m² s; that of a held-out sequence is "
             f"{amount(costs['cost_heldout'])} m² s. The force is drawn from the checkpoint; "
             "TensorBoard shows the loss by epoch."
@@ -504,10 +496,9 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
             "force",
             force_figure(model, [store[i] for i in range(len(store))]),
             "Both components of the force on one of two people who meet head-on, by relative "
-            "position. Dots are relative positions of people who were measured at one time. The "
-            "data were made with a repulsion that falls below "
-            f"{_WEAK:g} N at {reach:.2g} m, so what is drawn beyond is the error of this short "
-            "calibration.",
+            "position. Dots are measured relative positions. The true repulsion is below "
+            f"{_WEAK:g} N beyond {reach:.2g} m, so forces at larger distances are errors of this "
+            "short calibration.",
             "Contours of both components of a force by relative position.",
         ),
     ]
@@ -517,7 +508,8 @@ def _own_table() -> list[Block]:
     return [
         Heading("Your own table"),
         Text(
-            "A CSV with a row per car and sample is enough; columns and units are recognised.\n\n"
+            "A CSV file with a row per car and sample is sufficient. Columns and units are "
+            "recognised.\n\n"
             "```sh\nnnode check mine.csv\n```\n\n"
             "```python\nimport nnode\n\nreport = nnode.diagnose('mine.csv', model='idm', "
             "folder='runs/mine')\nprint(report.summary())\n```"

@@ -102,7 +102,7 @@ def discover(config: DictConfig, folder: Path) -> None:
         paths = [write() for write in reversed(written)][::-1]
     _print(diagnoses[0][1], paths[0], time.monotonic() - start)
     if len(diagnoses) > 1:
-        print(f"\nthe law that comes nearest, {diagnoses[1][0].name}:")
+        print(f"\nthe best law, {diagnoses[1][0].name}:")
         _print(diagnoses[1][1], paths[1], time.monotonic() - start)
     if guard.requested:
         name = signal.Signals(guard.requested).name
@@ -316,8 +316,8 @@ def _print(outcome: DiagnosisOutcome, paths: Mapping[str, Path], seconds: float)
         print(f"  {effect.name}: {interval(effect)}")
         print(f"    {effect.formula}; {effect.where}")
         for other in effect.alternatives:
-            number = f", or about {other.clusters} open clusters" if other.clusters else ""
-            print(f"    not to be told from {other.name}: {other.separated_by}{number}")
+            number = f", or about {other.clusters} exploration clusters" if other.clusters else ""
+            print(f"    not distinguishable from {other.name} without {other.separated_by}{number}")
     for what, path in paths.items():
         print(f"{what}: {path}")
     print(f"time: {seconds:.1f} s")

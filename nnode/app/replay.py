@@ -25,8 +25,8 @@ from nnode.pages.page import write_player
 from nnode.pages.replay import MOST, ReplayBlock, Scene, Zone
 
 _CAPTION = (
-    "Outlines are where agents were measured; arrows, the residuals, go there from where they are "
-    "simulated."
+    "Outlines are measured agents. Arrows lead from the simulated to the measured position. The "
+    "player opens on the sequence with the median error."
 )
 
 

@@ -723,9 +723,9 @@ def sequence_findings(
         if noise.beyond:
             law = "a law of second order" if domain == "traffic" else "a social force"
             window = suggested_window(noise, sequences[0].dt)
-            text += f", more than the {BEARABLE:g} m/s that {law} bears: "
+            text += f", above the limit of {BEARABLE:g} m/s for {law}; "
             if domain == "traffic":
-                text += "training and fits smooth and fit first speeds by themselves; "
+                text += "training and fits estimate initial speeds from smoothed paths; "
             text += f"data.smooth={window:g} (s) smooths positions and speeds"
             level = "warning"
         yield Finding("noise", level, text)

@@ -66,7 +66,7 @@ class Noise:
             return "noise of measured positions: unknown, as sequences have fewer than 9 samples"
         return (
             f"noise of measured positions: {self.position:.2g} m (standard deviation, by fourth "
-            f"differences); first speeds are uncertain by {self.start_speed:.2g} m/s"
+            f"differences); standard error of initial speeds: {self.start_speed:.2g} m/s"
         )
 
 

@@ -59,7 +59,7 @@ def divide(
     index = index_of(sequences)
     label = clusters(index, options.gap, together=together)
     why = f"sequences of a site that {relation(index, options.gap)}"
-    why += " or are there at one time" if together else ""
+    why += " or overlap in time" if together else ""
     number = int(label.max()) + 1
     wanted = round(options.sealed * number)
     if number > 1:
@@ -69,8 +69,8 @@ def divide(
             return Division(label, np.flatnonzero(~out).tolist(), np.flatnonzero(out).tolist(), why)
     parts = split(index, SplitOptions(heldout=options.sealed, gap=options.gap, seed=options.seed))
     note = (
-        "The sealed sequences are a block of time: all sequences are connected, and those that are "
-        "sealed are not independent of the others."
+        "All sequences are connected. The confirmation sequences are a block of time and are not "
+        "independent of the exploration sequences."
     )
     return Division(label, parts.train, parts.heldout, why, note)
 

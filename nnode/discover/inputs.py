@@ -105,9 +105,9 @@ def inputs_of(store: Source, options: DataOptions) -> Inputs:
 def _measured(store: Source) -> list[str]:
     """Notes on the measurement for the report."""
     noise, filled = noise_of(store), store.manifest.get("filled", [])
-    text = f"The {noise}."
+    text = f"N{str(noise)[1:]}."
     if noise.beyond:
-        text = text[:-1] + "; starts and measured leaders are those of smoothed paths."
+        text += " Initial states and measured leaders are taken from smoothed paths."
     return [text] + ([f"{interpolated_text(filled)}."] if filled else [])
 
 

@@ -51,4 +51,4 @@ def effects_of(system: System) -> list[Effect]:
 def omitted_effects(system: System) -> str:
     """The caption's note on the effects that a figure of a model's law omits; empty for none."""
     names = [effect.name for effect in effects_of(system)]
-    return f"without its effects {', '.join(names)}" if names else ""
+    return f"without {', '.join(names)}" if names else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +33,23 @@ _CODE = re.compile(
     re.M | re.S,
 )
 
+#: Tables with more rows are folded.
+ROWS = 12
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 @dataclass
 class Heading:
-    """Begins a section; level 2 is the highest, below the page's title."""
+    """Begins a section; level 2 is the highest, below the page's title.
+
+    A folded section is opened by its heading, by a link into it, and when the page is printed. In
+    Markdown it is an ordinary section.
+    """
 
     text: str
     level: int = 2
+    folded: bool = False
 
 
 @dataclass
@@ -62,6 +70,7 @@ class TableBlock:
         bold: which cells are set in bold.
         digits: after the point, for all columns or by column.
         full: what the CSV holds, where that is more than what is shown.
+        heads: headings of columns whose name in the CSV is another one.
     """
 
     name: str
@@ -70,10 +79,11 @@ class TableBlock:
     bold: pd.DataFrame | None = None
     digits: dict[str, int] | int = tables.DIGITS
     full: pd.DataFrame | None = None
+    heads: dict[str, str] = field(default_factory=dict)
 
     def grid(self) -> tables.Grid:
         """The table as text."""
-        return tables.grid(self.frame, digits=self.digits, bold=self.bold)
+        return tables.grid(self.frame, digits=self.digits, bold=self.bold, heads=self.heads)
 
     def csv(self) -> str:
         """The table in full."""
@@ -220,7 +230,10 @@ def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
 
 def _markdown_table(block: TableBlock) -> str:
     grid = block.grid()
-    names = [tables.markdown(tables.one_name(name)) for name in block.frame.columns]
+    names = [
+        tables.markdown(block.heads.get(name, tables.one_name(name)))
+        for name in block.frame.columns
+    ]
     labels = [
         tables.markdown(cell.text) for cell in grid.head[-1][: len(grid.head[-1]) - len(names)]
     ]
@@ -255,50 +268,36 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
     taken: Counter[str] = Counter()
     parts: list[dict[str, Any]] = []
     contents: list[dict[str, Any]] = []
-    for block in blocks:
+    fold: int | None = None  # level of the folded section that is open
+
+    def add(kind: str, block: TableBlock | FigureBlock | ReplayBlock, **content: Any) -> None:
+        caption = Markup(text.renderInline(block.caption.strip()))
+        parts.append({"kind": kind, "name": block.name, "caption": caption, **content})
+
+    for block in [*blocks, None]:
+        if fold and (block is None or (isinstance(block, Heading) and block.level <= fold)):
+            parts.append({"kind": "end of fold"})
+            fold = None
         match block:
-            case Heading(words, level):
+            case Heading(words, level, folded):
                 slug = _slug(words, taken)
-                parts.append({"kind": "heading", "text": words, "level": level, "id": slug})
+                fold = level if folded and fold is None else fold
+                part = {"kind": "heading", "text": words, "level": level, "id": slug}
+                parts.append({**part, "folded": folded and fold == level})
                 if level <= 3:
                     contents.append(parts[-1])
             case Text(markdown):
                 parts.append({"kind": "text", "html": Markup(text.render(markdown))})
             case TableBlock():
-                parts.append(
-                    {
-                        "kind": "table",
-                        "name": block.name,
-                        "caption": Markup(text.renderInline(block.caption.strip())),
-                        "grid": block.grid(),
-                        "csv": _base64(block.csv().encode()),
-                    }
-                )
+                grid, csv = block.grid(), _base64(block.csv().encode())
+                add("table", block, grid=grid, csv=csv, folded=len(block.frame) > ROWS)
             case FigureBlock():
                 width, height = (round(_PIXELS * side) for side in block.figure.get_size_inches())
-                parts.append(
-                    {
-                        "kind": "figure",
-                        "name": block.name,
-                        "caption": Markup(text.renderInline(block.caption.strip())),
-                        "alt": block.alt.strip(),
-                        "png": _base64((folder / FIGURES / f"{block.name}.png").read_bytes()),
-                        "width": width,
-                        "height": height,
-                    }
-                )
+                png = _base64((folder / FIGURES / f"{block.name}.png").read_bytes())
+                add("figure", block, alt=block.alt.strip(), png=png, width=width, height=height)
             case ReplayBlock():
                 data, said = block.data()
-                parts.append(
-                    {
-                        "kind": "replay",
-                        "name": block.name,
-                        "caption": Markup(text.renderInline(block.caption.strip())),
-                        "alt": block.alt.strip(),
-                        "data": Markup(data),
-                        "said": said,
-                    }
-                )
+                add("replay", block, alt=block.alt.strip(), data=Markup(data), said=said)
     environment = Environment(
         loader=PackageLoader("nnode.pages", "template"),
         autoescape=True,
@@ -310,6 +309,7 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
         title=title,
         subtitle=Markup(text.renderInline(subtitle)),
         parts=parts,
+        folds=any(part.get("folded") for part in parts),
         contents=contents,
         facts=_facts(blocks),
     )

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
+from collections.abc import Sequence as Sequenced
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from nnode.data.sequence import Sequence
 from nnode.plots.style import GREY, OKABE_ITO
+
+T = TypeVar("T")
 
 #: A player's sequences take at most so many bytes, and are at most so many.
 BYTES, MOST = 1_000_000, 60
@@ -76,8 +80,9 @@ class ReplayBlock:
 
     Attributes:
         name: ``[text](#figure-<name>)`` refers to the player.
-        scenes: in the order of the list; as many as :data:`BYTES` and :data:`MOST` allow are kept.
-            Of vehicles the player begins with the first one, of people with the one with most.
+        scenes: in the order of the list; as many as :data:`BYTES` and :data:`MOST` allow are kept,
+            at equal steps.
+            The player opens on the :func:`typical` one.
         caption: in Markdown; says what to see.
         alt: what moves, in words, for those who cannot see it.
         zones: shaded in all scenes.
@@ -94,27 +99,24 @@ class ReplayBlock:
     def data(self) -> tuple[str, str]:
         """What the page holds, as JSON, and what must be said of it."""
         scenes = list(self.scenes)
-        packed: list[str] = []
-        used = 0
-        for scene in scenes[:MOST]:
-            text = _json(_scene(scene))
-            used += len(text)
-            if packed and used > BYTES:
-                break
-            packed.append(text)
-        shown = [scene.sequence for scene in scenes[: len(packed)]]
+        total = len(scenes) if self.total is None else self.total
+        scenes = evenly(scenes, MOST)
+        packed = [_json(_scene(scene)) for scene in scenes]
+        kept = list(range(len(scenes)))
+        while len(kept) > 1 and sum(len(packed[i]) for i in kept) > BYTES:
+            kept = evenly(range(len(scenes)), len(kept) - 1)
+        shown = [scenes[i].sequence for i in kept]
         head = {
-            "first": _first(shown),
+            "first": typical([scenes[i] for i in kept]),
             "colours": {"measured": GREY, "simulated": COLOURS},
             "car": CAR,
             "body": BODY,
             "zones": [zone.plain() for zone in self.zones],
         }
-        text = f'{_json(head)[:-1]},"scenes":[{",".join(packed)}]}}'
+        text = f'{_json(head)[:-1]},"scenes":[{",".join(packed[i] for i in kept)}]}}'
         said = []
-        total = len(scenes) if self.total is None else self.total
-        if len(packed) < total:
-            said.append(f"{len(packed)} of {total} sequences are here.")
+        if len(kept) < total:
+            said.append(f"The player contains {len(kept)} of {total} sequences.")
         if any(s.x.shape[2] == 1 and not _lengths(s) for s in shown):
             said.append(f"Cars of unknown length are drawn {CAR:g} m long.")
         if any(s.x.shape[2] == 2 for s in shown):
@@ -122,15 +124,22 @@ class ReplayBlock:
         return text, " ".join(said)
 
 
-def _first(shown: list[Sequence]) -> int:
-    """Number of the sequence to begin with: one person alone shows no interaction."""
+def evenly(items: Sequenced[T], number: int) -> list[T]:
+    """At most ``number`` of the items, at equal steps of their order."""
+    chosen = np.linspace(0, len(items) - 1, min(number, len(items))).round().astype(int)
+    return [items[i] for i in chosen]
 
-    def much(i: int) -> tuple[int, float]:
-        s = shown[i]
-        return s.n_agents, float(s.time[-1] - s.time[0])
 
-    people = [i for i, s in enumerate(shown) if s.x.shape[2] == 2]
-    return max(people, key=much, default=0)
+def typical(scenes: list[Scene]) -> int:
+    """Number of the scene whose first simulation has the median error."""
+
+    def error(scene: Scene) -> float:
+        square = (next(iter(scene.simulated.values())) - scene.sequence.x) ** 2
+        compared = square[np.isfinite(square)]
+        return float(compared.mean()) if len(compared) else math.inf
+
+    order = sorted(range(len(scenes)), key=lambda i: error(scenes[i]))
+    return order[(len(order) - 1) // 2] if order else 0
 
 
 def _json(value: Any) -> str:

@@ -20,6 +20,9 @@ from nnode.files import csv_text
 _MARKS = re.compile(r"[\\`*\[!|]|(?<!\w)_|_(?!\w)")
 _ENTITY = re.compile(r"&(?=#?\w+;)")
 
+#: A number, an interval or a number with its error, as text.
+_NUMBER = re.compile(r"[+\-−±≤≥<>~ ]*\d[\d.,%±+\-−≤≥<>~\[\] e∞]*(to [\d.]+)?")
+
 #: Digits after the point where nothing else is asked for.
 DIGITS = 2
 
@@ -82,7 +85,11 @@ def number(value: Any, digits: int = DIGITS) -> str:
 
 
 def grid(
-    frame: pd.DataFrame, *, digits: Mapping[str, int] | int, bold: pd.DataFrame | None
+    frame: pd.DataFrame,
+    *,
+    digits: Mapping[str, int] | int,
+    bold: pd.DataFrame | None,
+    heads: Mapping[str, str] | None = None,
 ) -> Grid:
     """A frame as text; its index becomes the labels of the rows.
 
@@ -92,6 +99,7 @@ def grid(
         frame: of numbers, strings, or both.
         digits: after the point, for all columns or by column.
         bold: of the same shape; true cells are set in bold.
+        heads: headings of columns that are not their names.
 
     Raises:
         ValueError: ``bold`` has other rows or columns than the frame.
@@ -115,7 +123,8 @@ def grid(
         ([column[i] for column in beside], [column[i] for column in columns])
         for i in range(len(frame))
     ]
-    return Grid(_head(frame, list(labels.columns), columns), rows)
+    shown = frame.rename(columns=dict(heads or {}))
+    return Grid(_head(shown, list(labels.columns), columns), rows)
 
 
 def _label(value: Any) -> str:
@@ -152,9 +161,9 @@ def _head(frame: pd.DataFrame, labels: list[str], columns: list[list[Cell]]) -> 
 
 
 def _like_number(value: Any) -> bool:
-    """Whether a value stands well at the right: a number, or text that begins like one."""
+    """Whether a value stands well at the right: a number, also as text."""
     if isinstance(value, str):
-        return value.lstrip("+-−±≤≥<>~ ")[:1].isdigit() or value in ("", NOTHING)
+        return value in ("", NOTHING) or _NUMBER.fullmatch(value) is not None
     return value is None or isinstance(value, Real) or value is pd.NA
 
 

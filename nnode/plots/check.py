@@ -1,4 +1,4 @@
-"""What a file of trajectories holds, at a glance: speeds, steps in time, who is where when."""
+"""Speeds, sampling steps and presence of agents in a file of trajectories."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ def speeds(rows: Trajectories, usual: Range) -> Figure:
     left.axvspan(usual.low, usual.high, color=OKABE_ITO["orange"], alpha=0.25, linewidth=0)
     left.hist(np.clip(values, 0, top), bins=60, range=(0, top), color=OKABE_ITO["blue"])
     dress(left, x="speed (m/s)", y="displacements")
-    steps = rows.steps
+    steps = rows.steps.round(6)  # equal steps differ by rounding, which would divide a bar
     end = float(np.clip(np.percentile(steps, 99.9), 1.5 * rows.dt, 5 * rows.dt))
-    right.hist(np.clip(steps, 0, end), bins=60, range=(0, end), color=OKABE_ITO["blue"])
+    right.hist(np.clip(steps, 0, end), bins=61, range=(0, end), color=OKABE_ITO["blue"])
     right.set_yscale("log")
+    right.set_ylim(bottom=0.7)
     dress(right, x="time between neighbouring samples (s)", y="steps")
     return figure
 
@@ -49,8 +50,18 @@ def presence(rows: Trajectories, domain: Domain) -> Figure:
     above.autoscale()
     along = f"{'xy'[axis]} (m)" if domain == "crowd" else "position (m)"
     dress(above, y=along)
-    times, number = np.unique(rows.time, return_counts=True)
-    below.fill_between(times, number, step="mid", color=GREY, alpha=0.5, linewidth=0)
+    # by first and last times: counts at the samples would bridge times without any agent
+    events = np.concatenate([rows.time[start], rows.time[end]])
+    change = np.repeat([1, -1], len(start))
+    order = np.argsort(events, kind="stable")
+    below.fill_between(
+        events[order],
+        np.cumsum(change[order]),
+        step="post",
+        color=GREY,
+        alpha=0.5,
+        linewidth=0,
+    )
     below.set_ylim(0)
     dress(below, x="time (s)", y="agents")
     return figure

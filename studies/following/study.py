@@ -18,8 +18,8 @@ from studies.runner import Task, hash_of, run_tasks
 
 TITLE = "Car following: laws, effects, drivers"
 SUBTITLE = (
-    "Laws of following with and without effects, calibrated by Gauss and Newton's method "
-    "on exact tangents: NGSIM I-80 with a published division, OpenACC, TGSIM."
+    "Car-following laws with and without effects, calibrated by the Gauss–Newton method with exact "
+    "derivatives on NGSIM I-80 (published split), OpenACC and TGSIM."
 )
 #: Candidates and laws on platoons of a quick study.
 FEW = (REFERENCE, "helly", "idm + memory")

@@ -19,10 +19,10 @@ from studies.prediction.data import AHEAD, SCENES, SEEN, STEP, stores
 from studies.runner import Task, hash_of, run_tasks
 from studies.walking import tasks as walking
 
-TITLE = "Prediction: laws beside published figures"
+TITLE = "Prediction: laws and published results"
 SUBTITLE = (
-    "People who follow automated cars, by the published metric, and people in open scenes, each "
-    "scene predicted by laws that were calibrated on the other four."
+    "Drivers behind automated cars, by the published metric, and pedestrians in open scenes, where "
+    "each scene is predicted by laws that were calibrated on the other four."
 )
 #: Laws of car following, and laws of people with how the page calls them.
 LAWS = ("idm", "fvdm", "ovm", "gipps", "helly", "newell")

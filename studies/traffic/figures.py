@@ -122,7 +122,7 @@ def descents(curves: Mapping[str, np.ndarray]) -> Figure:
     for i, (model, values) in enumerate(curves.items()):
         ax.plot(*values.T, **{**curve_style(i), "marker": ""}, linewidth=1.3, label=model)
     ax.set(xscale="log", yscale="log")
-    ax.set_ylim(bottom=1e-3)  # what lies lower is rounding
+    ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-3))  # lower values are rounding errors
     dress(ax, x="simulations", y="average J above the least (m² s)")
     ax.legend(fontsize=SMALL_FONT, frameon=False)
     return figure

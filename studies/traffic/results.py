@@ -373,8 +373,8 @@ class Study:
             every += scenes(spread(sequences, FEW), systems, self.options.dt)
             number += len(sequences)
         what = (
-            f"Some sequences without a fault of every recording, beside {' and '.join(SHOWN)} as "
-            "calibrated to them."
+            "Sequences without a fault of every recording, as measured and as simulated by "
+            f"{' and '.join(SHOWN)}, which are calibrated to the recording."
         )
         return player("replay", every, what, number)
 

@@ -22,7 +22,7 @@ from studies.traffic.results import LAWS, MODELS, NETWORKS, Study
 TITLE = "Traffic: five models on ten recordings"
 SUBTITLE = (
     "Section 5 of Göttlich & Totzeck, *Optimal control for interacting particle systems driven "
-    "by neural networks*, on the same recordings, printed numbers beside ours."
+    "by neural networks*, on the same recordings, with the published values."
 )
 
 #: Relative time of a gradient.

@@ -22,10 +22,10 @@ from studies.walking import tasks
 from studies.walking.data import RUNS, prepare_runs, sequences
 from studies.walking.laws import DESIRED, LABELS, LAWS, SIMPLE, filled, new_system
 
-TITLE = "Walking: laws of people on two-way flows"
+TITLE = "Walking: pedestrian laws in two-way flows"
 SUBTITLE = (
-    "Laws that the field uses, calibrated on some runs and tested on others, where people want to "
-    "go measured before what is predicted, or told from its end."
+    "Common pedestrian laws, calibrated on some runs and tested on others. Desired directions are "
+    "measured before the prediction, or taken from its end."
 )
 #: Relative times of the calibrations.
 _COSTS = {"alone": 1.0, "exponential": 4.0, "esf": 9.0, "ttc": 9.0, "gcfm": 5.0, "cfsm": 10.0}
@@ -188,8 +188,7 @@ class Walking:
             for law in ("alone", best)
         }
         what = (
-            f"Some sequences of {horizon:g} s of runs that were held out, in which everybody was "
-            f"measured before, beside {' and '.join(systems)}; where people want to go: "
-            f"*{desired}*."
+            f"Sequences of {horizon:g} s of held-out runs, as measured and as simulated by "
+            f"{' and '.join(systems)}; desired velocity: *{desired}*."
         )
         return player("replay", scenes(spread(complete, FEW), systems), what, len(seen))

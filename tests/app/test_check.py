@@ -24,8 +24,8 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
     file = saved(table.rename(columns={"veh": "Vehicle ID"}), tmp_path, "my cars.csv")
     done = script("check", str(file), f"hydra.run.dir={tmp_path / 'run'}")
     assert done.returncode == 0, done.stderr
-    assert "12 vehicles, 4812 positions, sampled every 0.1 s: 0 errors, 1 thing" in done.stdout
-    assert "look  direction: all vehicles drive towards smaller positions" in done.stdout
+    assert "12 vehicles, 4812 positions, sampled every 0.1 s: 0 errors and 1 warning" in done.stdout
+    assert "WARN  direction: all vehicles drive towards smaller positions" in done.stdout
     page = (tmp_path / "run" / "check.html").read_text(encoding="utf-8")
     assert "Check of my cars.csv" in page
     (line,) = [line for line in done.stdout.splitlines() if "nnode prepare_data" in line]

@@ -113,7 +113,7 @@ def test_the_command_prints_what_was_found_and_where_it_is(run: Path) -> None:
     assert "verdict: named" in shown
     assert "The model lin lacks speed_zone" in shown
     assert "  speed_zone: alpha = 0.650 [0.627, 0.680], a = 400.0 [392.0, 400.0] m" in shown
-    assert "not to be told from speed_period: platoons at other times" in shown
+    assert "not distinguishable from speed_period without platoons at other times" in shown
     for what, name in (
         ("report", "report.json"),
         ("page", "report.html"),

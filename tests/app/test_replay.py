@@ -90,4 +90,4 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no column 'agent'"):
         nnode.replay(one.drop(columns="agent"), one, tmp_path / "r.html", domain="traffic")
     path = nnode.replay(pd.concat([one, other]), one, tmp_path / "r.html", domain="traffic")
-    assert "1 of 2 sequences are here." in path.read_text(encoding="utf-8")
+    assert "The player contains 1 of 2 sequences." in path.read_text(encoding="utf-8")

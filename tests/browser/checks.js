@@ -73,7 +73,7 @@
     }
     for (const e of document.querySelectorAll("canvas")) if ((e.getAttribute("aria-label") || "").length < 15) faults.push("a canvas without words");
     for (const e of document.querySelectorAll("input, select, button")) if (!(e.innerText || e.closest("label")?.innerText || "").trim()) faults.push("a control without a name");
-    for (const link of document.querySelectorAll("a")) if (!link.innerText.trim()) faults.push("a link without words");
+    for (const link of document.querySelectorAll("a")) if (!link.textContent.trim()) faults.push("a link without words");
     for (const part of ["main", "title"]) if (!document.querySelector(part)) faults.push(`no ${part}`);
     if (!document.documentElement.lang) faults.push("no language");
     return faults;

@@ -105,6 +105,21 @@ def test_keys_skip_the_contents_and_scroll_tables(browser: Browser, pages: dict[
     assert browser.evaluate(slid) > 0
 
 
+def test_links_and_print_open_folded_parts(browser: Browser, pages: dict[str, Path]) -> None:
+    opened(browser, pages["report"], WIDTHS["phone"])
+    parts = "[...document.querySelectorAll('details')].map((part) => part.open)"
+    assert browser.evaluate(parts) == [False] * browser.evaluate(f"{parts}.length")
+    link = "document.querySelector('nav a[href=\"#independent-clusters\"]')"
+    browser.evaluate(f"{link}.click(); 1")
+    inside = "document.querySelector('#table-clusters').checkVisibility()"
+    assert browser.evaluate(inside)
+    for check in ("silent()", "pale(4.5)", "small(12)", f"wide({WIDTHS['phone']})"):
+        assert faults(browser, check) == [], check
+    opened(browser, pages["report"], WIDTHS["desk"])
+    browser.evaluate("dispatchEvent(new Event('beforeprint')); 1")
+    assert all(browser.evaluate(parts))
+
+
 BAD = """<!DOCTYPE html><html><head><title>t</title></head><body>
 <h1>a</h1><h3>b</h3><p style="color:#999">pale</p><p style="font-size:8px">small</p>
 <div style="width:900px">wide</div><img src="https://nowhere.example/x.png" alt="x">

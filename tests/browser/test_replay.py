@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -49,13 +48,6 @@ def corridor() -> Scene:
     )
 
 
-def alone() -> Scene:
-    """One of the two."""
-    s = corridor().sequence
-    s = replace(s, name="alone", x=s.x[:, :1])
-    return Scene(s, {"late": s.x})
-
-
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with Browser() as found:
@@ -71,7 +63,6 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
             "p", [car("first", 4.0), car("second", 2.0)], "Cars.", "A car drives.", zone
         ),
         "corridor": ReplayBlock("p", [corridor()], "People.", "Two people pass each other."),
-        "dull": ReplayBlock("p", [alone(), corridor()], "People.", "They walk."),
     }
     return {
         name: write_player(block, folder / f"{name}.html", title=name).as_uri()
@@ -115,20 +106,12 @@ def test_the_pixels_are_where_the_cars_are(browser: Browser, pages: dict[str, st
         )
         assert measured == pytest.approx(SPEED * time, abs=1.5 * pixel)
         assert simulated == pytest.approx(SPEED * time - LATE, abs=1.5 * pixel)
-    assert "late: 3.00 m away" in browser.evaluate(
+    assert "late: distance 3.00 m" in browser.evaluate(
         "(() => { const r = document.querySelector('figure').replay, said = [];"
         " const old = r.pen.fillText.bind(r.pen);"
         " r.pen.fillText = (text, ...at) => { said.push(text); old(text, ...at); };"
         " r.show(2); return said.join('; '); })()"
     )
-
-
-def test_a_crowd_begins_with_most_people(browser: Browser, pages: dict[str, str]) -> None:
-    browser.open(pages["dull"], 800)
-    choice = "document.querySelector('.choice')"
-    assert browser.evaluate(f"[...{choice}.options].map((o) => o.text)") == ["alone", "walk"]
-    assert browser.evaluate(f"{choice}.selectedIndex") == 1
-    assert browser.evaluate("document.querySelector('figure').replay.scene.number") == 2
 
 
 def test_the_named_place_is_shaded_where_it_is(browser: Browser, pages: dict[str, str]) -> None:

@@ -78,7 +78,7 @@ def test_one_cluster_alone_gives_a_block_of_time_and_says_so() -> None:
     sequences = recorded(*[chr(200 + i) + chr(201 + i) for i in range(20)])
     found = divide(sequences, DiscoverOptions())
     assert found.number(found.exploration) == found.number(found.confirmation) == 1
-    assert "sealed are not independent of the others" in found.note
+    assert "are not independent of the exploration sequences" in found.note
     first, last = min(found.confirmation), max(found.confirmation)
     assert found.confirmation == list(range(first, last + 1))
     who = {agent for i in found.confirmation for agent in sequences[i].agents}
@@ -102,7 +102,7 @@ def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
         found = divide(sequences, DiscoverOptions(), together=together)
         assert_sound(found, sequences)
         assert found.number([*found.exploration, *found.confirmation]) == number
-        assert found.why.endswith("or are there at one time") == together
+        assert found.why.endswith("or overlap in time") == together
     assert len(found.confirmation) == 10
 
 

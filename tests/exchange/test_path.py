@@ -107,7 +107,7 @@ def work(sumo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             # what check prints reads the file, and is what the README goes on with
             (line,) = [one for one in done.stdout.splitlines() if "nnode prepare_data" in one]
             told = {word.replace(f"{folder}/", "") for word in shlex.split(line)[2:]}
-            assert "0 errors, 1 thing to look at" in done.stdout
+            assert "0 errors and 1 warning" in done.stdout
             assert "noise of measured positions: 0.02 m" in done.stdout
     chain = {words[1]: words[2:] for words in commands()}
     assert list(chain) == ["check", "train", "discover", "evaluate", "drive"]

@@ -67,19 +67,20 @@ def people(name: str, number: int, samples: int) -> Sequence:
     return Sequence(name=name, recording="hall", time=time, x=x)
 
 
-def test_a_crowd_begins_with_most_people(monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes = [(1, 90), (4, 20), (4, 30), (4, 30), (2, 60), (9, 10)]
-    many = [scene(people(f"hall/{i}", *size)) for i, size in enumerate(sizes)]
+def test_the_player_opens_on_the_median_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    many = []
+    for i, error in enumerate((3.0, 9.0, np.nan, 1.0, 2.0)):
+        s = people(f"hall/{i}", 2, 20)
+        many.append(Scene(s, {"a": s.x + error, "b": s.x}))
 
     def read(scenes: list[Scene]) -> tuple[int, list[str]]:
         content = json.loads(block(scenes).data()[0])
         return content["first"], [one["name"] for one in content["scenes"]]
 
-    assert read(many) == (5, [f"hall/{i}" for i in range(6)])
-    assert read(many[:5])[0] == 2  # the longer of those with as many
-    monkeypatch.setattr(replay, "MOST", 2)  # only of those that the page has
-    assert read(many) == (1, ["hall/0", "hall/1"])
-    assert read([scene(platoon()), scene(platoon(samples=60))])[0] == 0
+    assert read(many) == (0, [f"hall/{i}" for i in range(5)])
+    monkeypatch.setattr(replay, "MOST", 3)  # at equal steps, and only of those on the page
+    assert read(many) == (0, ["hall/0", "hall/2", "hall/4"])
+    assert read(many[1:2])[0] == 0
 
 
 def test_what_is_left_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,8 +94,8 @@ def test_what_is_left_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = len(json.loads(text)["scenes"])
     assert kept < 9
     assert len(text) < 3 * one + 1000
-    assert said.startswith(f"{kept} of 9 sequences are here.")
-    assert block(many[:1], total=40).data()[1].startswith("1 of 40 sequences are here.")
+    assert said.startswith(f"The player contains {kept} of 9 sequences.")
+    assert block(many[:1], total=40).data()[1].startswith("The player contains 1 of 40 sequences.")
     monkeypatch.setattr(replay, "BYTES", 1)
     assert len(json.loads(block(many).data()[0])["scenes"]) == 1
     monkeypatch.setattr(replay, "MOST", 0)

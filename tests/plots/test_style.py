@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
+from PIL import Image
 
 from nnode.errors import ConfigError
 from nnode.plots.style import DPI, OKABE_ITO, SEQUENTIAL, curve_style, dress, new_figure, save
@@ -39,15 +41,17 @@ def test_notebooks_show_a_figure() -> None:
 def test_failed_save_keeps_the_old_file_and_leaves_nothing(tmp_path: Path, monkeypatch) -> None:
     path = save(_figure(), tmp_path / "a.png")
     before = path.read_bytes()
-    figure = _figure()
+    whole = Image.Image.save
 
-    def half(target, **_):
+    def half(image, target, *values, **names):
+        if isinstance(target, io.BytesIO):
+            return whole(image, target, *values, **names)
         Path(target).write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(figure, "savefig", half)
+    monkeypatch.setattr(Image.Image, "save", half)
     with pytest.raises(ConfigError, match=r"a\.png.*No space left"):
-        save(figure, path)
+        save(_figure(), path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 

@@ -51,7 +51,7 @@ def test_after_a_blow_up_nobody_is_there(monkeypatch: pytest.MonkeyPatch) -> Non
     assert np.isnan(x[1:]).all()
     block = replay.player("p", [scene], "One.", 7)
     text, said = block.data()
-    assert said.startswith("1 of 7 sequences")
+    assert said.startswith("The player contains 1 of 7 sequences.")
     rows = json.loads(text)["scenes"][0]["simulated"][0]["x"]
     assert all(row[1:] == [None] * (s.n_samples - 1) for row in rows)
 

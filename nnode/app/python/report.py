@@ -25,10 +25,10 @@ class Report:
     """The result of a diagnosis.
 
     Attributes:
-        diagnosis: all results; the properties are the most important ones.
+        diagnosis: the whole result; the properties are its main parts.
         model: the calibrated model with the named effects.
-        nearest: the report of the nearest law, if it is not the requested one.
-        draw: draws a figure by its name; None if the report has no data.
+        nearest: the report of the best law, if another one was diagnosed.
+        draw: draws a figure by its name; None: the diagnosis was read, not made.
     """
 
     diagnosis: Diagnosis
@@ -44,12 +44,12 @@ class Report:
 
     @property
     def effects(self) -> list[NamedEffect]:
-        """Effects that were added, and confirmed on held-back clusters."""
+        """The effects that were added and confirmed."""
         return self.diagnosis.effects
 
     @property
     def leads(self) -> list[NamedEffect]:
-        """Effects that were found, but not confirmed."""
+        """Hypotheses that were not confirmed."""
         return self.diagnosis.leads
 
     @property
@@ -59,17 +59,17 @@ class Report:
 
     @property
     def gap(self) -> Gap:
-        """Errors on held-back sequences, before and after adding effects."""
+        """Errors on confirmation sequences, before and after."""
         return self.diagnosis.gap
 
     @property
     def clusters(self) -> Clusters:
-        """The independent clusters of the data."""
+        """Numbers and definition of independent clusters."""
         return self.diagnosis.clusters
 
     @property
     def data_faults(self) -> list[DataFault]:
-        """Faults of the measurement that were excluded."""
+        """Faults of the measurement; their sequences were excluded."""
         return self.diagnosis.data_faults
 
     @property
@@ -82,9 +82,9 @@ class Report:
 
         Args:
             which: ``map``: measured minus simulated speed in space and time, or acceleration by
-                place, before and after the effects were added; ``sealed``: errors of the held-back
-                sequences, before and after; ``coefficients`` of the effects; ``where``: deviations
-                by variable.
+                position, before and after the effects were added; ``sealed``: errors of the
+                confirmation sequences, before and after; ``coefficients`` of the effects;
+                ``where``: deviations by variable.
 
         Raises:
             ConfigError: an unknown figure, or a report without data.
@@ -100,14 +100,17 @@ class Report:
         lines = [
             self.sentence,
             "",
-            f"{'Model':<34}{d.model}",
-            f"{'Clusters, searched and held back':<34}{d.clusters.open} and {d.clusters.sealed}",
-            f"{'Error before, held-back data (m²)':<34}{amount(gap.before)}",
-            f"{'Error after, held-back data (m²)':<34}{amount(gap.after)}",
-            f"{'Noise floor (m²)':<34}{noise}",
-            f"{'Share of the gap that is closed':<34}{closed(d)}",
+            f"{'Model':<36}{d.model}",
+            f"{'Exploration, confirmation clusters':<36}{d.clusters.open}, {d.clusters.sealed}",
+            f"{'Error before, confirmation (m²)':<36}{amount(gap.before)}",
+            f"{'Error after, confirmation (m²)':<36}{amount(gap.after)}",
+            f"{'Noise floor (m²)':<36}{noise}",
+            f"{'Removed error above the noise floor':<36}{closed(d)}",
         ]
-        for title, effects in (("Effects", self.effects), ("Not confirmed", self.leads)):
+        for title, effects in (
+            ("Effects", self.effects),
+            ("Not confirmed", self.leads),
+        ):
             rows = [
                 (f"{effect.name}.{name}", c.value, c.low, c.high, c.unit)
                 for effect in effects
@@ -118,7 +121,7 @@ class Report:
         lines += _table("Differences between drivers and disturbances", drivers)
         absent = [(a.name, a.detectable, a.unit) for a in d.absences if a.testable]
         if absent:
-            lines += ["", "Not found; an effect of this strength is detected with 80 % power"]
+            lines += ["", "Not found; detectable strength with 80 % power"]
             lines += [f"{name:<28}{amount(size):>12}  {unit}" for name, size, unit in absent]
         return "\n".join(line.rstrip() for line in lines)
 
@@ -127,7 +130,7 @@ class Report:
         return plain_report(self.diagnosis)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """A row per coefficient of named and of unconfirmed effects."""
+        """A row per coefficient of named effects and of hypotheses."""
         rows = [
             {
                 "effect": effect.name,

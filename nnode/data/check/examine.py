@@ -223,11 +223,11 @@ def _judged(examined: Examination, sequences: list[Sequence], rate: float | None
 
 def _made(examined: Examination, number: int) -> Iterator[Finding]:
     if number:
-        looked = f"; faults were looked for in {len(examined.sequences)}" * (
+        looked = f"; {len(examined.sequences)} of them were examined for faults" * (
             len(examined.sequences) < number
         )
         yield Finding(
             "sequences",
             "note",
-            f"data={examined.source.group} makes {number} sequences of it{looked}",
+            f"data={examined.source.group} yields {number} sequences{looked}",
         )

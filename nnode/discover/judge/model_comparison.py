@@ -123,7 +123,7 @@ def too_few(clusters: int) -> str:
     required = least_confirmation()
     if clusters >= required:
         return ""
-    available = {0: "no sealed cluster is", 1: "one sealed cluster is"}.get(
-        clusters, f"{clusters} sealed clusters are"
+    return (
+        f"{clusters} confirmation clusters are independent of the exploration clusters, and a "
+        f"confirmation requires {required}"
     )
-    return f"{available} independent of the open ones, and it takes {required} to confirm anything"

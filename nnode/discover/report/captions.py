@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.outcome import DiagnosisOutcome
-from nnode.discover.report.deviation import Deviation, deviation
+from nnode.discover.report.deviation import SPAN, Deviation, deviation
 from nnode.discover.report.figures.maps import (
     approach_maps,
     neighbour_maps,
@@ -23,13 +23,13 @@ from nnode.discover.report.figures.marks import (
     flexible_curve,
     place_curves,
 )
-from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
+from nnode.discover.report.figures.paths import as_drawn, trajectories
 from nnode.discover.report.files import amount, individual, interval
 from nnode.discover.report.replay import AFTER, BEFORE, player, scenes
 from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.pages.page import FigureBlock
-from nnode.pages.replay import ReplayBlock
+from nnode.pages.replay import ReplayBlock, typical
 from nnode.pages.tables import markdown
 from nnode.plots.quality import faults_figure
 
@@ -67,8 +67,7 @@ def figures(inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions)
             FigureBlock(
                 "coefficients",
                 coefficient_intervals(d.effects),
-                "Coefficients with their 95 % intervals. The dotted line stands where the effect "
-                "would be absent.",
+                "Coefficients with 95 % intervals. Dotted line: value without the effect.",
                 "; ".join(f"{effect.name}: {interval(effect)}" for effect in d.effects),
             )
         )
@@ -85,7 +84,7 @@ def figures(inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions)
             FigureBlock(
                 "unknown",
                 flexible_curve(d.unknown, unit_of(outcome.base)),
-                f"What a flexible fit adds, by {variable}. A description, not an explanation.",
+                f"Nonparametric estimate of the missing term by {variable}.",
                 f"Curve of the missing term by {variable}.",
             )
         )
@@ -115,22 +114,16 @@ def figure(
 
 def _confirmation_errors(outcome: DiagnosisOutcome) -> FigureBlock:
     d = outcome.diagnosis
-    columns = ([row[key] for row in d.sealed] for key in ("name", "before", "after"))
-    names, before, after = columns
-    if not d.effects:
-        return FigureBlock(
-            "sealed",
-            confirmation_costs([str(n) for n in names], before, None, d.gap.noise_floor),
-            "Mean square error of every sealed sequence.",
-            f"Marks of {len(names)} sequences, from the largest error to the smallest.",
-        )
-    better = sum(a < b for a, b in zip(after, before, strict=True))
+    names, before, after = ([row[key] for row in d.sealed] for key in ("name", "before", "after"))
+    smaller = sum(a < b for a, b in zip(after, before, strict=True))
+    counted = f" With effects, {smaller} of {len(names)} errors are smaller." * bool(d.effects)
     return FigureBlock(
         "sealed",
-        confirmation_costs([str(n) for n in names], before, after, d.gap.noise_floor),
-        f"Mean square error of every sealed sequence. {better} of {len(names)} errors are smaller "
-        "with effects.",
-        f"Paired marks of {len(names)} sequences; {better} lie lower after than before.",
+        confirmation_costs(
+            list(map(str, names)), before, after if d.effects else None, d.gap.noise_floor
+        ),
+        f"Mean square error of each confirmation sequence, in decreasing order.{counted}",
+        f"Marks of {len(names)} sequences, from the largest error to the smallest.{counted}",
     )
 
 
@@ -140,7 +133,7 @@ def _faults(inputs: Inputs) -> FigureBlock:
     return FigureBlock(
         "faults",
         faults_figure([*inputs.faulty, *inputs.sequences], inputs.faults, inputs.domain, FAULTY),
-        f"Sequences with a fault of the measurement, which is marked.{cut}",
+        f"Sequences with a fault of the measurement; the fault is marked.{cut}",
         "Position over time of " + ", ".join(s.name for s in shown) + ", faults marked.",
     )
 
@@ -154,8 +147,11 @@ def _places(outcome: DiagnosisOutcome) -> list[FigureBlock]:
             FigureBlock(
                 "where",
                 place_curves(curves, unit),
-                "Mean deviation of the measurement from the calibrated model, with standard "
-                "errors; the interval that stands out is shaded.",
+                f"Term ({unit}) that is missing from the model without effects, by variable, with "
+                "standard errors, estimated to first order together with the model's parameters. "
+                "These parameters can compensate for a part of a curve, often a constant. A curve "
+                "therefore shows the shape of the missing term, and may differ from measured minus "
+                "simulated rates in size and sign. The interval of the table is shaded.",
                 "; ".join(
                     f"{p.variable} {amount(p.low)} to {amount(p.high)} {p.unit}: "
                     f"{amount(p.deviation)} ± {amount(p.error, 2)} {unit}"
@@ -175,34 +171,35 @@ def _map_figures(
         return []
     spreads = ", ".join(f"{name}: {_spread(map_)} {unit} rms" for name, map_ in maps.items())
     note = "".join(
-        f" {effect} knows the agents of the open sequences and acts on them alone."
+        f" {effect} acts only on agents of the exploration sequences."
         for effect in individual(outcome.extended)
     )
     if inputs.domain == "traffic":
         space, neighbour_map = time_space_maps(maps), approach_maps(maps)
         words = (
-            "Measured minus simulated speed in time and space, in all sequences; platoons are "
-            f"simulated for two seconds at a time. Grey: nobody was there.{_laid(inputs)}{note}",
-            "The same by gap and by how fast the vehicle ahead draws away.",
+            "Measured minus simulated speed by time and position, in all sequences. The "
+            f"simulation restarts every {SPAN['traffic']:g} s. Grey: no vehicle."
+            f"{_superimposed(inputs)}{note}",
+            "Measured minus simulated speed by gap and relative speed of the vehicle ahead.",
         )
     else:
         space = plane_maps(maps, inputs.sequences[0].walls)
         neighbour_map = neighbour_maps(maps)
         words = (
-            "Mean of measured minus simulated acceleration by place, in all sequences; everyone is "
-            f"simulated for one second at a time. Walls are black.{note}",
-            "The same by where the nearest person is, seen in one's own way: the triangle walks "
-            "to the right.",
+            "Mean of measured minus simulated acceleration by position, in all sequences. The "
+            f"simulation restarts every {SPAN['crowd']:g} s. Thick lines: walls.{note}",
+            "Mean of measured minus simulated acceleration by the position of the nearest person, "
+            "in the frame of the own walking direction (triangle).",
         )
     return [
-        FigureBlock("map", space, words[0], f"Map of the deviations by place. {spreads}."),
+        FigureBlock("map", space, words[0], f"Map of the deviations by position. {spreads}."),
         FigureBlock("map_beside", neighbour_map, words[1], f"Map by the nearest agent. {spreads}."),
     ]
 
 
-def _laid(inputs: Inputs) -> str:
+def _superimposed(inputs: Inputs) -> str:
     number = len({s.recording for s in inputs.sequences})
-    return f" The {number} recordings are laid on top of each other." if number > 1 else ""
+    return f" The {number} recordings are superimposed." if number > 1 else ""
 
 
 def _spread(map_: Deviation) -> str:
@@ -227,25 +224,18 @@ def _paths(outcome: DiagnosisOutcome, options: DiscoverOptions) -> list[FigureBl
     replayed = scenes(outcome)
     if not replayed:
         return []
-    s = replayed[0].sequence
-    simulated = as_drawn(replayed[0])
+    scene = replayed[typical(replayed)]
+    s, simulated = scene.sequence, as_drawn(scene)
     errors = ", ".join(simulation.heading for simulation in simulated)
-    name, plain = (f"the sealed sequence {n}" for n in (markdown(s.name), s.name))
-    which = "whose error falls most" if outcome.diagnosis.effects else "with the largest error"
+    name = markdown(s.name)
     moving = [player(outcome, replayed)] if options.replay else []
     return [
-        *moving,
         FigureBlock(
             "trajectories",
             trajectories(s, simulated),
-            f"Measured and simulated paths of {name}, the one {which}. The simulations are those "
-            "that its errors were computed from.",
-            f"Paths of {plain}; {errors}.",
+            f"Measured and simulated paths of the confirmation sequence {name}, which has the "
+            "median error.",
+            f"Paths of the sequence {s.name}; {errors}.",
         ),
-        FigureBlock(
-            "moments",
-            film_strip(s, simulated),
-            f"Moments of {name}: open marks are measured, filled ones simulated, lines join them.",
-            f"Moments of {plain}; {errors}.",
-        ),
+        *moving,
     ]

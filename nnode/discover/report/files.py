@@ -19,7 +19,6 @@ from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.result import Coefficient, Diagnosis, Laws, NamedEffect
 from nnode.files import write_text
 from nnode.model import FeedForward, System, build_model
-from nnode.model.effects import CATALOGUE
 from nnode.model.extend import effects_of
 
 REPORT = "report.json"
@@ -119,14 +118,14 @@ def remarks(diagnosis: Diagnosis) -> list[str]:
     """Remarks on the verdict: a better-fitting law, faults of the measurement."""
     sentences, laws = [], diagnosis.laws_again or diagnosis.laws
     if laws is not None and laws.best not in ("", diagnosis.model):
-        qualifier = f" with {_listed(laws.effects)}" if laws.effects else ""
-        sentences.append(f"Of the laws that were compared, {laws.best}{qualifier} comes nearer.")
+        best = _listed([laws.best, *laws.effects])
+        sentences.append(f"Of the compared laws, {best} fits best.")
     faults = diagnosis.data_faults
     if faults:
         where = len({fault.sequence for fault in faults})
         sentences.append(
-            f"Beside that the measurement holds {_count(len(faults), 'fault')} in "
-            f"{_count(where, 'sequence')}, which were left out."
+            f"{_count(where, 'sequence')} with {_count(len(faults), 'fault')} of the measurement "
+            "were excluded."
         )
     return sentences
 
@@ -135,51 +134,44 @@ def verdict(d: Diagnosis) -> str:
     """The verdict in one sentence."""
     names = _listed([effect.name for effect in d.effects])
     gain = (
-        f"the mean square error on sealed sequences goes from {amount(d.gap.before)} to "
-        f"{amount(d.gap.after)} m² ({closed(d)} of what can be closed above the noise floor of "
-        f"{amount(d.gap.noise_floor)} m²)"
+        "the extended model reduces the mean square error on the confirmation sequences from "
+        f"{amount(d.gap.before)} to {amount(d.gap.after)} m², which removes {closed(d)} of the "
+        f"error above the noise floor ({amount(d.gap.noise_floor)} m²)"
     )
-    if any(_has_numbers(effect.name) for effect in d.effects):
-        gain += (
-            ", in the last part of each sequence, each agent's number being taken from the first"
-        )
     unconfirmed = (
         f" {_listed([e.name for e in d.leads])} remains a hypothesis: {d.confirmation.reason}."
     )
     match d.verdict:
         case "named":
-            pronoun = "it" if len(d.effects) == 1 else "them"
-            return (
-                f"The model {d.model} lacks {names}: with {pronoun}, {gain}."
-                + unconfirmed * bool(d.leads)
-            )
+            return f"The model {d.model} lacks {names}: {gain}." + unconfirmed * bool(d.leads)
         case "indistinguishable":
             alternatives = {a.name for effect in d.effects for a in effect.alternatives}
             rivals = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
             return (
-                f"The model {d.model} lacks something, and these data cannot tell whether it is "
-                f"{names} or rather {rivals}: with {names}, {gain}."
+                f"The model {d.model} lacks an effect, but the data cannot distinguish {names} "
+                f"from {rivals}: {gain}."
             )
         case "not_testable":
             c = d.clusters
             return (
-                f"Not testable with these data: there {'is' if c.open == 1 else 'are'} "
-                f"{_count(c.open, 'open cluster')} and {c.sealed} sealed (one cluster are "
-                f"{c.why}), and about {c.enough} in all would do. Nothing is named."
+                f"The data are too few for a test: they contain "
+                f"{_count(c.open, 'exploration cluster')} and "
+                f"{_count(c.sealed, 'confirmation cluster')}, and about {c.enough} clusters are "
+                f"needed (a cluster is formed by {c.why}). No effect is named."
             )
         case "unknown":
             variables = (
-                _listed(d.unknown.variables) if d.unknown else "variables that were not found"
+                _listed(d.unknown.variables) if d.unknown else "variables that were not tested"
             )
-            subject = f"Beyond {names} the" if d.effects else "The"
+            beyond = f", beyond {names}," if d.effects else ""
             return (
-                f"{subject} model {d.model} lacks something that is not in the catalogue; it "
-                f"depends on {variables}."
+                f"The model {d.model} deviates from the data{beyond} in a way that no effect of "
+                f"the catalogue explains; the deviation depends on {variables}."
             )
         case "none":
             return (
-                f"Nothing is missing from the model {d.model} that these data could show: no "
-                "effect of the catalogue passes, and no structure is left."
+                f"No missing effect was found: none of the catalogue improves the model {d.model} "
+                "significantly, and no structure remains in the residuals."
                 + unconfirmed
                 * bool(d.leads)
             )
@@ -187,11 +179,6 @@ def verdict(d: Diagnosis) -> str:
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def _has_numbers(name: str) -> bool:
-    effect = CATALOGUE.effects.get(name)
-    return effect is not None and effect.individual
 
 
 def closed(diagnosis: Diagnosis) -> str:

@@ -18,9 +18,7 @@ from nnode.discover.report.captions import Figures, figures, unit_of
 from nnode.discover.report.files import (
     CHECKPOINT,
     amount,
-    closed,
     has_network,
-    in_unit,
     individual,
     interval,
     remarks,
@@ -37,10 +35,10 @@ TENSORBOARD = "tensorboard"
 _PACKAGES = ("torch", "numpy", "scipy", "matplotlib")
 
 _NETWORK = (
-    "**The model is a network.** A network can learn any function of its own inputs: an effect "
-    "that depends on nothing else (in traffic on the gap, in a crowd on relative place and "
-    "velocity) is inside its weights already and can be neither found nor excluded here. "
-    "Diagnose a physical law, such as `model=lin` or `model=sf`, to learn about those."
+    "**The model is a network.** A network can represent any function of its inputs: the gap in "
+    "traffic, the relative position and velocity in a crowd. Effects that depend on these inputs "
+    "alone can be neither found nor excluded. Diagnose a physical law, such as `model=lin` or "
+    "`model=sf`, to test them."
 )
 
 
@@ -88,13 +86,13 @@ def page_blocks(
         *_gap(d, drawn),
         *_coefficients(d, drawn, outcome),
         *_agents(d),
-        *_model(d),
-        *_shown(d, drawn),
+        *_decided(d),
+        *_shown(drawn),
         *_places(d, drawn, unit),
-        *_rest(d, drawn, unit),
-        *_usage(d, commands, folder, outcome),
-        *_decided(d, drawn),
+        *_unexplained(d, drawn),
+        *_absent(d),
         *_data(d, drawn),
+        *_usage(d, commands, folder, outcome),
         *_laws(d),
         *_clusters(d),
         _provenance(d, inputs),
@@ -113,79 +111,52 @@ def _map(drawn: Figures) -> list[Block]:
     return [Heading("Where the model deviates from the data"), *drawn.map]
 
 
-def _laws(d: Diagnosis) -> list[Block]:
-    """The comparison of base laws."""
-    if d.laws is None or not d.laws.ranking:
-        return []
-    compared = [d.laws] if d.laws_again is None else [d.laws, d.laws_again]
-    latest = compared[-1]
-    asked = next((law for law in latest.ranking if law.name == d.model), None)
-    qualifier = f", with {', '.join(latest.effects)}," if latest.effects else ""
-    if latest.best == d.model:
-        words = f"Of the laws that were compared, {d.model}{qualifier} comes nearest."
-    elif asked is None:
-        words = f"{latest.best}{qualifier} comes nearest; {d.model} was not compared."
-    else:
-        words = (
-            f"**{latest.best}{qualifier} comes nearer than {d.model}**, whose held-out cost is "
-            f"{100 * asked.behind:.3g} % higher (p = {amount(asked.p_value, 2)}). What {d.model} "
-            f"lacks may be no effect but the other law: `nearest_law/` holds its diagnosis."
-        )
-    words += (
-        f" Costs are those of {latest.clusters} open clusters that calibrations left out in turn."
-    )
-    if d.laws.refused:
-        words += (
-            " Not compared: "
-            + "; ".join(f"{markdown(k)}: {markdown(v)}" for k, v in d.laws.refused.items())
-            + "."
-        )
-    names = ("laws", "laws_again")
-    return [
-        Heading("Which base law"),
-        Text(words),
-        *(tables.laws_table(*law, d.domain) for law in zip(compared, names, strict=False)),
-    ]
-
-
 def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
     """The errors on the confirmation sequences, with the definition for the whole page."""
     n_confirmation, n_exploration = len(d.split.get("sealed", [])), len(d.split.get("open", []))
     return [
-        Heading("The error on sealed sequences"),
-        Text(
-            f"{n_confirmation} of {n_confirmation + n_exploration} sequences were sealed: they "
-            "were held back, and neither calibration nor search used them. "
-            f"{d.gap.definition} {_gap_words(d)}".strip()
-        ),
+        Heading("Errors on confirmation sequences"),
+        *drawn.gap,
         tables.gap_table(d),
+        Text(
+            f"{n_confirmation} of {n_confirmation + n_exploration} sequences are confirmation "
+            f"sequences. Neither calibration nor search used them. {d.gap.definition}".strip()
+        ),
     ]
 
 
-def _gap_words(d: Diagnosis) -> str:
-    if not d.effects:
-        return "No effect was added, so both errors are those of the calibrated model."
-    return f"The effects close {closed(d)} of the gap between the model and the noise."
-
-
 def _coefficients(d: Diagnosis, drawn: Figures, outcome: DiagnosisOutcome) -> list[Block]:
-    blocks: list[Block] = [Heading("What is missing")]
+    blocks: list[Block] = [Heading("Coefficients")]
     if has_network(outcome.base):
         blocks.append(Text(_NETWORK))
     if d.effects:
         blocks += [tables.coefficients_table(d.effects), *drawn.effects]
     else:
         blocks.append(Text("No effect of the catalogue was added to the model."))
+    if d.base:
+        blocks.append(tables.base_table(d))
     if d.leads:
         blocks += [
-            Heading("Found, not confirmed", 3),
-            Text(f"A lead to follow, not a finding: {d.confirmation.reason}."),
+            Heading("Hypotheses that were not confirmed", 3),
+            Text(f"Reason: {d.confirmation.reason}."),
             tables.coefficients_table(d.leads, "leads"),
         ]
     return blocks
 
 
-def _decided(d: Diagnosis, drawn: Figures) -> list[Block]:
+def _agents(d: Diagnosis) -> list[Block]:
+    """The differences between agents, in addition to population effects."""
+    blocks: list[Block] = []
+    if d.drivers:
+        blocks = [tables.drivers_table(d)]
+    elif d.agents:
+        blocks = [tables.agents_table(d)]
+        if any(estimate.later for estimate in d.agents):
+            blocks.append(tables.later_table(d))
+    return [Heading("Differences between agents"), *blocks] if blocks else []
+
+
+def _decided(d: Diagnosis) -> list[Block]:
     """The tests behind the verdict."""
     blocks: list[Block] = []
     if d.notes:
@@ -196,151 +167,130 @@ def _decided(d: Diagnosis, drawn: Figures) -> list[Block]:
         blocks.append(tables.alternatives_table(d))
     if d.verdict == "not_testable" and d.screen.leads:
         blocks += [
-            Heading("What one would look at first", 3),
+            Heading("Hypotheses", 3),
             Text(
-                "A description of the open sequences, and no finding: with so few independent "
-                "clusters chance cannot be told from anything."
+                "These effects describe the exploration sequences best. The number of independent "
+                "clusters is too small to distinguish them from chance."
             ),
             tables.screen_table(d),
         ]
-    blocks += drawn.gap
     if d.sealed:
         blocks.append(tables.confirmation_table(d))
     return [Heading("How it was decided"), *blocks] if blocks else []
 
 
-def _clusters(d: Diagnosis) -> list[Block]:
-    c = d.clusters
-    return [
-        Heading("What is independent of what"),
-        Text(
-            f"One cluster are {c.why}; {c.simultaneous}. Every interval, test and fold goes by "
-            f"cluster. With {c.open} open {'cluster' if c.open == 1 else 'clusters'} no two-sided "
-            f"p-value can be below {amount(d.screen.floor, 2)}."
-        ),
-        tables.clusters_table(d),
-    ]
-
-
-def _agents(d: Diagnosis) -> list[Block]:
-    """The differences between agents, in addition to population effects."""
-    if d.drivers:
-        return [Heading("Do drivers differ?"), tables.drivers_table(d)]
-    if not d.agents:
+def _shown(drawn: Figures) -> list[Block]:
+    if not drawn.paths:
         return []
-    words = [
-        f"- {estimate.name}: "
-        + ("named." if estimate.named else f"not named: {estimate.reason}.")
-        + f" What lasts longer than {amount(estimate.lasts, 2)} s cannot be told from a number of "
-        "one's own."
-        for estimate in d.agents
+    return [Heading("A typical confirmation sequence"), *drawn.paths]
+
+
+def _places(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
+    found = (
+        [tables.places_table(d, unit)]
+        if d.places
+        else [Text("No curve over a variable is significant.")]
+    )
+    return [Heading("Deviations by variable"), *found, *drawn.places]
+
+
+def _unexplained(d: Diagnosis, drawn: Figures) -> list[Block]:
+    """Structure that no effect of the catalogue explains."""
+    heading = Heading("Unexplained structure")
+    if d.unknown is None:
+        return [heading, Text("No curve is significant in the remaining residuals.")]
+    facts = {
+        "Variables": ", ".join(d.unknown.variables) or "none that was tested",
+        "Share of the remaining squared errors that a nonparametric fit removes": (
+            f"{100 * d.unknown.gain:.0f} %"
+        ),
+        "Similar formula (a hint, not a result)": f"`{d.unknown.hint}`" if d.unknown.hint else "–",
+    }
+    return [
+        heading,
+        Text("\n".join(f"- {name}: {fact}" for name, fact in facts.items())),
+        *drawn.unknown,
+        Text("An explanation can be tested as an effect of your own (`docs/discovery.md`)."),
     ]
-    blocks: list[Block] = [
-        Heading("Do agents differ?"),
-        Text("\n".join(words)),
-        tables.agents_table(d),
-    ]
-    if any(estimate.later for estimate in d.agents):
-        blocks.append(tables.later_table(d))
-    return blocks
+
+
+def _absent(d: Diagnosis) -> list[Block]:
+    """Effects that were not found, and those that these data cannot test."""
+    blocks: list[Block] = []
+    if any(absence.testable for absence in d.absences):
+        blocks.append(tables.absent_table(d))
+    if d.not_testable or any(not absence.testable for absence in d.absences):
+        blocks.append(tables.not_testable_table(d))
+    none = [Text("All effects of the catalogue were found.")]
+    return [Heading("Effects that were not found"), *(blocks or none)]
 
 
 def _data(d: Diagnosis, drawn: Figures) -> list[Block]:
-    blocks: list[Block] = [Heading("Faults of the measurement")]
+    heading = Heading("Faults of the measurement")
     if not d.data_faults:
-        return [*blocks, Text("None: every sequence was used.")]
-    sequences = {fault.sequence for fault in d.data_faults}
+        return [heading, Text("No sequence has a fault.")]
     return [
-        *blocks,
-        Text(
-            f"{len(d.data_faults)} faults in {len(sequences)} sequences, which the diagnosis did "
-            "without: what no vehicle and no person can have done is no missing effect. Look at "
-            "the recording there, and correct it or leave it out."
-        ),
+        heading,
+        Text("Sequences with a fault were excluded. Check the recording at the given times."),
         tables.faults_table(d),
         *drawn.faults,
     ]
 
 
-def _model(d: Diagnosis) -> list[Block]:
-    if not d.base:
+def _laws(d: Diagnosis) -> list[Block]:
+    """The comparison of base laws."""
+    if d.laws is None or not d.laws.ranking:
         return []
-    return [Heading("The model's own parameters"), tables.base_table(d)]
+    compared = {"laws": d.laws} | ({"laws_again": d.laws_again} if d.laws_again else {})
+    latest = d.laws_again or d.laws
+    words = f"Best law: {latest.best}. Diagnosed law: {d.model}."
+    if latest.best != d.model and any(law.name == d.model for law in latest.ranking):
+        words += " The folder `nearest_law` contains the diagnosis of the best law."
+    refused = [
+        f"- not compared: {markdown(name)} ({markdown(reason)})"
+        for name, reason in d.laws.refused.items()
+    ]
+    return [
+        Heading("Comparison of base laws", folded=True),
+        Text(words),
+        *(tables.laws_table(laws, name, d.domain) for name, laws in compared.items()),
+        *([Text("\n".join(refused))] if refused else []),
+    ]
 
 
-def _places(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
-    blocks: list[Block] = [Heading("Deviations by variable")]
-    if d.places:
-        words = [
-            f"- {p.variable} in [{amount(p.low)}, {amount(p.high)}]{in_unit(p.unit)}: "
-            f"{amount(p.deviation)} ± {amount(p.error, 2)} {unit}, "
-            f"{'–' if np.isnan(p.share) else f'{100 * p.share:.0f} %'} of the excess error"
-            for p in d.places[:3]
-        ]
-        blocks += [Text("\n".join(words)), tables.places_table(d, unit)]
-    else:
-        blocks.append(Text("No single variable that was looked at stands out."))
-    return [*blocks, *drawn.places]
-
-
-def _rest(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
-    blocks: list[Block] = [Heading("What is left")]
-    if d.unknown is None:
-        blocks.append(Text("No structure that a flexible fit would find."))
-    else:
-        hint = f" A form that comes near, as a hint only: `{d.unknown.hint}`."
-        blocks += [
-            Text(
-                "Something that is not in the catalogue. It depends on "
-                f"{', '.join(d.unknown.variables) or 'no variable that was looked at'}; a "
-                f"flexible fit of the first removes {100 * d.unknown.gain:.0f} % of the squared "
-                f"errors of positions that are left.{hint if d.unknown.hint else ''} "
-                "Next: look at where it acts, think of a cause, and write it as an effect of "
-                "your own (docs/discovery.md)."
-            ),
-            *drawn.unknown,
-        ]
-    blocks.append(Heading("Effects that were not found", 3))
-    absent = any(absence.testable for absence in d.absences)
-    untested = bool(d.not_testable) or any(not absence.testable for absence in d.absences)
-    if absent:
-        blocks.append(tables.absent_table(d))
-    if untested:
-        blocks.append(tables.not_testable_table(d))
-    if not absent and not untested:
-        blocks.append(Text("None was left to look for."))
-    return blocks
-
-
-def _shown(d: Diagnosis, drawn: Figures) -> list[Block]:
-    if not drawn.paths:
-        return []
-    return [Heading("A sealed sequence"), *drawn.paths]
+def _clusters(d: Diagnosis) -> list[Block]:
+    c = d.clusters
+    return [
+        Heading("Independent clusters", folded=True),
+        Text(
+            f"A cluster consists of {c.why}; {c.simultaneous}. Clusters are the unit of every "
+            "interval, test and cross-validation. No two-sided p-value can be below "
+            f"{amount(d.screen.floor, 2)} with {c.open} exploration clusters."
+        ),
+        tables.clusters_table(d),
+    ]
 
 
 def _usage(
     d: Diagnosis, commands: list[str], folder: Path, outcome: DiagnosisOutcome
 ) -> list[Block]:
-    more = ""
+    words = [
+        "The extended model can be evaluated, plotted and trained like any other model. Training "
+        "starts from the estimates."
+    ]
     if has_network(outcome.base):
-        more += (
-            " The weights of the network are in the checkpoint alone; trained from the "
-            "configuration it starts anew."
+        words.append(
+            "The weights of the network are stored in the checkpoint only. Training from the "
+            "configuration starts with new weights."
         )
-    for name in individual(outcome.extended):
-        more += (
-            f" {name} knows the agents of the open sequences; for all others it does not act, so "
-            "that the errors that the command `evaluate` gives on sealed sequences are those "
-            "without it."
-        )
-    words = (
-        "The extended model is a model like any other: errors beside baselines on the sealed "
-        "sequences, force plots, and further training from its configuration, in which every "
-        f"parameter starts at its estimate.{more}"
-    )
+    words += [
+        f"{name} acts only on agents of the exploration sequences, and `nnode evaluate` gives "
+        "errors without it on confirmation sequences."
+        for name in individual(outcome.extended)
+    ]
     code = "```sh\n" + "\n".join(commands) + "\n```"
     python = f'```python\nimport nnode\n\nmodel = nnode.load("{folder / CHECKPOINT}")\n```'
-    return [Heading("Using the extended model"), Text(f"{words}\n\n{code}\n\n{python}")]
+    return [Heading("Using the extended model"), Text("\n\n".join([" ".join(words), code, python]))]
 
 
 def _provenance(d: Diagnosis, inputs: Inputs) -> Provenance:
@@ -350,9 +300,13 @@ def _provenance(d: Diagnosis, inputs: Inputs) -> Provenance:
         listed = [f"{f['name']} (SHA-256 {f['sha256'][:12]})" for f in files.values()]
         facts["Data"] = ", ".join(listed[:12]) + (" …" if len(listed) > 12 else "")
     facts["Sequences"] = (
-        f"open: {_names(d.split.get('open', []))}; sealed: {_names(d.split.get('sealed', []))}"
+        f"exploration: {_names(d.split.get('open', []))}; "
+        f"confirmation: {_names(d.split.get('sealed', []))}"
     )
-    facts["Time"] = ", ".join(f"{what} {seconds:.1f} s" for what, seconds in d.seconds.items())
+    facts["Time"] = ", ".join(
+        f"{'confirm' if what == 'sealed' else what} {seconds:.1f} s"
+        for what, seconds in d.seconds.items()
+    )
     return Provenance(facts)
 
 

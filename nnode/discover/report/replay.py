@@ -9,7 +9,7 @@ import numpy as np
 from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report.files import amount
 from nnode.discover.result import Diagnosis, NamedEffect
-from nnode.pages.replay import ReplayBlock, Scene, Zone
+from nnode.pages.replay import ReplayBlock, Scene, Zone, evenly
 
 #: Largest number of confirmation sequences in the player.
 SCENES = 16
@@ -17,33 +17,25 @@ SCENES = 16
 BEFORE, AFTER = "without effects", "with effects"
 
 
-def by_improvement(outcome: DiagnosisOutcome) -> list[int]:
-    """Rows of ``diagnosis.sealed``, first the one whose error falls most, or without effects the
-    one with the largest error. Rows without two finite errors are left out."""
-    rows = outcome.diagnosis.sealed
-
-    def gain(i: int) -> float:
-        after = rows[i]["after"] if outcome.diagnosis.effects else 0.0
-        return float(rows[i]["before"]) - float(after)
-
-    finite = [i for i, row in enumerate(rows) if np.isfinite([row["before"], row["after"]]).all()]
-    return sorted(finite, key=gain, reverse=True)
-
-
 def scenes(outcome: DiagnosisOutcome) -> list[Scene]:
-    """Confirmation sequences with the simulations of their errors, without and with effects, in the
-    order of :func:`by_improvement`.
+    """Confirmation sequences with the simulations of their errors, without and with effects.
 
-    The still figure has the first one; a crowd's player begins with the one with most people.
+    They are ordered by decreasing error without effects; of many sequences, at most :data:`SCENES`
+    are taken at equal steps of this order. Sequences without finite errors are left out.
     """
+    d = outcome.diagnosis
+    compared = [
+        (row, before, after)
+        for row, (before, after) in zip(d.sealed, outcome.simulated, strict=False)
+        if before is not None
+        and after is not None
+        and np.isfinite([row["before"], row["after"]]).all()
+    ]
+    compared.sort(key=lambda item: -item[0]["before"])
     replayed = []
-    for i in by_improvement(outcome)[:SCENES]:
-        before, after = outcome.simulated[i]
-        if before is None or after is None:
-            continue
-        row, paths = outcome.diagnosis.sealed[i], {BEFORE: before.x}
-        errors = {BEFORE: float(row["before"])}
-        if outcome.diagnosis.effects:
+    for row, before, after in evenly(compared, SCENES):
+        paths, errors = {BEFORE: before.x}, {BEFORE: float(row["before"])}
+        if d.effects:
             paths[AFTER], errors[AFTER] = after.x, float(row["after"])
         notes = {title: f"error {amount(error)} m²" for title, error in errors.items()}
         replayed.append(Scene(before.sequence, paths, notes=notes, restart=before.restart))
@@ -58,14 +50,14 @@ def player(outcome: DiagnosisOutcome, replayed: list[Scene]) -> ReplayBlock:
     return ReplayBlock(
         "replay",
         replayed,
-        "Sealed sequences, on which nothing was calibrated, as measured and in the simulations "
-        "that the errors on this page were computed from. Outlines are where agents were measured; "
-        "arrows, the residuals, go there from where they are simulated. Agents without a "
-        "simulated position are given to the simulation and do not count in the error. The "
-        "distance is the root mean square over the agents at the moment that is shown; the error "
-        f"is the mean of its square over the sequence.{_restart_note(replayed)}{named}",
-        f"Player of {len(replayed)} sealed sequences: agents as measured, and as simulated by "
-        f"{len(replayed[0].simulated)} models.",
+        "Confirmation sequences by decreasing error, as measured and as simulated; the player "
+        "opens on the sequence with the median error. Outlines are measured agents, and arrows "
+        "lead from the simulated to the measured position. Agents without a simulated position "
+        "are inputs of the simulation. The distance is the root mean square over the agents at "
+        "the moment shown, and the error is the mean of its square over the sequence."
+        f"{_restart_note(replayed)}{named}",
+        f"Player of {len(replayed)} confirmation sequences: agents as measured and as simulated "
+        f"by {len(replayed[0].simulated)} models.",
         shaded,
         n_confirmation,
     )
@@ -77,7 +69,7 @@ def _restart_note(replayed: list[Scene]) -> str:
     if scene.restart is None:
         return ""
     seconds = scene.restart * scene.sequence.dt
-    return f" Simulations start again from the measurement every {seconds:.2g} s."
+    return f" Simulations restart from the measurement every {seconds:.2g} s."
 
 
 def zones(d: Diagnosis) -> list[Zone]:
@@ -91,11 +83,11 @@ def zones(d: Diagnosis) -> list[Zone]:
             continue
         match place.variable.split(",")[0]:
             case "position" | "position x":
-                return [Zone("where they part", x=ends)]
+                return [Zone("largest deviation", x=ends)]
             case "position y":
-                return [Zone("where they part", y=ends)]
+                return [Zone("largest deviation", y=ends)]
             case "clock time":
-                return [Zone("when they part", t=ends)]
+                return [Zone("largest deviation", t=ends)]
     return []
 
 

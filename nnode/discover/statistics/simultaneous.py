@@ -46,11 +46,11 @@ class Simultaneous:
     def plain(self) -> str:
         """In a sentence."""
         if not self.pairs:
-            return "no two clusters of a site were there at one time"
-        kept = "they are one cluster" if self.together else "they are taken as independent"
+            return "no two clusters of a site overlap in time"
+        kept = "one cluster" if self.together else "independent"
         return (
-            f"{self.pairs} pairs of clusters that were there at one time: correlation of their "
-            f"residuals {self.correlation:.2f}, one-sided p = {self.p_value:.3f}; {kept}"
+            f"{self.pairs} pairs of clusters overlap in time and are treated as {kept} "
+            f"(correlation of residuals {self.correlation:.2f}, one-sided p = {self.p_value:.3f})"
         )
 
 

@@ -178,7 +178,7 @@ class Replay {
     pen.fillStyle = "#1a1a1a";
     pen.textAlign = "left";
     const away = p.ghost ? this.away(p.x, this.time) : NaN;
-    const now = !p.ghost ? "" : Number.isNaN(away) ? "nobody there" : `${away.toFixed(2)} m away`;
+    const now = !p.ghost ? "" : Number.isNaN(away) ? "no agents" : `distance ${away.toFixed(2)} m`;
     const said = [p.note, now].filter(Boolean).join("; ");
     // narrow panels beside each other have room for two lines
     const lines = p.top === 32 ? [p.title, said] : ["", p.title + (said && `: ${said}`)];
@@ -290,7 +290,7 @@ class Replay {
     const most = Math.max(1e-9, ...rows.flat().filter((x) => !Number.isNaN(x)));
     pen.fillStyle = "#595959";
     pen.textAlign = "left";
-    pen.fillText(`distance from the measurement, up to ${most.toFixed(2)} m`, 2, top + 16);
+    pen.fillText(`distance from the measurement (maximum ${most.toFixed(2)} m)`, 2, top + 16);
     pen.lineWidth = 1.6;
     rows.forEach((row, i) => {
       pen.strokeStyle = this.data.colours.simulated[i % this.data.colours.simulated.length];

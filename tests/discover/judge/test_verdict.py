@@ -182,5 +182,5 @@ def test_what_is_left_is_drawn_in_the_unit_of_its_variable() -> None:
     left = judge.structure([curves([0.0, 1.0, 2.0], [0.1, 0.1, 0.1], removed=0.2)])
     assert (left.variables, left.gain) == (["gap"], 0.2)
     ax = flexible_curve(left, "m/s").axes[0]
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("gap (m)", "missing (m/s)")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("gap (m)", "missing term (m/s)")
     assert list(np.asarray(ax.lines[-1].get_ydata())) == [0.0, 1.0, 2.0]

@@ -99,10 +99,10 @@ def test_headline_tables_and_json_state_the_same_errors(run: Run) -> None:
     assert report["gap"]["after"] == pytest.approx(after)
     words = [amount(before), amount(after)]
     if d.verdict == "named":
-        assert f"goes from {words[0]} to {words[1]} m²" in verdict(d)
+        assert f"from {words[0]} to {words[1]} m²" in verdict(d)
     assert verdict(d) in run.page.replace("&#39;", "'")
     table = pd.read_csv(run.folder / "gap.csv", dtype=str)
-    shown = table[table.iloc[:, 0].isin(["base without effects", "base with effects"])]
+    shown = table[table.iloc[:, 0].isin(["base", "base with effects"])]
     assert list(shown.iloc[:, 1]) == (words if d.effects else words[:1])
     each = pd.read_csv(run.folder / "sealed.csv")
     assert list(each["before"]) == pytest.approx([row["before"] for row in report["sealed"]])
@@ -122,7 +122,8 @@ def test_the_definition_stands_once_on_the_page_and_in_the_report(run: Run) -> N
 def test_player_and_paths_show_the_errors_of_the_table(run: Run) -> None:
     rows = {row["name"]: row for row in run.report["sealed"]}
     (text,) = re.findall(r'<script type="application/json">(.*?)</script>', run.page, re.S)
-    scenes = json.loads(text)["scenes"]
+    player = json.loads(text)
+    scenes = player["scenes"]
     assert len(scenes) > 3
     keys = ["before", "after"][: len(scenes[0]["simulated"])]
     for scene in scenes:
@@ -135,8 +136,8 @@ def test_player_and_paths_show_the_errors_of_the_table(run: Run) -> None:
             square = np.nanmean(away**2) * scene["dims"]
             # positions are rounded to the centimetre
             assert np.sqrt(square) == pytest.approx(np.sqrt(row[key]), abs=0.008)
-    first = rows[scenes[0]["name"]]
-    alts = re.findall(r'alt="Paths of the sealed sequence ([^;]*); ([^"]*)"', run.page)
+    first = rows[scenes[player["first"]]["name"]]
+    alts = re.findall(r'alt="Paths of the sequence ([^;]*); ([^"]*)"', run.page)
     words = [f"error {amount(first[key])} m²" for key in keys]
     assert alts == [(first["name"], alts[0][1])]
     assert all(word in alts[0][1] for word in words)

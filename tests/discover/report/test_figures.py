@@ -8,10 +8,9 @@ from matplotlib.collections import QuadMesh
 
 from nnode.data.sequence import Sequence
 from nnode.discover.report.deviation import Deviation
-from nnode.discover.report.figures import paths
 from nnode.discover.report.figures.maps import neighbour_maps, plane_maps, time_space_maps
 from nnode.discover.report.figures.marks import AFTER, BEFORE, confirmation_costs
-from nnode.discover.report.figures.paths import as_drawn, film_strip, trajectories
+from nnode.discover.report.figures.paths import as_drawn, trajectories
 from nnode.pages.replay import Scene
 
 
@@ -65,7 +64,7 @@ def platoon() -> Sequence:
     return Sequence(name="lane/1", recording="lane", time=time, x=x[..., None])
 
 
-def test_trajectories_and_moments_of_a_platoon() -> None:
+def test_trajectories_of_a_platoon() -> None:
     s = platoon()
     late = s.x - 0.5 * s.time[:, None, None]
     late[:, -1] = np.nan  # the leader is given
@@ -74,9 +73,3 @@ def test_trajectories_and_moments_of_a_platoon() -> None:
     assert [ax.get_title() for ax in figure.axes[:2]] == ["without: error 1.3 m²", "with"]
     assert len(figure.axes) == 4
     assert len(trajectories(s, both[:1]).axes) == 2
-    strip = film_strip(s, both)
-    assert len(strip.axes) == 2 * paths.MOMENTS
-    last = strip.axes[-2]
-    measured, simulated = (np.asarray(line.get_xdata()) for line in last.lines)
-    assert (measured - simulated)[:-1] == pytest.approx(0.5 * s.time[-1])
-    assert measured.mean() == pytest.approx(0.0)  # seen from the platoon's middle

@@ -7,6 +7,7 @@ from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -18,11 +19,12 @@ from nnode.discover.judge.confirmation import defined
 from nnode.discover.report.captions import Figures
 from nnode.discover.report.files import verdict
 from nnode.discover.report.page import draw, page_blocks
-from nnode.discover.report.replay import by_improvement, zones
+from nnode.discover.report.replay import scenes, zones
 from nnode.discover.result import Coefficient, Confirmation, DataFault
 from nnode.model import build_model
 from nnode.model.build import add_effects
-from nnode.pages.page import Heading, Text
+from nnode.pages.page import Heading, TableBlock, Text
+from nnode.pages.replay import typical
 from tests.discover.conftest import Case
 from tests.discover.recorded import ZONE
 
@@ -64,31 +66,34 @@ def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Cas
     assert page.index(told) < page.index("Where the model deviates from the data</h2>")
     order = [
         "Where the model deviates from the data",
-        "The error on sealed sequences",
-        "What is missing",
-        "Do agents differ?",
-        "The model's own parameters",
-        "A sealed sequence",
-        "Deviations by variable",
-        "What is left",
-        "Using the extended model",
+        "Errors on confirmation sequences",
+        "Coefficients",
+        "Differences between agents",
         "How it was decided",
+        "A typical confirmation sequence",
+        "Deviations by variable",
+        "Unexplained structure",
+        "Effects that were not found",
         "Faults of the measurement",
-        "What is independent of what",
+        "Using the extended model",
+        "Independent clusters",
         "How this page was made",
     ]
-    heads = re.findall(r"<h2[^>]*>([^<]*)</h2>", page.replace("&#39;", "'"))
+    heads = re.findall(r"<h2[^>]*>([^<]*)</h2>", page)
     assert heads == order
+    folded = re.findall(r"<summary><h2[^>]*>([^<]*)</h2></summary>", page)
+    assert folded == ["Independent clusters"]
     for words in (
         "nnode evaluate X",
-        "position in [400, 600] m: −6.1 ± 0.4 m/s, 71 % of the excess error",
+        "−6.1 ± 0.4",
+        "71 %",
         "platoons at other times",
         "car 1 jumps",
         "made by hand",
-        "5 sequences were sealed",
+        "5 sequences are confirmation sequences",
         traffic.found.diagnosis.gap.definition,
-        "3 open clusters no two-sided p-value can be below 0.001.",
-        "driver_heterogeneity: not named: the last part of the sealed sequences",
+        "No two-sided p-value can be below 0.001 with 3 exploration clusters.",
+        "no: the last part of the sealed sequences",
     ):
         assert words in page, words
 
@@ -100,7 +105,6 @@ def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
         "faults",
         "map",
         "map_beside",
-        "moments",
         "sealed",
         "trajectories",
         "unknown",
@@ -127,7 +131,7 @@ def test_a_crowd_s_page(crowd: Case, tmp_path: Path) -> None:
     still = replace(crowd.options, replay=False)
     draw(crowd.inputs, crowd.found, still, CONFIG, [], tmp_path)()
     page = (tmp_path / "report.html").read_text()
-    assert "Mean of measured minus simulated acceleration by place" in page
+    assert "Mean of measured minus simulated acceleration by position" in page
     assert "made_up_wind" in page
 
 
@@ -137,9 +141,9 @@ def plain(case: Case, **changes: object) -> list[str]:
     found.diagnosis = replace(found.diagnosis, **changes)
     blocks = page_blocks(case.inputs, found, Figures(), [], Path("run"))
     return [
-        b.markdown if isinstance(b, Text) else b.text
+        b.text if isinstance(b, Heading) else b.markdown if isinstance(b, Text) else b.name
         for b in blocks
-        if isinstance(b, Text | Heading)
+        if isinstance(b, Text | Heading | TableBlock)
     ]
 
 
@@ -158,26 +162,22 @@ def test_a_page_of_nothing_found(traffic: Case) -> None:
         agents=[],
     )
     assert "No effect of the catalogue was added to the model." in words
-    assert "None: every sequence was used." in words
-    assert "No structure that a flexible fit would find." in words
-    assert "None was left to look for." in words
+    assert "No sequence has a fault." in words
+    assert "No curve is significant in the remaining residuals." in words
     assert not any("network" in text for text in words)
-    assert "Do agents differ?" not in words
-    assert "Found, not confirmed" not in words
+    assert "Differences between agents" not in words
+    assert "leads" not in words
 
 
-def test_what_was_not_confirmed_is_a_lead(traffic: Case) -> None:
+def test_hypotheses_that_were_not_confirmed_are_listed_with_the_reason(traffic: Case) -> None:
     d = traffic.found.diagnosis
-    no = Confirmation(0.4, 5, False, "the sealed clusters are not predicted better with it")
+    no = Confirmation(0.4, 5, False, "the errors do not fall")
     words = plain(traffic, effects=[], verdict="none", leads=d.effects, confirmation=no)
-    assert "No effect of the catalogue was added to the model." in words
-    lead = "A lead to follow, not a finding: the sealed clusters are not predicted better with it."
-    assert words[words.index("Found, not confirmed") + 1] == lead
+    assert words[words.index("leads") - 1] == "Reason: the errors do not fall."
 
 
 def test_where_nothing_can_be_tested_the_first_screen_is_described(traffic: Case) -> None:
-    words = plain(traffic, effects=[], verdict="not_testable")
-    assert words[words.index("What one would look at first") + 1].startswith("A description of")
+    assert "screen" in plain(traffic, effects=[], verdict="not_testable")
 
 
 def test_a_network_is_told_to_hide_effects(traffic: Case) -> None:
@@ -186,7 +186,7 @@ def test_a_network_is_told_to_hide_effects(traffic: Case) -> None:
     case.found.base = build_model({**options, "leader": "measured"})
     words = plain(case)
     assert any(text.startswith("**The model is a network.**") for text in words)
-    assert any("weights of the network are in the checkpoint alone" in text for text in words)
+    assert any("weights of the network are stored in the checkpoint only" in text for text in words)
 
 
 def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> None:
@@ -197,32 +197,37 @@ def test_numbers_of_agents_are_said_to_be_unknown_elsewhere(traffic: Case) -> No
     gap = replace(case.found.diagnosis.gap, definition=defined("traffic", True))
     words = plain(case, agents=[replace(own, named=True, reason="")], gap=gap)
     assert any("each agent's number is taken from the first 40 %" in text for text in words)
-    assert any("for all others it does not act" in text for text in words)
+    assert any("acts only on agents of the exploration sequences" in text for text in words)
 
 
-def test_the_telling_sequence_is_where_most_was_gained(traffic: Case) -> None:
+def test_the_player_opens_on_the_sequence_with_the_median_error(traffic: Case) -> None:
     found = deepcopy(traffic.found)
-    names = [traffic.inputs.sequences[i].name for i in found.confirmation]
+    ((simulation, _), *_) = found.simulated
+    assert simulation is not None
+    errors = [4.0, 9.0, 1.0, float("inf"), 16.0]  # a simulation that diverged is not shown
+    sequences = [replace(simulation.sequence, name=f"s{error:g}") for error in errors]
+    moved = [
+        replace(simulation, sequence=s, x=s.x + np.sqrt(error))
+        for s, error in zip(sequences, errors, strict=True)
+    ]
+    found.simulated = [(one, one) for one in moved]
     rows = [
-        {"name": names[0], "before": 5.0, "after": 4.5},
-        {"name": names[1], "before": 4.0, "after": 1.0},
+        {"name": s.name, "before": e, "after": e} for s, e in zip(sequences, errors, strict=True)
     ]
     found.diagnosis = replace(found.diagnosis, sealed=rows)
-    assert by_improvement(found) == [1, 0]
-    found.diagnosis = replace(found.diagnosis, effects=[])
-    assert by_improvement(found) == [0, 1]
-    rows[0]["before"] = float("inf")  # a simulation that blew up is not shown
-    assert by_improvement(found) == [1]
+    shown = scenes(found)
+    assert [scene.sequence.name for scene in shown] == ["s16", "s9", "s4", "s1"]
+    assert shown[typical(shown)].sequence.name == "s4"
 
 
-def test_the_named_place_is_shaded_and_else_where_they_part(traffic: Case) -> None:
+def test_the_named_place_is_shaded_and_else_the_largest_deviation(traffic: Case) -> None:
     d = deepcopy(traffic.found.diagnosis)
     a, b = ZONE
     (zone,) = zones(d)
     assert (zone.label, zone.t, zone.circle) == ("speed_zone", None, None)
     assert zone.x == pytest.approx((a, b))
     (zone,) = zones(replace(d, effects=[]))
-    assert (zone.label, zone.x) == ("where they part", (a, b))
+    assert (zone.label, zone.x) == ("largest deviation", (a, b))
     assert zones(replace(d, effects=[], places=[])) == []
     (effect,) = d.effects
     at = {

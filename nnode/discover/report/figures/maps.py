@@ -15,6 +15,8 @@ from nnode.plots.style import DIVERGING, FONT, GREY, SEQUENTIAL, SMALL_FONT, dre
 #: Smallest and largest number of cells along a side of a coloured map, with about PER_CELL values
 #: in each.
 CELLS, PER_CELL = (12, 48), 3
+#: Largest height of a map of a plane, inches.
+TALL = 6.5
 #: A mean of fewer values is not shown in maps of arrows.
 LEAST = 3
 #: The scale of colours and arrows ends at this percentile of the map before.
@@ -152,10 +154,12 @@ def _arrows(
     # squares of about a step's length, at most 24 along the longer side
     side = max(size / 24, 0.4)
     edges = tuple(np.arange(a - side / 2, b + side, side) for a, b in zip(low, high, strict=True))
-    wide = (high - low)[0] > 1.6 * (high - low)[1]
+    ends = np.vstack([[low, high], np.empty((0, 2)) if walls is None else walls.reshape(-1, 2)])
+    across, along = np.ptp(ends, axis=0)
+    wide = across > 1.6 * along
     rows, columns = (len(panels), 1) if wide else (1, len(panels))
-    ratio = float(np.clip((high - low)[1] / max((high - low)[0], 1e-6), 0.25, 1.6))
-    width = 8.0 / columns if columns > 1 else 7.2
+    ratio = float(np.clip(along / max(across, 1e-6), 0.25, 1.6))
+    width = min(8.0 / columns if columns > 1 else 7.2, TALL / ratio)
     figure = new_figure(width * columns + 1.0, (0.92 * width * ratio + 0.5) * rows + 0.3)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     fields = []

@@ -24,7 +24,7 @@ AFTER: dict[str, Any] = {"color": OKABE_ITO["blue"], "marker": "o"}
 
 
 def place_curves(places: Sequence[Place], unit: str) -> Figure:
-    """Mean deviation by variable, with its standard errors and the interval that stands out.
+    """Missing term by variable, with its standard errors and the significant interval.
 
     Args:
         places: one panel each.
@@ -50,11 +50,11 @@ def place_curves(places: Sequence[Place], unit: str) -> Figure:
                 elinewidth=0.8,
                 markersize=4,
             )
-        share = f"{100 * place.share:.0f} % of the excess" if np.isfinite(place.share) else ""
+        share = f"{100 * place.share:.0f} % of the error" if np.isfinite(place.share) else ""
         dress(
             ax,
             x=_with_unit(place.variable, place.unit),
-            y=f"deviation ({unit})" if n % columns == 0 else "",
+            y=f"missing term ({unit})" if n % columns == 0 else "",
             title=share.replace("-", "−"),
         )
     for ax in axes.flat[len(places) :]:
@@ -94,6 +94,7 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
             [0], [f"{effect.name}\n{name}{f' ({c.unit})' if c.unit not in ('', '1') else ''}"]
         )
         dress(ax, grid=False)
+        ax.ticklabel_format(axis="x", useOffset=False)
         ax.tick_params(axis="y", length=0)
         ax.margins(x=0.15)
         for side in ("top", "right", "left"):
@@ -115,27 +116,30 @@ def confirmation_costs(
         np.asarray(costs, float)[order] for costs in (before, before if after is None else after)
     )
     place = np.arange(len(order))
+    recordings = {name.rpartition("/")[0] for name in names}
+    shared = f"{recordings.pop()}/" if len(recordings) == 1 and "" not in recordings else ""
     figure = new_figure(7.2, 3.2)
     ax = figure.subplots()
     ax.vlines(place, np.minimum(b, a), np.maximum(b, a), color=GREY, linewidth=1)
     shown = [("without effects", b, BEFORE), ("with effects", a, AFTER)][: 1 + (after is not None)]
     for _, values, style in shown:
         ax.plot(place, values, linestyle="", markersize=5.5, **style)
-    positive = np.concatenate([b, a])
-    if (positive > 0).all():
+    levels = np.concatenate([b, a, [floor] if floor > 0 else []])
+    if (levels > 0).all():
         ax.set_yscale("log")
+        ax.set_ylim(0.7 * np.nanmin(levels), 1.4 * np.nanmax(levels))
         ax.tick_params(which="minor", labelsize=SMALL_FONT, width=0.6, color=GREY)
     handles = [Line2D([], [], linestyle="", label=label, **style) for label, _, style in shown]
     if np.isfinite(floor) and floor > 0:
         ax.axhline(floor, color="black", linestyle="--", linewidth=0.9)
-        handles.append(
-            Line2D([], [], color="black", linestyle="--", label="noise of the measurement")
-        )
+        handles.append(Line2D([], [], color="black", linestyle="--", label="measurement noise"))
     if len(order) <= NAMED:
-        ax.set_xticks(place, [names[i] for i in order], rotation=40, ha="right")
+        short = [names[i].removeprefix(shared) for i in order]
+        ax.set_xticks(place, short, rotation=40, ha="right")
     else:
         ax.set_xticks([])
-    dress(ax, x="sealed sequence", y="mean square error (m²)")
+    of = f" of {shared.rstrip('/')}" if shared else ""
+    dress(ax, x=f"confirmation sequence{of}", y="mean square error (m²)")
     figure.legend(
         handles=handles, loc="outside upper center", ncols=3, frameon=False, fontsize=SMALL_FONT
     )
@@ -149,7 +153,7 @@ def flexible_curve(structure: Structure, unit: str) -> Figure:
     ax.axhline(0, color=GREY, linewidth=0.8)
     ax.plot(structure.curve["at"], structure.curve["deviation"], color=OKABE_ITO["blue"])
     variable = structure.variables[0] if structure.variables else "variable"
-    dress(ax, x=_with_unit(variable, structure.unit), y=f"missing ({unit})")
+    dress(ax, x=_with_unit(variable, structure.unit), y=f"missing term ({unit})")
     return figure
 
 

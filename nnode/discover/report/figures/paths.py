@@ -1,4 +1,4 @@
-"""One sequence as measured and as two models simulate it: paths, moments."""
+"""Paths of one sequence as measured and as two models simulate it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nnode.data.sequence import Sequence
-from nnode.discover.report.figures.maps import draw_walls
+from nnode.discover.report.figures.maps import TALL, draw_walls
 from nnode.discover.report.figures.marks import AFTER, BEFORE
 from nnode.pages.replay import Scene
 from nnode.plots.style import GREY, SMALL_FONT, dress, new_figure
-
-#: Moments of a film strip.
-MOMENTS = 5
 
 _MEASURED: dict[str, Any] = {"color": GREY, "marker": "o"}
 
@@ -80,7 +77,7 @@ def _lines(s: Sequence, simulated: list[Simulated]) -> Figure:
         dress(lower, x="clock time (s)", y="simulated −\nmeasured (m)")
         for ax in (top, lower):
             ax.label_outer()
-    figure.legend(handles=_handles(simulated, True), **_LEGEND)
+    figure.legend(handles=_handles(simulated), **_LEGEND)
     return figure
 
 
@@ -102,7 +99,7 @@ def _paths(s: Sequence, simulated: list[Simulated]) -> Figure:
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         dress(ax, x="x (m)", y="y (m)", title=simulation.heading)
         ax.label_outer()
-    figure.legend(handles=_handles(simulated, True), **_LEGEND)
+    figure.legend(handles=_handles(simulated), **_LEGEND)
     return figure
 
 
@@ -114,13 +111,11 @@ _LEGEND: dict[str, Any] = {
 }
 
 
-def _handles(simulated: list[Simulated], lines: bool) -> list[Line2D]:
-    style: dict[str, Any] = {"linestyle": "-", "marker": ""} if lines else {"linestyle": ""}
-    measured: dict[str, Any] = {"linewidth": 2.2, "alpha": 0.55} if lines else {"fillstyle": "none"}
+def _handles(simulated: list[Simulated]) -> list[Line2D]:
     return [
-        Line2D([], [], label="measured", **{**_MEASURED, **style, **measured}),
+        Line2D([], [], label="measured", color=GREY, linewidth=2.2, alpha=0.55),
         *(
-            Line2D([], [], label=simulation.title, **{**simulation.style, **style})
+            Line2D([], [], label=simulation.title, color=simulation.style["color"])
             for simulation in simulated
         ),
     ]
@@ -153,55 +148,7 @@ def _planes(
         figure = new_figure(side, (0.9 * side * ratio + 0.45) * number + 0.6)
         grid = figure.subplots(number, 1, sharex=True, sharey=True, squeeze=False)
     else:
-        width = side / number
-        figure = new_figure(side + 0.6, 0.9 * width * ratio + 1.1)
+        width = min(side / number, TALL / ratio)
+        figure = new_figure(width * number + 0.6, 0.9 * width * ratio + 1.1)
         grid = figure.subplots(1, number, sharex=True, sharey=True, squeeze=False)
     return figure, list(grid.ravel())
-
-
-def _moment(ax: Axes, s: Sequence, simulation: Simulated, k: int) -> None:
-    """Measured and simulated agents at sample k, joined by lines."""
-    if s.x.shape[2] == 1:
-        # cars are shown relative to their mean position, with one scale for all moments
-        frame = s.x.mean((1, 2))
-        half = max(np.nanmax(np.abs(x[..., 0] - frame[:, None])) for x in (s.x, simulation.x))
-        ax.set(xlim=(-1.06 * half, 1.06 * half), ylim=(-0.6, 1.6))
-        ax.set_yticks([0, 1], ["simulated", "measured"])
-        real, model = (
-            np.stack([x[k, :, 0] - frame[k], np.full(x.shape[1], y)], 1)
-            for x, y in ((s.x, 1.0), (simulation.x, 0.0))
-        )
-    else:
-        low, high = _view(s)
-        draw_walls(ax, s.walls)
-        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        real, model = s.x[k], simulation.x[k]
-    joined = list(np.stack([real, model], 1))
-    ax.add_collection(LineCollection(joined, colors="black", linewidths=0.7))
-    ax.plot(*real.T, linestyle="", markersize=5.5, fillstyle="none", **_MEASURED)
-    ax.plot(*model.T, linestyle="", markersize=5, alpha=0.85, **simulation.style)
-
-
-def film_strip(sequence: Sequence, simulated: list[Simulated]) -> Figure:
-    """Moments of a sequence, a row each; a column per simulation, joined to the measurement."""
-    s = sequence
-    number = min(MOMENTS, s.n_samples)
-    moments = np.unique(np.linspace(0, s.n_samples - 1, number).round().astype(int))
-    traffic = s.x.shape[2] == 1
-    low, high = (np.zeros(2), np.array([1.0, 0.28])) if traffic else _view(s)
-    ratio = float(np.clip((high - low)[1] / (high - low)[0], 0.15, 1.4))
-    width = 4.2
-    figure = new_figure(width * len(simulated) + 0.6, (width * ratio + 0.2) * len(moments) + 0.8)
-    axes = figure.subplots(len(moments), len(simulated), sharex=True, sharey="col", squeeze=False)
-    for row, k in zip(axes, moments, strict=True):
-        for i, (ax, simulation) in enumerate(zip(row, simulated, strict=True)):
-            _moment(ax, s, simulation, int(k))
-            last, seconds = k == moments[-1], s.time[k] - s.time[0]
-            across = f"{seconds:.1f} s" if traffic else f"{seconds:.1f} s: y (m)"
-            along = "position seen from the platoon's middle (m)" if traffic else "x (m)"
-            title = simulation.title if k == moments[0] else ""
-            dress(ax, x=along if last else "", y=across if i == 0 else "", title=title)
-            if i:
-                ax.tick_params(labelleft=False)
-    figure.legend(handles=_handles(simulated, False), **_LEGEND)
-    return figure
