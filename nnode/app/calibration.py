@@ -621,20 +621,21 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     log.info("calibrating to %d sequences with drivers who differ", len(indices))
     seed = int(trainer.provenance.config["seed"])
     first = _logged_parameters(trainer.model, trainer.history[0])
+    drivers_fit, estimated = None, False
     try:
         drivers_fit = calibrated_drivers(
             copy.deepcopy(trainer.model).cpu(),
             first,
             [store[i] for i in indices],
-            drivers or AUTO,
+            drivers,
             clusters(store.index)[indices],
             seed,
         )
+        estimated = drivers_fit is None or drivers is not None or drivers_fit.converged
     except ConfigError:
         if drivers is not None:
             raise
-        drivers_fit = None
-    if drivers is None and (drivers_fit is None or not drivers_fit.converged):
+    if not estimated:
         log.warning(
             "how drivers differ could not be estimated: all share their parameters, whose "
             "intervals do not contain that they differ"

@@ -176,11 +176,12 @@ def calibrated_drivers(
     model: System,
     first: dict[str, float],
     sequences: list[Sequence],
-    drivers: str | list[str],
+    drivers: str | list[str] | None,
     cluster: np.ndarray,
     seed: int,
-) -> Drivers:
-    """Calibrate to drivers who differ.
+) -> Drivers | None:
+    """Calibrate to drivers who differ; None if this is the default (``drivers`` is None) and
+    positions were smoothed before.
 
     Args:
         model: start of one search.
@@ -192,8 +193,8 @@ def calibrated_drivers(
     Raises:
         ConfigError: see :func:`nnode.population.drivers.fit_drivers`.
     """
-    from nnode.population.drivers import STEP, fit_drivers  # compiled code takes a second
-    from nnode.population.followers import FLOOR, paths_of
+    from nnode.population.drivers import STEP, checked, fit_drivers  # compiled code takes a second
+    from nnode.population.followers import paths_of, without_errors
     from nnode.population.intervals import variations
 
     double = copy.deepcopy(model).double()
@@ -202,14 +203,19 @@ def calibrated_drivers(
     inside = np.where(np.isfinite(high - low), INSIDE * (high - low), 0.0)
     vector.fill_(np.clip(vector.row.numpy(), low + inside, high - inside))
     paths = paths_of(sequences, STEP)
-    if paths.error <= FLOOR:
-        log.info(
-            "positions show no errors that are new at every sample, so that they were smoothed: "
-            "errors of %g m are assumed",
-            SMOOTHED,
-        )
-        paths = replace(paths, error=SMOOTHED)
-    population = fit_drivers(double, paths, drivers, first, seed=seed)
+    if without_errors(sequences):
+        # positions of a simulation are explained by a law, and those that were smoothed are not
+        part = paths_of(checked(sequences), STEP)
+        if not fit_drivers(double, part, first=first, pairs=0).explains_rates:
+            if drivers is None:
+                return None
+            log.info(
+                "positions show no errors that are new at every sample, so that they were "
+                "smoothed: errors of %g m are assumed",
+                SMOOTHED,
+            )
+            paths = replace(paths, error=SMOOTHED)
+    population = fit_drivers(double, paths, drivers or AUTO, first, seed=seed)
     if not population.estimate.converged:
         log.warning(
             "the estimation of drivers who differ did not converge: take another law, fewer "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from typing import Any, cast
 
@@ -58,7 +59,7 @@ from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.system import System
-from nnode.population.followers import drivers_differ
+from nnode.population.followers import EXPLAINED, drivers_differ, without_errors
 from nnode.population.intervals import variations
 from nnode.progress import Stages
 
@@ -154,14 +155,14 @@ def _diagnosed(
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
     candidates = [e for e in CATALOGUE.of(domain, system.order) if e.name in names]
-    differ = drivers_differ(system, sequences)
+    differ = _drivers_differ(system, sequences, options)
     refused = {e.name: reason for e in candidates if (reason := not_offered(e, system, differ))}
     offered = [effect for effect in candidates if effect.name not in refused]
     effects = [effect for effect in offered if not issubclass(effect, IndividualEffect)]
-    exploration = _explore(system, sequences, options, effects, clock, stages, hint)
+    explore = partial(_explore, system, sequences, options, effects, differ, clock, stages, hint)
+    exploration = explore()
     if exploration.simultaneity.together:
-        regrouped = _explore(system, sequences, options, effects, clock, stages, hint, True)
-        exploration = replace(regrouped, simultaneity=exploration.simultaneity)
+        exploration = replace(explore(together=True), simultaneity=exploration.simultaneity)
     division, engine = exploration.division, exploration.engine
     base_system, selection = exploration.base_system, exploration.selection
     notes: list[str] = [division.note] if division.note else []
@@ -211,7 +212,6 @@ def _diagnosed(
         extended = confirmation.with_agents(engine, corrected, named_individuals)
     gap, errors, simulations = confirmation.gap(extended, named_individuals)
     clock.lap("sealed")
-    removed_share = 1 - square_of(engine, selection.fit.system) / square_of(engine, base_system)
     tests = confirmation.tests
     effects_named = [
         *(
@@ -237,7 +237,7 @@ def _diagnosed(
         verdict=_verdict(
             selection,
             unexplained,
-            removed_share,
+            1 - square_of(engine, selection.fit.system) / square_of(engine, base_system),
             bool(named_individuals),
             testable,
             bool(imitations),
@@ -278,6 +278,13 @@ def _diagnosed(
     )
 
 
+def _drivers_differ(system: System, sequences: list[Sequence], options: DiscoverOptions) -> bool:
+    """Whether differences between drivers are part of the statistical model. They are not if
+    positions were smoothed, because the errors that are left are autocorrelated."""
+    smoothed = options.smoothed and without_errors(sequences)
+    return drivers_differ(system, sequences) and not smoothed
+
+
 def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves]:
     """The curves that remain significant in the residuals of a selected model."""
     engine, remaining = exploration.engine, exploration.base_curves
@@ -299,7 +306,7 @@ def _drivers(engine: Engine, fit: Fit, notes: list[str]) -> list[Variation]:
     """The variances between drivers and over time, under the model with all selected effects.
 
     Args:
-        notes: a note is added to them if the standard deviation of the pushes is at its bound.
+        notes: a note is added to them if pushes explain a large part of the rates.
     """
     if not isinstance(engine, FollowersEngine):
         return []
@@ -307,11 +314,15 @@ def _drivers(engine: Engine, fit: Fit, notes: list[str]) -> list[Variation]:
     assert engine.population is not None
     drivers = [Variation(name, **row) for name, row in variations(engine.population).items()]
     push = next(row for row in drivers if row.name == "push")
-    if push.at_bound == "high":
+    if push.at_bound == "high" or not engine.population.explains_rates:
+        rate = "accelerations" if fit.system.order > 1 else "speeds"
+        hint = ""
+        if without_errors(engine.sequences):
+            hint = " If positions were smoothed before, set discover.smoothed=true."
         notes.append(
-            f"Pushes of {push.estimate:.3g} {push.unit} are the strongest that are allowed: the "
-            "law explains little of how speeds change, and effects may be hidden behind them. "
-            "Compare other laws, or look at how the positions were measured."
+            f"The law explains little of how {rate} vary: pushes have a standard deviation of "
+            f"{push.estimate:.3g} {push.unit}, more than {EXPLAINED:.0%} of that of the {rate}. "
+            f"Effects may be hidden behind them. Compare other laws.{hint}"
         )
     return drivers
 
@@ -343,6 +354,7 @@ def _explore(
     sequences: list[Sequence],
     options: DiscoverOptions,
     effects: list[type[Effect]],
+    differ: bool,
     clock: _Clock,
     stages: Stages,
     hint: System | None,
@@ -351,12 +363,14 @@ def _explore(
     """Calibrate, locate deviations, and select effects on the exploration sequences.
 
     Args:
+        differ: whether drivers differ.
         together: simultaneous sequences form one cluster.
     """
     stages.begin("calibrating")
     division = divide(sequences, options, together=together)
     exploration_sequences = [sequences[i] for i in division.exploration]
-    engine = engine_of(system, exploration_sequences, division.label[division.exploration])
+    label = division.label[division.exploration]
+    engine = engine_of(system, exploration_sequences, label, differ=differ)
     initial = initial_fit(engine, copy.deepcopy(system).double())
     if initial is None:
         raise SimulationError(

@@ -27,6 +27,9 @@ class DiscoverOptions:
     exclude: list[str] = field(default_factory=list)  # names not to look for
     # models to compare before effects are looked for; null: the domain's laws; []: none
     compare: list[str] | None = None
+    # positions without white errors were smoothed before: their errors are autocorrelated, and all
+    # drivers are simulated with the same parameters; null: whether the data source is known for it
+    smoothed: bool | None = None
     max_effects: int = 4  # at most so many are added
     structure: bool = (
         True  # look for what has no name; without, it is faster and nothing is unknown

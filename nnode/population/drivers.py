@@ -20,7 +20,7 @@ from nnode.population.estimate import (
     fit_deviations,
     fit_variances,
 )
-from nnode.population.followers import Followers, Paths, score_bias
+from nnode.population.followers import Followers, Paths, law_explains_rates, score_bias
 from nnode.population.likelihood import Marginal, PushNoise, marginal
 from nnode.simulation.rhs import formula_of
 
@@ -50,6 +50,8 @@ RANKING_STEPS = 15
 PAIRS = 2
 #: With fewer followers, variances between drivers are not estimated.
 LEAST_DRIVERS = 5
+#: Number of sequences that decide whether positions without errors were smoothed.
+CHECKED = 20
 #: Longest step of the simulations, s, by the Runge-Kutta method of fourth order.
 STEP = 0.2
 
@@ -82,6 +84,11 @@ class Population:
     def random(self) -> list[str]:
         """Names of the parameters that differ between drivers."""
         return [self.model.names[q] for q in self.model.random]
+
+    @property
+    def explains_rates(self) -> bool:
+        """See :func:`~nnode.population.followers.law_explains_rates`."""
+        return law_explains_rates(self.model, float(self.estimate.variances.noise[0]))
 
 
 def fit_drivers(
@@ -180,6 +187,12 @@ def refit(before: Population, system: System, paths: Paths, *, fixed: bool) -> P
         model, before.noise, model.start, variances, agents=agents, start=start
     )
     return replace(before, model=model, estimate=deviations, bias=np.zeros(len(model.start)))
+
+
+def checked(sequences: list[Sequence]) -> list[Sequence]:
+    """At most :data:`CHECKED` of some sequences, evenly spaced."""
+    number = min(CHECKED, len(sequences))
+    return [sequences[i] for i in np.linspace(0, len(sequences) - 1, number).round().astype(int)]
 
 
 def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:

@@ -36,13 +36,16 @@ from nnode.simulation.rhs import formula_of
 
 #: Smallest standard deviation of measurement errors, m: that of a camera.
 FLOOR = 0.01
-#: Range of white measurement errors, m, in which differences between drivers are estimated by
-#: default. Below it, positions were smoothed or simulated: SUMO's paths at 5 Hz, which have no
-#: errors, seem to have errors of 0.011 m, and errors of smoothed positions are autocorrelated,
-#: which the likelihood neglects. Above it, smoothed leaders keep too much noise: ESIMAS's errors of
-#: 0.57 m are attributed to pushes. A table in docs/discovery.md compares both approaches below the
-#: upper limit.
+#: Range of white measurement errors, m. Below it, positions were simulated, or they were smoothed:
+#: then their errors are autocorrelated, which the likelihood neglects. SUMO's paths at 5 Hz, which
+#: have no errors, seem to have errors of 0.011 m. Above it, smoothed leaders keep too much noise:
+#: ESIMAS's errors of 0.57 m are attributed to pushes. Tables in docs/discovery.md compare both
+#: approaches.
 NOISE = (0.015, 0.45)
+#: Pushes above this share of the standard deviation of the measured rates show that errors of
+#: positions are attributed to them. Simulations by ``lin`` and ``idm`` without errors, calibrated
+#: with their effects: 0.16 to 0.35. Smoothed measurements (NGSIM, TGSIM, Waymo): 0.44 to 5.7.
+EXPLAINED = 0.4
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
 DIFFERENCE, START_DIFFERENCE = 1e-4, 1e-2
 #: The push on the highest rate ``(R, F)``, as a function of the index of the time in the paths
@@ -218,12 +221,28 @@ def follower_formula(system: System) -> LaneDynamics | None:
 
 
 def drivers_differ(system: System, sequences: Iterable[Sequence]) -> bool:
-    """Whether differences between drivers are estimated by default: if the model is a formula of
-    the positions and speeds of a driver and of the vehicles ahead, and the measurement errors are
-    in the range :data:`NOISE`."""
+    """Whether differences between drivers can be estimated by default: if the model is a formula
+    of the positions and speeds of a driver and of the vehicles ahead, and the measurement errors
+    are not above :data:`NOISE`. If they are below, see :func:`law_explains_rates`."""
     if follower_formula(system) is None:
         return False
-    return NOISE[0] < measured_noise(sequences).position < NOISE[1]
+    return measured_noise(sequences).position < NOISE[1]
+
+
+def without_errors(sequences: Iterable[Sequence]) -> bool:
+    """Whether positions have no white measurement errors: they were simulated or smoothed."""
+    return measured_noise(sequences).position < NOISE[0]
+
+
+def law_explains_rates(model: Followers, push: float) -> bool:
+    """Whether pushes of a standard deviation are small, compared to the variation of the highest
+    rate of the followers' smoothed paths; see :data:`EXPLAINED`. Otherwise positions without
+    errors are not those of a simulation by a similar model."""
+    paths, rates = model.paths, []
+    for sequence, place in zip(paths.sequence, paths.place, strict=True):
+        rate = np.gradient(paths.smoothed[sequence][:, place], paths.dt)
+        rates.append(rate - rate.mean() if model.lane.order == 1 else np.gradient(rate, paths.dt))
+    return push <= EXPLAINED * float(np.sqrt(np.mean(np.concatenate(rates) ** 2)))
 
 
 def _n_disturbed(lane: LaneDynamics) -> int:

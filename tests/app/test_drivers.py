@@ -123,7 +123,7 @@ def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model
     ("model", "noise", "options", "plan"),
     [
         ("idm", True, {}, None),
-        ("idm", False, {}, "none"),
+        ("idm", False, {}, None),
         ("lin", True, {}, "none"),
         ("a2", True, {}, "none"),
         ("idm", True, {"pooling": Pooling.alone}, "none"),
@@ -132,7 +132,7 @@ def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model
         ("lin", True, {"drivers": ["v0"]}, ["v0"]),
     ],
 )
-def test_drivers_differ_by_default_in_laws_of_second_order_where_positions_have_errors(
+def test_drivers_differ_by_default_in_laws_of_second_order(
     small: pd.DataFrame, model: str, noise: bool, options: dict[str, Any], plan: Any
 ) -> None:
     given = list(nnode.sequences(small if noise else pairs(number=6, seconds=20.0)))

@@ -84,9 +84,11 @@ def test_nothing_is_named_where_the_law_is_right() -> None:
     assert d.gap.after == d.gap.before
 
 
-@pytest.mark.parametrize(("calm", "testable"), [(1.0, True), (0.05, False)])
-def test_a_desired_speed_can_be_tested_where_it_would_bind(calm: float, testable: bool) -> None:
-    sequences = platoons(**MANY, calm=calm)
+@pytest.mark.parametrize(("calm", "noise", "testable"), [(1.0, 0.02, True), (0.05, 0.1, False)])
+def test_a_desired_speed_can_be_tested_where_it_would_bind(
+    calm: float, noise: float, testable: bool
+) -> None:
+    sequences = platoons(**MANY, calm=calm, noise=noise)
     options = DiscoverOptions(effects=["free_flow_speed"], structure=False)
     d = diagnose(law(), sequences, options).diagnosis
     assert d.verdict == "none"

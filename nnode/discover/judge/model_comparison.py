@@ -29,7 +29,6 @@ from nnode.discover.residuals.fit import sums
 from nnode.discover.statistics.combination import least_confirmation
 from nnode.discover.statistics.paired import score_toward
 from nnode.model.system import System
-from nnode.population.followers import drivers_differ
 
 
 def engine_of(
@@ -38,6 +37,7 @@ def engine_of(
     clusters: np.ndarray | None = None,
     *,
     whole: bool = False,
+    differ: bool = False,
     like: Engine | None = None,
 ) -> Engine:
     """The engine for a model and its extensions.
@@ -45,13 +45,14 @@ def engine_of(
     Args:
         whole: compare whole lane sequences with unweighted errors, as most calibrations do; it has
             no effect in crowds.
+        differ: whether drivers differ.
         like: an engine whose variances are used if drivers differ.
     """
     if whole and system.domain == "traffic":
         return TrafficEngine(sequences, np.inf, clusters, np.inf)
     if isinstance(like, FollowersEngine):
         return FollowersEngine(sequences, clusters, like=like)
-    if like is None and drivers_differ(system, sequences):
+    if differ:
         return FollowersEngine(sequences, clusters)
     return windows_of(system, sequences, clusters)
 

@@ -481,6 +481,7 @@ class Memory(LaneEffect):
     """
 
     name = "memory"
+    of_drivers = True
     rules = {
         2: Rule(
             rate="W + law(T=q) - law()",
