@@ -72,7 +72,7 @@ STAGES = {
     "calibrating": 6.0,
     "locating": 22.0,
     "naming": 62.0,
-    "comparing on sealed sequences": 55.0,
+    "confirming": 55.0,
 }
 
 
@@ -171,7 +171,7 @@ def _diagnosed(
         selection, imitations = _without_imitations(exploration, nearer, notes)
     numbers = _clusters(exploration, options, len(effects))
     testable = numbers.open >= numbers.least
-    stages.begin("comparing on sealed sequences")
+    stages.begin("confirming")
     confirmation = ConfirmationSet(
         engine,
         base_system,

@@ -20,7 +20,7 @@ class Rules:
     # J tests between effects, comparisons of effects with curves
     level: float = 0.05
     # level that the first screen and the confirmation clusters must each reach on their own. The
-    # error rate is that of both together, ``discover.alpha``; without this one, strong evidence in
+    # error rate is that of both together, discover.alpha; without this one, strong evidence in
     # one part would name an effect that the other part contradicts
     each: float = 0.25
     # stricter level, where errors mislead most: unexplained structure, and similar effects

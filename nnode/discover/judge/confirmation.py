@@ -79,10 +79,10 @@ class _ModelTest:
                 f"(p = {self.p_value:.3f}, required {self.alpha:g})"
             )
         if not self.likelihood_rises:
-            return "the sealed clusters are not predicted better with it"
+            return "the confirmation clusters are not predicted better with it"
         if not self.confirmed:
             return (
-                "the errors of positions on the sealed sequences do not become smaller with it "
+                "the errors of positions on the confirmation sequences do not decrease with it "
                 f"({self.before:.3g} and {self.after:.3g} m²)"
             )
         return ""
@@ -98,8 +98,8 @@ _SIMULATED = {
     "measured paths of the vehicles ahead, smoothed, each with the parameters and the start that "
     "are most likely for that driver",
     "crowd": "of each person at each compared sample. Everyone is simulated for about 1.5 s at a "
-    "time among the measured paths of the others, and what an unknown start state explains is "
-    "taken out",
+    "time among the measured paths of the others, and the part that an unknown start state "
+    "explains is removed",
 }
 
 
@@ -116,8 +116,8 @@ def defined(compared: str, individual: bool) -> str:
     )
     return (
         "The error is the mean square distance between measured and simulated position (m²) "
-        f"{_SIMULATED[compared]}. It is averaged within each sealed sequence, then over the sealed "
-        f"sequences.{last_part if individual else ''}"
+        f"{_SIMULATED[compared]}. It is averaged within each confirmation sequence, then over "
+        f"the sequences.{last_part if individual else ''}"
     )
 
 
@@ -387,19 +387,19 @@ def _rejection_reason(
     if not enough:
         return "there are too few clusters to test it"
     if estimate.p_value > alpha or not estimate.interval()[0] > 0:
-        return "what an agent's numbers have in common over time does not stand out"
+        return "the differences between agents that persist over time are not significant"
     if structure:
-        return "something without a name is left, which numbers of agents would absorb"
+        return "unexplained structure remains, which agent-specific parameters would absorb"
     return ""
 
 
 def _not_confirmed_reason(p_value: float, errors: HeldOutErrors | None, clusters: int) -> str:
     """Why the confirmation clusters do not confirm them; empty if they do."""
     if errors is None:
-        return "the sealed sequences are too short to be divided"
+        return "the confirmation sequences are too short to be divided"
     if p_value > rules().level:
         return too_few(clusters) or (
-            "the last part of the sealed sequences is not predicted better by own numbers than "
-            f"without, or by one number per sequence (one-sided p = {p_value:.3f})"
+            "agent-specific parameters do not predict the last part of the confirmation sequences "
+            f"better than none, or than one per sequence (one-sided p = {p_value:.3f})"
         )
     return ""

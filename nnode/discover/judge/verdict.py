@@ -233,8 +233,8 @@ def agents_absent(estimate: IndividualEstimate, alpha: float, enough_clusters: b
         ""
         if testable
         else (
-            f"{name} would not stand out with a probability of {rules().power:.0%} even if it were "
-            f"{strength.expected:.3g}{'' if strength.unit == '1' else ' ' + strength.unit}"
+            f"{name} would not be significant with a probability of {rules().power:.0%} even if it "
+            f"were {strength.expected:.3g}{'' if strength.unit == '1' else ' ' + strength.unit}"
         ),
     )
 
