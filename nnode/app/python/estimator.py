@@ -60,7 +60,7 @@ class Calibrator:
         drivers: ``none``, ``auto`` or names of parameters such as ``["T", "v0"]``, which differ
             between drivers; ``auto`` selects those whose variance the data determine. Laws of lanes
             are then calibrated by a mixed-effects model, see ``docs/method.md``. None is ``auto``
-            for laws of second order if errors of positions are 0.015 to 0.45 m, and otherwise
+            for laws of second order if errors of positions are at most 0.45 m, and otherwise
             ``none``.
         pooling: ``pooled``, ``alone`` or ``shrunk``; the last two add separate parameters of each
             sequence in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
