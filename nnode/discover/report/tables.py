@@ -73,10 +73,12 @@ def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -
             "to": lambda row: estimate(row[2])[2],
             "unit": lambda row: _unit(row[2]),
             "where": lambda row: row[0].where,
+            "p combined": lambda row: amount(row[0].combined, 2),
             "p on sealed clusters": lambda row: _p_confirmation(row[0]),
         },
-        "Coefficients with 95 % intervals. *p*: one-sided, on the confirmation clusters.",
-        heads={"p on sealed clusters": "p"},
+        "Coefficients with 95 % intervals. *p*: of exploration and confirmation clusters together, "
+        "and of the confirmation clusters alone.",
+        heads={"p combined": "p", "p on sealed clusters": "p, confirmation"},
     )
 
 
