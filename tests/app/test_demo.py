@@ -17,7 +17,7 @@ def test_the_demo_ends_with_one_page(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert printed.rstrip().endswith(f"{page}")
     assert "nnode check mine.csv" in printed
     assert "The model lin lacks speed_zone" in printed
-    assert "Nothing is missing from the model lin" in printed
+    assert "No missing effect was found" in printed
     html = page.read_text(encoding="utf-8")
     assert len(html) < 3_000_000
     assert 'src="data:image/png' in html
