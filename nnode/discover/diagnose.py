@@ -33,7 +33,7 @@ from nnode.discover.name.search import (
     Selection,
     converged_fit,
     initial_fit,
-    most_likely_extension,
+    likely_extensions,
     search,
     without_steps,
 )
@@ -379,9 +379,14 @@ def _explore(
         )
     hints = [] if hint is None else [hint]
     if isinstance(engine, FollowersEngine):
-        likely_models = most_likely_extension(engine, initial, effects)
-        engine.fit_whitening_among([*likely_models, initial.system])
-        hints += likely_models
+        without_variances = copy.copy(engine)
+        engine.fit_whitening(initial.system, torch.from_numpy(initial.row))
+        if engine.population is None or not engine.population.plausible:
+            # a strong missing effect is attributed to pushes
+            extensions = likely_extensions(without_variances, initial, effects)
+            hints += extensions
+            engine = without_variances
+            engine.fit_whitening_among([*extensions, initial.system])
         base = refine(engine, initial.system)
     else:
         base = converged_fit(engine, initial.system)

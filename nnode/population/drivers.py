@@ -86,6 +86,13 @@ class Population:
         return [self.model.names[q] for q in self.model.random]
 
     @property
+    def plausible(self) -> bool:
+        """Whether the estimate converged, with pushes that are shorter than the longest allowed.
+        Longer ones are a deviation of the law or a difference between drivers."""
+        variances = self.estimate.variances
+        return self.estimate.converged and variances.noise[1] < (1 - NEAR) * variances.high[1]
+
+    @property
     def explains_rates(self) -> bool:
         """See :func:`~nnode.population.followers.law_explains_rates`."""
         return law_explains_rates(self.model, float(self.estimate.variances.noise[0]))

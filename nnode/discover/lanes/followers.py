@@ -207,12 +207,12 @@ class FollowersEngine(TrafficEngine):
             self._set_population(refit(start, fixed, paths, fixed=self._like is not None))
 
     def fit_whitening_among(self, systems: list[System]) -> None:
-        """Estimate with each of some models, and keep the estimate with the best BIC. The variances
-        of a model that lacks an effect would attribute it to autocorrelated pushes, which would
-        hide it."""
+        """Estimate with each of some models, starting from the present estimate, and keep the one
+        with the best BIC. The variances of a model that lacks an effect would attribute it to
+        autocorrelated pushes, which would hide it."""
         best, criterion = self, -np.inf
         for system in systems:
-            trial = copy.copy(best)
+            trial = copy.copy(self)
             row = ParameterVector(system).row
             trial.fit_whitening(system, row)
             assert trial.population is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -85,16 +86,15 @@ def initial_fit(engine: Engine, system: System) -> Fit | None:
     return min(fits, key=lambda fit: fit.cost, default=None)
 
 
-def most_likely_extension(engine: Engine, fit: Fit, effects: list[type[Effect]]) -> list[System]:
-    """The model with the effect that explains most of the present residuals, calibrated; empty if
-    its simulation diverges."""
+def likely_extensions(engine: Engine, fit: Fit, effects: list[type[Effect]]) -> list[System]:
+    """The model with each of the effects that explain most of the present residuals, calibrated;
+    without those whose simulations diverge."""
     effect_traces = [trace for effect in effects for trace in traces(engine, fit, effect)]
-    for score in Screen(fit, engine.cluster).scores(effect_traces)[:1]:
-        try:
-            return [calibrated(engine, fit, score, 0.0).system]
-        except SimulationError:
-            break
-    return []
+    extensions = []
+    for score in Screen(fit, engine.cluster).scores(effect_traces)[:LIKELY]:
+        with suppress(SimulationError):
+            extensions.append(calibrated(engine, fit, score, 0.0).system)
+    return extensions
 
 
 def converged_fit(engine: Engine, system: System, rounds: int = 2) -> Fit:
