@@ -87,10 +87,11 @@ class Population:
 
     @property
     def plausible(self) -> bool:
-        """Whether the estimate converged, with pushes that are shorter than the longest allowed.
-        Longer ones are a deviation of the law or a difference between drivers."""
+        """Whether the estimate converged, with pushes that are small compared to the rates and
+        shorter than the longest allowed. Others stand for a deviation of the law."""
         variances = self.estimate.variances
-        return self.estimate.converged and variances.noise[1] < (1 - NEAR) * variances.high[1]
+        short = variances.noise[1] < (1 - NEAR) * variances.high[1]
+        return self.estimate.converged and short and self.explains_rates
 
     @property
     def explains_rates(self) -> bool:
