@@ -43,8 +43,8 @@ FLOOR = 0.01
 #: approaches.
 NOISE = (0.015, 0.45)
 #: Pushes above this share of the standard deviation of measured rates show that a missing effect,
-#: or errors of positions, are attributed to them. Simulations by ``lin`` and ``idm`` without errors,
-#: calibrated with their effects: 0.16 to 0.35; without a hidden zone: 0.7 to 1.1. Smoothed
+#: or errors of positions, are attributed to them. Simulations by ``lin`` and ``idm`` without errors
+#: and with their effects: 0.16 to 0.35; without a hidden zone: 0.7 to 1.1. Smoothed
 #: measurements (NGSIM, TGSIM, Waymo): 0.44 to 5.7.
 EXPLAINED = 0.4
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
