@@ -138,8 +138,9 @@ def test_sumo_s_drivers_are_understood_without_any_noise(
     assert {other["name"] for other in effect["alternatives"]} <= kin
     found = {name: c["value"] for name, c in effect["coefficients"].items()}
     assert found.get("kappa_close", found.get("kappa")) == pytest.approx(KAPPA, abs=0.1)
-    # of followers behind measured leaders, each with his most likely start
-    assert (report["gap"]["closed"] > 0.8) == bool(report["effects"])
+    # of followers behind measured leaders, each with his most likely start; the bounds on
+    # accelerations remain
+    assert (report["gap"]["closed"] > 0.7) == bool(report["effects"])
 
 
 def test_the_stretch_of_longer_times_is_found(
