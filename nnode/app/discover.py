@@ -66,7 +66,16 @@ log = logging.getLogger(__name__)
 #: Folder of the diagnosis of the nearest law, if it is not the requested one.
 NEAREST = "nearest_law"
 #: Data sources whose positions were smoothed before they were published.
-SMOOTHED = {"astazero", "highd", "ngsim", "ngsim_pairs", "openacc", "pairs", "tgsim", "waymo_pairs"}
+SMOOTHED_SOURCES = {
+    "astazero",
+    "highd",
+    "ngsim",
+    "ngsim_pairs",
+    "openacc",
+    "pairs",
+    "tgsim",
+    "waymo_pairs",
+}
 
 
 def discover(config: DictConfig, folder: Path) -> None:
@@ -221,7 +230,7 @@ def _job(
     laws = candidates(model, system, options)
     inputs = read()
     if options.smoothed is None:
-        smoothed = data.smooth is not None or str(data.name) in SMOOTHED
+        smoothed = data.smooth is not None or str(data.name) in SMOOTHED_SOURCES
         options = replace(options, smoothed=smoothed)
     if data.prepared is None:  # options of a prepared folder are fixed
         # the extended model is trained and tested on the sequences without faults

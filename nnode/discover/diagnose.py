@@ -59,7 +59,8 @@ from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.system import System
-from nnode.population.followers import EXPLAINED, drivers_differ, without_errors
+from nnode.population.drivers import EXPLAINED
+from nnode.population.followers import drivers_differ, without_errors
 from nnode.population.intervals import variations
 from nnode.progress import Stages
 
@@ -197,7 +198,7 @@ def _diagnosed(
         individual_estimates = [max(pair, key=lambda estimate: estimate.p_value) for pair in pairs]
     estimates = _bonferroni([estimate for estimate in individual_estimates if estimate is not None])
     agents = [
-        confirmation.agents(estimate, corrected.system, options.alpha, bool(unexplained), testable)
+        confirmation.agents(estimate, corrected.system, bool(unexplained), testable)
         for estimate in estimates
     ]
     tested = list(zip(estimates, agents, strict=True))
@@ -212,12 +213,8 @@ def _diagnosed(
         extended = confirmation.with_agents(engine, corrected, named_individuals)
     gap, errors, simulations = confirmation.gap(extended, named_individuals)
     clock.lap("sealed")
-    tests = confirmation.tests
     effects_named = [
-        *(
-            named(engine, corrected, step, test.confirmation, test.p_value)
-            for step, test in ((step, tests[step.chosen.name]) for step in selection.steps)
-        ),
+        *(confirmation.named(engine, corrected, step) for step in selection.steps),
         *(
             named_agents(estimate, agent.confirmed, system.order)
             for estimate, agent in tested
@@ -379,14 +376,13 @@ def _explore(
         )
     hints = [] if hint is None else [hint]
     if isinstance(engine, FollowersEngine):
-        without_variances = copy.copy(engine)
-        engine.fit_whitening(initial.system, torch.from_numpy(initial.row))
-        if engine.population is None or not engine.population.plausible:
+        populations = [engine.population_of(initial.system)]
+        if not populations[0].plausible:
             # a strong missing effect is attributed to pushes
-            extensions = likely_extensions(without_variances, initial, effects)
+            extensions = likely_extensions(engine, initial, effects)
             hints += extensions
-            engine = without_variances
-            engine.fit_whitening_among([*extensions, initial.system])
+            populations += map(engine.population_of, extensions)
+        engine.set_likeliest(populations)
         base = refine(engine, initial.system)
     else:
         base = converged_fit(engine, initial.system)

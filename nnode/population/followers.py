@@ -42,11 +42,6 @@ FLOOR = 0.01
 #: ESIMAS's errors of 0.57 m are attributed to pushes. Tables in docs/discovery.md compare both
 #: approaches.
 NOISE = (0.015, 0.45)
-#: Pushes above this share of the standard deviation of measured rates show that a missing effect,
-#: or errors of positions, are attributed to them. Simulations by ``lin`` and ``idm`` without errors
-#: and with their effects: 0.16 to 0.35; without a hidden zone: 0.7 to 1.1. Smoothed
-#: measurements (NGSIM, TGSIM, Waymo): 0.44 to 5.7.
-EXPLAINED = 0.4
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
 DIFFERENCE, START_DIFFERENCE = 1e-4, 1e-2
 #: The push on the highest rate ``(R, F)``, as a function of the index of the time in the paths
@@ -224,7 +219,7 @@ def follower_formula(system: System) -> LaneDynamics | None:
 def drivers_differ(system: System, sequences: Iterable[Sequence]) -> bool:
     """Whether differences between drivers can be estimated by default: if the model is a formula
     of the positions and speeds of a driver and of the vehicles ahead, and the measurement errors
-    are not above :data:`NOISE`. If they are below, see :func:`law_explains_rates`."""
+    are not above :data:`NOISE`. If they are below, see :func:`without_errors`."""
     if follower_formula(system) is None:
         return False
     return measured_noise(sequences).position < NOISE[1]
@@ -233,17 +228,6 @@ def drivers_differ(system: System, sequences: Iterable[Sequence]) -> bool:
 def without_errors(sequences: Iterable[Sequence]) -> bool:
     """Whether positions have no white measurement errors: they were simulated or smoothed."""
     return measured_noise(sequences).position < NOISE[0]
-
-
-def law_explains_rates(model: Followers, push: float) -> bool:
-    """Whether pushes of a standard deviation are small, compared to the variation of the highest
-    rate of the followers' smoothed paths; see :data:`EXPLAINED`. Otherwise positions without
-    errors are not those of a simulation by a similar model."""
-    paths, rates = model.paths, []
-    for sequence, place in zip(paths.sequence, paths.place, strict=True):
-        rate = np.gradient(paths.smoothed[sequence][:, place], paths.dt)
-        rates.append(rate - rate.mean() if model.lane.order == 1 else np.gradient(rate, paths.dt))
-    return push <= EXPLAINED * float(np.sqrt(np.mean(np.concatenate(rates) ** 2)))
 
 
 def _n_disturbed(lane: LaneDynamics) -> int:

@@ -181,13 +181,15 @@ class ConfirmationSet:
                 reduced, unconfirmed = None, selection.steps
                 self.tests = {step.chosen.name: test for step in unconfirmed}
         # the intervals need the whitening of the full model, which without_steps refits
-        hypotheses = [
-            named(engine, full_fit, step, test.confirmation, test.p_value)
-            for step, test in ((step, self.tests[step.chosen.name]) for step in unconfirmed)
-        ]
+        hypotheses = [self.named(engine, full_fit, step) for step in unconfirmed]
         remaining = without_steps(engine, selection, unconfirmed, self.base)
         self._corrected_fit = reduced or remaining.fit
         return remaining, hypotheses
+
+    def named(self, engine: Engine, fit: Fit, step: Step) -> NamedEffect:
+        """An effect with its coefficients in a fit and its weakest test."""
+        test = self.tests[step.chosen.name]
+        return named(engine, fit, step, test.confirmation, test.p_value)
 
     def _closed_tests(
         self, engine: Engine, selection: Selection, full_fit: Fit
@@ -230,7 +232,7 @@ class ConfirmationSet:
             error_after < error_before or before is not self.base or self.comparison.drivers
         )
         return _ModelTest(
-            self._combined(exploration, confirmation),
+            float(combined(exploration, confirmation, self.n_exploration, self.clusters)),
             confirmation,
             self.alpha,
             likelihood_rises,
@@ -238,9 +240,6 @@ class ConfirmationSet:
             error_before,
             error_after,
         )
-
-    def _combined(self, exploration: float, confirmation: float) -> float:
-        return float(combined(exploration, confirmation, self.n_exploration, self.clusters))
 
     def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
         return refine(engine, without(fit.system, *(step.chosen.name for step in steps)))
@@ -272,7 +271,6 @@ class ConfirmationSet:
         self,
         estimate: IndividualEstimate,
         system: System,
-        alpha: float,
         structure: bool,
         enough: bool,
     ) -> Agents:
@@ -286,7 +284,7 @@ class ConfirmationSet:
         (name,) = estimate.effect.strengths
         low, high = estimate.interval()
         errors = None
-        if estimate.spread and (estimate.p_value <= alpha or not enough):
+        if estimate.spread and (estimate.p_value <= self.alpha or not enough):
             errors = held_out_errors(
                 self.domain, self.base, system, estimate, self.sequences, self.label
             )
@@ -299,7 +297,7 @@ class ConfirmationSet:
                 p_value = max(better(score) for score in scores)
             if means[MODELS[1]] >= min(means[MODELS[0]], means[MODELS[2]]):
                 p_value = 1.0
-        rejected = _rejection_reason(estimate, alpha, structure, enough)
+        rejected = _rejection_reason(estimate, self.alpha, structure, enough)
         reason = rejected or _not_confirmed_reason(p_value, errors, self.clusters)
         return Agents(
             name=estimate.effect.name,

@@ -13,7 +13,7 @@ all models of a diagnosis are compared with the same whitening.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -206,21 +206,17 @@ class FollowersEngine(TrafficEngine):
         else:
             self._set_population(refit(start, fixed, paths, fixed=self._like is not None))
 
-    def fit_whitening_among(self, systems: list[System]) -> None:
-        """Estimate with each of some models, starting from the present estimate, and keep the one
-        with the best BIC. The variances of a model that lacks an effect would attribute it to
-        autocorrelated pushes, which would hide it."""
-        best, criterion = self, -np.inf
-        for system in systems:
-            trial = copy.copy(self)
-            row = ParameterVector(system).row
-            trial.fit_whitening(system, row)
-            assert trial.population is not None
-            penalty = len(row) * np.log(max(len(trial.population.estimate.agents), 2)) / 2
-            if (likelihood := trial.population.marginal.loglik - penalty) > criterion:
-                best, criterion = trial, likelihood
-        assert best.population is not None
-        self._set_population(best.population)
+    def population_of(self, system: System) -> Population:
+        """The estimate with a model, starting from the present one; the engine keeps its own."""
+        trial = copy.copy(self)
+        trial.fit_whitening(system, ParameterVector(system).row)
+        assert trial.population is not None
+        return trial.population
+
+    def set_likeliest(self, populations: Iterable[Population]) -> None:
+        """Take the estimate with the best BIC. The variances of a model that lacks an effect would
+        attribute it to autocorrelated pushes, which would hide it."""
+        self._set_population(max(populations, key=lambda population: population.criterion))
 
     def simulated_engines(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
         """Engines of paths simulated by a model, with deviations of drivers, pushes and measurement

@@ -297,7 +297,7 @@ def _with_refitted_variances(
     model without a strong effect would attribute it to autocorrelated pushes."""
     assert selection.screen is not None
     likeliest = sorted(candidates, key=lambda c: c.fit.cost)[:LIKELY]
-    engine.fit_whitening_among([candidate.fit.system for candidate in likeliest])
+    engine.set_likeliest([engine.population_of(candidate.fit.system) for candidate in likeliest])
     selection.fit = refine(engine, selection.fit.system)
     refitted = []
     for candidate in candidates:

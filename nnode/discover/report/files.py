@@ -138,12 +138,13 @@ def verdict(d: Diagnosis) -> str:
         f"{amount(d.gap.before)} to {amount(d.gap.after)} m², which removes {closed(d)} of the "
         f"error above the noise floor ({amount(d.gap.noise_floor)} m²)"
     )
-    unconfirmed = (
-        f" {_listed([e.name for e in d.leads])} remains a hypothesis: {d.confirmation.reason}."
-    )
+    unconfirmed = ""
+    if d.leads:
+        hypotheses = _listed([effect.name for effect in d.leads])
+        unconfirmed = f" {hypotheses} remains a hypothesis: {d.confirmation.reason}."
     match d.verdict:
         case "named":
-            return f"The model {d.model} lacks {names}: {gain}." + unconfirmed * bool(d.leads)
+            return f"The model {d.model} lacks {names}: {gain}.{unconfirmed}"
         case "indistinguishable":
             alternatives = {a.name for effect in d.effects for a in effect.alternatives}
             rivals = _listed(sorted(alternatives - {e.name for e in d.effects}), "or")
@@ -171,9 +172,7 @@ def verdict(d: Diagnosis) -> str:
         case "none":
             return (
                 f"No missing effect was found: none of the catalogue improves the model {d.model} "
-                "significantly, and no structure remains in the residuals."
-                + unconfirmed
-                * bool(d.leads)
+                f"significantly, and no structure remains in the residuals.{unconfirmed}"
             )
 
 
