@@ -236,8 +236,8 @@ def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
     others = {other["name"] for one in found["effects"] for other in one["alternatives"]}
     sizes = _sizes(case["law"], case["effect"])
     hidden = set(sizes)
-    values = {
-        one["name"]: next(iter(one["coefficients"].values()))["value"]
+    intervals = {
+        one["name"]: next(iter(one["coefficients"].values()))
         for one in found["effects"]
         if one["name"] in hidden
     }
@@ -253,13 +253,38 @@ def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
         "among": hidden <= set(names) | others,
         "false": bool(set(names) - hidden),
         "size": " ".join(f"{size:g}" for size in sizes.values()),
-        "estimate": " ".join(f"{values[name]:.3g}" if name in values else "-" for name in sizes),
+        "estimate": " ".join(
+            f"{intervals[name]['value']:.3g}" if name in intervals else "-" for name in sizes
+        ),
+        "covered": " ".join(_covers(intervals.get(name), size) for name, size in sizes.items()),
         **{
             f"{name} (%)": round(drivers[name]["estimate"], 1) if name in drivers else 0.0
             for name in ("v0", "T")
         },
+        **{
+            f"{name} covered": _covers(drivers.get(name), value, "lower", "upper")
+            for name, value in _variations(case).items()
+        },
         "seconds": round(time.monotonic() - begun, 1),
     }
+
+
+def _variations(case: dict[str, Any]) -> dict[str, float]:
+    """The true standard deviations of drivers' parameters, %, and of pushes, and their time, s."""
+    names = {"lin": ["v0"], "idm": ["v0", "T"]}[case["law"]]
+    return {name: 100 * case["spread"] for name in names} | {
+        "push": PUSH[case["law"]],
+        "push_time": LASTS,
+    }
+
+
+def _covers(
+    interval: dict[str, Any] | None, value: float, low: str = "low", high: str = "high"
+) -> str:
+    """Whether an interval of 95 % contains the true value; ``-`` where there is no interval."""
+    if interval is None or not all(np.isfinite(interval[end] or np.nan) for end in (low, high)):
+        return "-"
+    return "yes" if interval[low] <= value <= interval[high] else "no"
 
 
 def main() -> None:
