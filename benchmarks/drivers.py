@@ -272,7 +272,7 @@ def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
 def _variations(case: dict[str, Any]) -> dict[str, float]:
     """The true standard deviations of drivers' parameters, %, and of pushes, and their time, s."""
     names = {"lin": ["v0"], "idm": ["v0", "T"]}[case["law"]]
-    return {name: 100 * case["spread"] for name in names} | {
+    return dict.fromkeys(names, 100 * case["spread"]) | {
         "push": PUSH[case["law"]],
         "push_time": LASTS,
     }
