@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from nnode.app.check import check_file as check
     from nnode.app.discover import diagnose_table as diagnose
     from nnode.app.drive import drive_run as drive
+    from nnode.app.predict import Predictions
+    from nnode.app.predict import predict_run as predict
     from nnode.app.python.estimator import Calibrator, fit
     from nnode.app.python.inputs import sequences
     from nnode.app.python.report import Report
@@ -27,6 +29,7 @@ __all__ = [
     "Calibration",
     "Calibrator",
     "Check",
+    "Predictions",
     "Report",
     "Sequence",
     "Sequences",
@@ -37,6 +40,7 @@ __all__ = [
     "drive",
     "fit",
     "load",
+    "predict",
     "replay",
     "sequences",
     "simulate",
@@ -46,6 +50,7 @@ __all__ = [
 _HOMES = {
     "Calibration": ("nnode.app.calibration", "Calibration"),
     "Calibrator": ("nnode.app.python.estimator", "Calibrator"),
+    "Predictions": ("nnode.app.predict", "Predictions"),
     "Report": ("nnode.app.python.report", "Report"),
     "Sequence": ("nnode.data.sequence", "Sequence"),
     "Sequences": ("nnode.data.sequences", "Sequences"),
@@ -55,6 +60,7 @@ _HOMES = {
     "diagnose": ("nnode.app.discover", "diagnose_table"),
     "drive": ("nnode.app.drive", "drive_run"),
     "fit": ("nnode.app.python.estimator", "fit"),
+    "predict": ("nnode.app.predict", "predict_run"),
     "replay": ("nnode.app.replay", "replay"),
     "load": ("nnode.calibrate.checkpoint", "load"),
     "sequences": ("nnode.app.python.inputs", "sequences"),

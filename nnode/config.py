@@ -140,6 +140,16 @@ class SimulateConfig:
 
 
 @dataclass
+class PredictConfig:
+    """``nnode predict``: followers predicted from the first seconds of their paths."""
+
+    run: str = MISSING  # folder of a training with drivers who differ
+    seconds: float = 3.0  # length of the known beginning, at least 2
+    part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
+    data: Any = MISSING
+
+
+@dataclass
 class PlotForcesConfig:
     """``nnode plot_forces``: what calibrated models have learned."""
 
@@ -172,6 +182,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     (None, "export_schema"): ExportConfig,
     (None, "drive_schema"): DriveConfig,
     (None, "simulate_schema"): SimulateConfig,
+    (None, "predict_schema"): PredictConfig,
     (None, "plot_forces_schema"): PlotForcesConfig,
     (None, "study_schema"): StudyConfig,
     (None, "discover_schema"): DiscoverConfig,

@@ -72,11 +72,11 @@ def intervals_of(run: str) -> Intervals:
     return parameters if isinstance(parameters, dict) else {}
 
 
-def groups_of_run(overrides: list[str]) -> list[str]:
+def groups_of_run(overrides: list[str], groups: tuple[str, ...] = ("data", "solver")) -> list[str]:
     """Overrides that choose the run's data and solver if the user chooses none."""
     run = path_given(overrides, "run")
     checkpoint = [] if run is None else [f"checkpoint={checkpoint_of(run)}"]
-    return saved_groups([*overrides, *checkpoint], "checkpoint", ("data", "solver"))
+    return saved_groups([*overrides, *checkpoint], "checkpoint", groups)
 
 
 @dataclass

@@ -29,8 +29,19 @@ class Bands:
     bands: Mapping[float, tuple[np.ndarray, np.ndarray]]
 
 
-def band_panels(vehicles: Sequence[Bands], what: str = "gap (m)") -> Figure:
-    """A panel per vehicle or person, two side by side; ``what`` is on the vertical axis."""
+def band_panels(
+    vehicles: Sequence[Bands],
+    what: str = "gap (m)",
+    *,
+    median: str = "median of samples",
+    band: str = "of samples",
+) -> Figure:
+    """A panel per vehicle or person, two side by side.
+
+    Args:
+        what: label of the vertical axis.
+        median, band: labels of the medians, and of the bands after their level.
+    """
     rows = -(-len(vehicles) // 2)
     figure = new_figure(7.2, 1.9 * rows + 0.5)
     panels = figure.subplots(rows, 2, squeeze=False).ravel()
@@ -44,9 +55,9 @@ def band_panels(vehicles: Sequence[Bands], what: str = "gap (m)") -> Figure:
                 color=blue,
                 alpha=0.4 if level < 0.9 else 0.18,
                 linewidth=0,
-                label=f"{100 * level:g} % of samples",
+                label=f"{100 * level:g} % {band}",
             )
-        ax.plot(one.time, one.median, color=blue, linewidth=1.0, label="median of samples")
+        ax.plot(one.time, one.median, color=blue, linewidth=1.0, label=median)
         ax.plot(one.time, one.measured, color="black", linewidth=1.2, label="measured")
         dress(ax, x="time (s)", y=what, title=one.name)
         if what.startswith("gap"):

@@ -170,9 +170,12 @@ def fit_drivers(
     )
 
 
-def obstacle(system: System, sequences: list[Sequence]) -> str | None:
-    """Why differences between drivers cannot be estimated for a model or its data; None if they
-    can."""
+def obstacle(system: System, sequences: list[Sequence], least: int = LEAST_DRIVERS) -> str | None:
+    """Why drivers who differ cannot be estimated for a model or its data; None if they can.
+
+    Args:
+        least: number of followers that are needed.
+    """
     physical = sum(value.numel() for value, _ in system.physical().values())
     if system.domain != "traffic":
         return "people meet everybody in their sequence, and only cars follow measured leaders"
@@ -186,10 +189,8 @@ def obstacle(system: System, sequences: list[Sequence]) -> str | None:
     if "dt" in getattr(system.formula, "symbols", ()):
         return "the law is a map from step to step"
     n_followers = sum(s.n_agents - 1 for s in sequences)
-    if n_followers < LEAST_DRIVERS:
-        return (
-            f"there are {n_followers} followers behind measured leaders, fewer than {LEAST_DRIVERS}"
-        )
+    if n_followers < least:
+        return f"there are {n_followers} followers behind measured leaders, fewer than {least}"
     if not np.ptp([s.dt for s in sequences]) < 1e-6:
         return "the sequences have different sampling intervals"
     return None
@@ -290,7 +291,7 @@ def _estimated(
 
 def _most_likely(model: Followers, noise: PushNoise, starts: list[np.ndarray]) -> Population:
     """The estimate with the largest likelihood from several starts."""
-    fits = [_estimated(model, noise, theta, _variances(model)) for theta in starts]
+    fits = [_estimated(model, noise, theta, initial_variances(model)) for theta in starts]
     return max(fits, key=lambda fit: fit.marginal.loglik)
 
 
@@ -350,7 +351,8 @@ def _identified(fit: Estimate) -> bool:
     return bool((informative & (fit.variances.spread < (1 - NEAR) * MOST_SPREAD)).all())
 
 
-def _variances(model: Followers) -> Variances:
+def initial_variances(model: Followers) -> Variances:
+    """Standard deviations and times where a search starts, and their bounds."""
     paths, order = model.paths, model.lane.order
     number, length = len(model.random), paths.dt * paths.x.shape[1]
     low_push, high_push, push = PUSH[order]
@@ -371,7 +373,7 @@ def _variances(model: Followers) -> Variances:
 
 def _with_starts(variances: Variances, model: Followers) -> Variances:
     """Variances with as many standard deviations of starts as a model needs."""
-    n_starts, defaults = len(variances.start), _variances(model)
+    n_starts, defaults = len(variances.start), initial_variances(model)
     if n_starts == model.starts:
         return variances
     kept = min(n_starts, model.starts)

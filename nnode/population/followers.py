@@ -90,6 +90,14 @@ class Paths:
     error: float
     batch: Batch
 
+    def starting_from(self, given: np.ndarray) -> Paths:
+        """The same paths, with starts that are smoothed from the given samples ``(K,)`` only."""
+        start = [
+            _start(smooth(path[observed & given]), self.dt)
+            for path, observed in zip(self.x, self.observed, strict=True)
+        ]
+        return replace(self, start=np.stack(start, 1))
+
     def remeasured(self, x: np.ndarray, draw: Draw) -> Paths:
         """Simulated measurements: of other followers, and of leaders whose true paths are the
         smoothed ones.
@@ -101,21 +109,14 @@ class Paths:
         measured = x + self.error * draw(x.shape)
         smoothed = [smooth(true + self.error * draw(true.shape)) for true in self.smoothed]
         which = smoothed, self.sequence, self.place, self.dt
-        start = np.stack(
-            [
-                _start(smooth(path[observed]), self.dt)
-                for path, observed in zip(measured, self.observed, strict=True)
-            ],
-            1,
-        )
-        return replace(
+        remeasured = replace(
             self,
             x=measured,
             smoothed=smoothed,
-            start=start,
             ahead=_ahead(*which, len(self.ahead), self.half),
             ahead_at_samples=_ahead(*which, x.shape[1], self.dt),
         )
+        return remeasured.starting_from(np.ones(x.shape[1], dtype=bool))
 
 
 def paths_of(sequences: list[Sequence], step: float) -> Paths:

@@ -1,0 +1,291 @@
+"""Followers predicted from the first seconds of their paths: ``nnode predict``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from omegaconf import DictConfig
+from scipy.stats import norm
+
+from nnode.app.calibration import Calibration
+from nnode.app.cli.prepared import with_prepared
+from nnode.app.cli.runs import RESULT
+from nnode.app.cli.saved import merge_saved, options_of
+from nnode.app.evaluate import choose
+from nnode.app.export import checkpoint_of
+from nnode.app.python.inputs import Table, data_used
+from nnode.app.training import started
+from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.calibrate.resampling import Paired, paired
+from nnode.data.clusters import clusters
+from nnode.data.dataset import Source
+from nnode.data.options import DataOptions
+from nnode.data.prepare import open_data
+from nnode.data.sequences import Sequences
+from nnode.errors import CheckpointError, ConfigError
+from nnode.files import csv_text, write_json, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Shortest known beginning, s. With 1 s, the linearisation at the driver's parameters failed for
+#: one of 32 simulated drivers: his 95 % band had errors of up to 40 of its standard deviations.
+SHORTEST = 2.0
+#: Level of the bands.
+LEVEL = 0.95
+#: Number of followers in the figure.
+SHOWN = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Predictions:
+    """Followers predicted from the first seconds of their paths.
+
+    Attributes:
+        table: a row per follower and sample: ``sequence``, ``agent``, ``time`` (s after the start),
+            ``given`` (whether the prediction uses the sample), ``ahead``, the measured position of
+            the vehicle ahead (m); ``measured``, ``predicted`` and ``typical`` positions (m), where
+            ``typical`` is the prediction with the parameters of the typical driver; ``low`` and
+            ``high`` (m), the ends of the 95 % band of the measured position.
+        seconds: length of the known beginning.
+        rmse, rmse_typical: root mean square errors of predicted positions, m.
+        covered: share of measured positions in the band.
+        difference: of mean square errors (m²), prediction minus typical driver, with its interval
+            by clusters.
+    """
+
+    table: pd.DataFrame
+    seconds: float
+    rmse: float
+    rmse_typical: float
+    covered: float
+    difference: Paired
+
+    def plain(self) -> dict[str, Any]:
+        """The content of ``prediction.json``."""
+        return {
+            "seconds": self.seconds,
+            "followers": self._number,
+            "rmse": self.rmse,
+            "rmse_typical": self.rmse_typical,
+            "covered": self.covered,
+            "level": LEVEL,
+            "mse_minus_typical": asdict(self.difference),
+        }
+
+    @property
+    def _number(self) -> int:
+        return len(self.table.groupby(["sequence", "agent"]))
+
+    def __repr__(self) -> str:
+        d = self.difference
+        return (
+            f"{self._number} followers predicted from their first {self.seconds:g} s: RMSE "
+            f"{self.rmse:.3g} m, {self.rmse_typical:.3g} m with the typical driver's parameters "
+            f"(mean square error {d.difference:+.3g} m² [{d.low:.3g}, {d.high:.3g}]); "
+            f"{self.covered:.0%} of measured positions in the band of {LEVEL:.0%}"
+        )
+
+    def plot(self) -> Figure:
+        """Measured and predicted gaps of six followers, with bands."""
+        from nnode.plots.bands import Bands, band_panels  # loads Matplotlib, which takes a second
+
+        groups = list(self.table.groupby(["sequence", "agent"], sort=False))
+        shown = []
+        for (sequence, _), rows in groups[:: max(1, len(groups) // SHOWN)][:SHOWN]:
+            gap = {
+                key: (rows["ahead"] - rows[key]).to_numpy()
+                for key in ("measured", "predicted", "low", "high")
+            }
+            shown.append(
+                Bands(
+                    name=str(sequence),
+                    time=rows["time"].to_numpy(),
+                    measured=gap["measured"],
+                    median=gap["predicted"],
+                    bands={LEVEL: (gap["high"], gap["low"])},
+                )
+            )
+        return band_panels(shown, median="predicted", band="band")
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write ``prediction.csv``, ``prediction.json`` and ``prediction.png``."""
+        from nnode.plots.style import save
+
+        table, scores = folder / "prediction.csv", folder / "prediction.json"
+        write_text(table, csv_text(self.table))
+        write_json(scores, self.plain())
+        return [save(self.plot(), folder / "prediction.png"), table, scores]
+
+
+def predict_run(
+    run: str | Path | Calibration,
+    data: Table | Sequences | None = None,
+    *,
+    seconds: float = 3.0,
+    part: str = "auto",
+) -> Predictions:
+    """Predict followers of a lane from the first seconds of their paths.
+
+    A driver's parameters are estimated from these seconds, given the differences between drivers
+    that the run found; see ``docs/method.md``. Vehicles ahead move as measured.
+
+    Args:
+        run: folder of a training with drivers who differ, a checkpoint, or the result of
+            :func:`nnode.fit`.
+        data: other data; None takes those of the run.
+        seconds: length of the known beginning, at least 2.
+        part: part of the data, ``heldout``, ``train``, ``unseen``, ``all``; ``auto`` is the first
+            that exists, except train.
+
+    Raises:
+        CheckpointError: the run does not exist.
+        ConfigError: the run has no differences between drivers, the beginning is too short, or no
+            sequence is longer.
+    """
+    if isinstance(run, Calibration):
+        checkpoint = run.checkpoint
+        drivers = None if run.drivers is None else run.drivers.plain()
+    else:
+        checkpoint, drivers = load_checkpoint(checkpoint_of(str(run))), _drivers(str(run))
+    variances = _variances(drivers)
+    store = data_used(checkpoint) if data is None else Sequences.of(data)
+    return _predicted(checkpoint, store, variances, seconds, part)
+
+
+def predict(config: DictConfig, folder: Path) -> None:
+    """The command: :func:`predict_run` on the requested data, and its files.
+
+    Raises:
+        NNodeError: see :func:`predict_run`.
+    """
+    checkpoint, variances = (
+        load_checkpoint(checkpoint_of(config.run)),
+        _variances(_drivers(config.run)),
+    )
+    config = with_prepared(merge_saved(config, checkpoint.config, ("data",)))
+    data: DataOptions = options_of(config.data)
+    store = open_data(data, folder / "data")
+    predictions = _predicted(checkpoint, store, variances, float(config.seconds), config.part)
+    print(predictions)
+    for path in predictions.write(folder):
+        print(f"{'plot' if path.suffix == '.png' else path.name.partition('.')[0]}: {path}")
+
+
+def _drivers(run: str) -> Any:
+    """The differences between drivers in a run's ``result.json``; None if there are none.
+
+    Raises:
+        CheckpointError: the file is missing or damaged.
+    """
+    path = checkpoint_of(run).parent.parent / RESULT
+    try:
+        return json.loads(path.read_text(encoding="utf-8")).get("drivers")
+    except (OSError, ValueError, AttributeError) as error:
+        raise CheckpointError(
+            f"{path} cannot be read, which holds the differences between drivers; give the folder "
+            "of a complete training"
+        ) from error
+
+
+def _variances(drivers: Any) -> dict[str, float]:
+    """Standard deviations and times by name, as :func:`nnode.population.prediction.predict` takes
+    them, and ``measurement`` (m)."""
+    if drivers is None:
+        raise ConfigError(
+            "the run has no differences between drivers, from which a driver's parameters are "
+            "predicted; train with trainer.drivers=auto, in Python nnode.fit(..., drivers='auto')"
+        )
+    try:
+        rows = drivers["variability"]
+        names = ["push", "push_time", "measurement", *drivers["differ"]]
+        values = {name: float(rows[name]["estimate"]) for name in names}
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            "the differences between drivers in result.json are damaged: expected an estimate of "
+            "push, push_time, measurement and of each parameter that differs; train again"
+        ) from error
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise CheckpointError(f"result.json: {name} is {value:g}, expected a positive number")
+    return values | {name: values[name] / 100 for name in drivers["differ"]}
+
+
+def _predicted(
+    checkpoint: Checkpoint,
+    store: Source,
+    variances: Mapping[str, float],
+    seconds: float,
+    part: str,
+) -> Predictions:
+    from nnode.population.drivers import STEP, obstacle  # compiled code takes a second
+    from nnode.population.followers import paths_of
+    from nnode.population.prediction import predict as predict_paths
+
+    if not SHORTEST <= seconds < np.inf:
+        raise ConfigError(
+            f"seconds={seconds:g}: expected at least {SHORTEST:g} s, as bands after shorter "
+            "beginnings are too narrow"
+        )
+    model = checkpoint.build().double()
+    store = started(checkpoint, store)
+    _, indices, _ = choose(store, checkpoint, part)
+    long = [i for i in indices if store[i].time[-1] - store[i].time[0] > seconds + store[i].dt]
+    if not long:
+        raise ConfigError(
+            f"seconds={seconds:g}: none of the {len(indices)} sequences is longer; give fewer"
+        )
+    sequences = [store[i] for i in long]
+    if reason := obstacle(model, sequences, least=1):
+        raise ConfigError(f"followers cannot be predicted: {reason}")
+    variances = dict(variances)
+    paths = replace(paths_of(sequences, STEP), error=variances.pop("measurement"))
+    prediction = predict_paths(model, paths, variances, seconds)
+    alike = {name: variances[name] for name in ("push", "push_time")}
+    typical = predict_paths(model, paths, alike, seconds).mean
+    half = norm.ppf(0.5 + LEVEL / 2) * np.hypot(prediction.deviation, paths.error)
+    rows = []
+    for f, (b, place) in enumerate(zip(paths.sequence, paths.place, strict=True)):
+        s, k = sequences[b], slice(sequences[b].n_samples)
+        rows.append(
+            pd.DataFrame(
+                {
+                    "sequence": s.name,
+                    "agent": s.agents[place] if s.agents else str(place),
+                    "time": s.time - s.time[0],
+                    "given": prediction.given[k],
+                    "ahead": s.x[:, place + 1, 0],
+                    "measured": s.x[:, place, 0],
+                    "predicted": prediction.mean[f, k],
+                    "typical": typical[f, k],
+                    "low": (prediction.mean - half)[f, k],
+                    "high": (prediction.mean + half)[f, k],
+                }
+            )
+        )
+    table = pd.concat(rows, ignore_index=True)
+    unknown = table[~table["given"]]
+    squares = pd.DataFrame(
+        {
+            "sequence": unknown["sequence"],
+            **{key: (unknown[key] - unknown["measured"]) ** 2 for key in ("predicted", "typical")},
+        }
+    )
+    means = squares.groupby("sequence", sort=False).mean()
+    _, label = np.unique(clusters(store.index)[long], return_inverse=True)
+    return Predictions(
+        table=table,
+        seconds=seconds,
+        rmse=float(np.sqrt(squares["predicted"].mean())),
+        rmse_typical=float(np.sqrt(squares["typical"].mean())),
+        covered=float(unknown["measured"].between(unknown["low"], unknown["high"]).mean()),
+        difference=paired(
+            means["predicted"].to_numpy(), means["typical"].to_numpy(), label, seed=0
+        ),
+    )
