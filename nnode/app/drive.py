@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from nnode.app.export import checkpoint_of
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.data.store import MANIFEST, Store
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.exchange.drive import Drive, drive
 from nnode.exchange.drivers import drivable
 from nnode.exchange.running_sumo import Steps
@@ -76,7 +76,7 @@ def drive_run(
     place = Path(mkdtemp(prefix="nnode-drive-")) if folder is None else Path(folder)
     run_steps = steps_of(checkpoint, model)
     if steps not in STEPS:
-        raise ConfigError(f"steps={steps} is unknown, expected {', '.join(STEPS)}")
+        raise unknown_value("steps", steps, STEPS)
     if steps == "run" and run_steps.method not in _PLACED[order]:
         raise ConfigError(
             f"steps=run: the run was calibrated with {run_steps}, SUMO can make "

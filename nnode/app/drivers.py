@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from nnode.calibrate.options import Pooling, TrainerOptions
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.model import System
 from nnode.model.term import Term, short_names
 from nnode.plots.traffic import driver_figure
@@ -65,12 +65,7 @@ def planned(
         training = sequences()
         possible = obstacle(model, training) is None and drivers_differ(model, training)
         return None if possible else NONE
-    if given != AUTO and not _names(given):
-        raise ConfigError(
-            f"trainer.drivers={given} is unknown, expected auto, none, or a list of parameters of "
-            "the law such as [T, v0]"
-        )
-    asked = f"trainer.drivers={_words(given)}"
+    asked = f"trainer.drivers={given if given == AUTO else '[' + ', '.join(given) + ']'}"
     if options.pooling is not Pooling.pooled:
         raise ConfigError(
             f"{asked} and trainer.pooling={options.pooling.value} both give drivers parameters of "
@@ -86,14 +81,18 @@ def planned(
     return list(given)
 
 
-def _names(given: Any) -> bool:
-    """Whether an option is a list of words."""
-    listed = isinstance(given, ListLike) and not isinstance(given, str)
-    return bool(listed and len(given) and all(isinstance(name, str) for name in given))
+def check_drivers(given: Any) -> None:
+    """Refuse a value of ``trainer.drivers`` that is neither a choice nor a list of names.
 
-
-def _words(given: Any) -> str:
-    return f"[{', '.join(given)}]" if _names(given) else str(given)
+    Raises:
+        ConfigError: another value.
+    """
+    listed = isinstance(given, ListLike) and not isinstance(given, str) and len(given) > 0
+    if given not in (None, AUTO, NONE) and not (
+        listed and all(isinstance(name, str) for name in given)
+    ):
+        hint = ", or a list of parameters of the law such as [T, v0]"
+        raise unknown_value("trainer.drivers", given, (AUTO, NONE), hint)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,7 @@ from nnode.calibrate.options import Device, SolverOptions
 from nnode.data.dataset import Source
 from nnode.data.options import DataOptions
 from nnode.data.prepare import NOT_PREPARATION, open_data
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.files import write_json
 from nnode.progress import Stages
 
@@ -50,7 +50,7 @@ def choose(store: Source, checkpoint: Checkpoint, part: str) -> tuple[str, list[
         ConfigError: an unknown part, or a part without sequences.
     """
     if part not in PARTS:
-        raise ConfigError(f"part={part} is unknown, expected one of {', '.join(PARTS)}")
+        raise unknown_value("part", part, PARTS)
     before = set(source_hashes(checkpoint.manifest).values())
     shared = bool(before & set(source_hashes(store.manifest).values()))
     comparable = not shared or _cut_alike(store.manifest, checkpoint.manifest)

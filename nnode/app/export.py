@@ -27,7 +27,7 @@ from nnode.data.dataset import SequenceDataset
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.exchange.counterpart import Counterpart, Intervals
 from nnode.exchange.jupedsim import has_parameters, jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import has_type, sumo_type, traffic_of
@@ -118,9 +118,7 @@ def export(config: DictConfig, folder: Path) -> None:
     model = checkpoint.build()
     targets = targets_of(config.to, model)
     if config.trajectories not in SOURCES:
-        raise ConfigError(
-            f"trajectories={config.trajectories} is unknown, expected {', '.join(SOURCES)}"
-        )
+        raise unknown_value("trajectories", config.trajectories, SOURCES)
     data: DataOptions = options_of(config.data)
     solver_options: SolverOptions = options_of(config.solver)
     set_threads(checkpoint.config["trainer"]["threads"], data.domain)
@@ -178,7 +176,7 @@ def targets_of(asked: Any, model: System) -> list[str]:
     names = [asked] if isinstance(asked, str) else list(asked or [])
     for name in names:
         if name not in TARGETS:
-            raise ConfigError(f"to={name} is unknown, expected auto or any of {', '.join(TARGETS)}")
+            raise unknown_value("to", name, ("auto", *TARGETS))
         if name in FORMATS:
             check_format("to", name, model.domain)
     if not names:

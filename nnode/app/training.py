@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from torch.utils.data import DataLoader
 
 from nnode.app.cli.saved import options_of
-from nnode.app.drivers import NONE, planned
+from nnode.app.drivers import NONE, check_drivers, planned
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed
@@ -38,6 +38,10 @@ from nnode.plots import force_figure
 from nnode.simulation import Solver, TorchdiffeqSolver, substeps
 
 log = logging.getLogger(__name__)
+
+#: Smallest values of the trainer's options.
+_LOWEST = {"max_epochs": 0, "evaluate_every": 1, "figure_every": 0, "save_every": 0}
+_LOWEST |= {"patience": 1, "threads": 1}
 
 #: Parts of a split, as checkpoints name them.
 PARTS = ("train", "heldout", "dropped")
@@ -94,8 +98,6 @@ def straight_loader(
 
 def set_threads(threads: int | None, domain: str) -> None:
     """Set torch's threads; by default one for traffic, whose tensors are small."""
-    if threads is not None and threads < 1:
-        raise ConfigError(f"trainer.threads={threads} must be at least 1, or null")
     if threads is not None or domain == "traffic":
         torch.set_num_threads(threads or 1)
 
@@ -117,13 +119,11 @@ def check(config: DictConfig) -> None:
         ConfigError: an option is out of its range.
     """
     trainer = config.trainer
-    for name, low in (("max_epochs", 0), ("evaluate_every", 1), ("figure_every", 0)):
-        if trainer[name] < low:
-            raise ConfigError(f"trainer.{name}={trainer[name]} must be at least {low}")
-    if trainer.save_every < 0:
-        raise ConfigError(f"trainer.save_every={trainer.save_every} must be at least 0 s")
-    if trainer.patience is not None and trainer.patience < 1:
-        raise ConfigError(f"trainer.patience={trainer.patience} must be at least 1, or null")
+    for name, low in _LOWEST.items():
+        if trainer[name] is not None and trainer[name] < low:
+            hint = ", or null" if name in ("patience", "threads") else ""
+            raise ConfigError(f"trainer.{name}={trainer[name]} must be at least {low}{hint}")
+    check_drivers(trainer.drivers)
 
 
 def model_of(config: DictConfig) -> System:

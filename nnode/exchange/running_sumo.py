@@ -20,7 +20,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.exchange.drivers import DriverInputs
 
 #: Supported programs.
@@ -261,7 +261,7 @@ def _loaded(program: str) -> tuple[Any, str]:
         ConfigError: the program is unknown or not installed.
     """
     if program not in PROGRAMS:
-        raise ConfigError(f"program={program} is unknown, expected {' or '.join(PROGRAMS)}")
+        raise unknown_value("program", program, PROGRAMS)
     home = _home()
     tools = str(home / "tools") if home else None
     if tools is not None and tools not in sys.path:

@@ -154,7 +154,7 @@ def test_all_share_their_parameters_where_the_default_cannot_be_estimated(
     ("options", "words"),
     [
         ({"drivers": ["foo"]}, r"drivers=foo is no parameter .* v0, T, s0, a, b"),
-        ({"drivers": "some"}, r"drivers=some is unknown, expected auto, none, or a list"),
+        ({"drivers": "some"}, r"drivers=some is unknown, expected one of auto, none, or a list"),
         ({"drivers": []}, r"drivers=\[\] is unknown"),
         ({"drivers": "auto", "pooling": "alone"}, r"choose one of them"),
         ({"drivers": "auto", "model": "krauss"}, r"map from step to step; take .*drivers=none"),

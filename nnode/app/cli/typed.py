@@ -15,7 +15,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.saved import in_hydra, make_absolute, plain
-from nnode.errors import ConfigError
+from nnode.errors import unknown_value
 from nnode.program import configuration
 
 
@@ -78,9 +78,7 @@ def written(section: str, group: str) -> tuple[type, DictConfig]:
     from nnode.config import SCHEMAS, choices
 
     if group not in choices(section):
-        raise ConfigError(
-            f"{section}={group} is unknown, expected one of {', '.join(choices(section))}"
-        )
+        raise unknown_value(section, group, choices(section))
     values = cast(DictConfig, OmegaConf.load(configuration() / section / f"{group}.yaml"))
     return SCHEMAS[section, str(values.pop("defaults")[0])], values
 

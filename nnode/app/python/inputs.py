@@ -26,9 +26,8 @@ from nnode.data.readers.columns import Table as DataTable
 from nnode.data.readers.table import TableOptions
 from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
-from nnode.errors import ConfigError, suggestion
+from nnode.errors import ConfigError, unknown_value
 from nnode.model.laws import LAW_MODELS
-from nnode.program import configuration
 
 #: Models by their names: those of ``conf/model``, and the laws of the package.
 MODELS: dict[str, dict[str, Any]] = {
@@ -68,7 +67,7 @@ def model_options(
     schema = SCHEMAS.get(("model", f"{term}_schema"))
     if schema is None:
         terms = sorted({node.term for (group, _), node in SCHEMAS.items() if group == "model"})
-        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(terms)}")
+        raise unknown_value("model.term", term, terms)
     if hasattr(schema, "leader") and leader is not None:
         given.setdefault("leader", leader)
     if effects:
@@ -135,7 +134,7 @@ def choice(
     }
     name = str(given.get("name", ""))
     if name not in schemas:
-        raise ConfigError(f"{group}={name} is unknown, expected one of {', '.join(schemas)}")
+        raise unknown_value(group, name, schemas)
     return merged(group, schemas[name], given, further or {})
 
 
@@ -148,7 +147,7 @@ def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(model, str):
         return {"name": model.get("term", ""), **model}
     if model not in MODELS:
-        raise ConfigError(f"model={model} is unknown, expected one of {', '.join(MODELS)}")
+        raise unknown_value("model", model, MODELS)
     return {"name": model, **MODELS[model]}
 
 
@@ -240,12 +239,6 @@ def data_options(data: str, given: Mapping[str, Any], *, in_memory: bool = False
     Raises:
         ConfigError: the data set or an option is unknown, or a mandatory option is missing.
     """
-    names = {path.stem for path in (configuration() / "data").glob("*.yaml")}
-    if data not in names:
-        raise ConfigError(
-            f"data={data} is unknown, expected one of {', '.join(sorted(names))}"
-            f"{suggestion(data, names)}"
-        )
     schema, defaults = written("data", data)
     options = merged("data", schema, defaults, given)
     if in_memory and OmegaConf.is_missing(options, "path"):

@@ -71,7 +71,7 @@ WRONG = [
     ("train optimizer=lbgfs", r"did you mean optimizer=lbfgs\?", 2),
     (
         "train experiment=paper",
-        "no experiment=paper; experiment is one of demo_crowd, ",
+        r"no experiment=paper; did you mean experiment=paper_.*\? experiment is one of demo_",
         2,
     ),
     ("train -m hydra/launcher=core", r"did you mean hydra/launcher=cores\? .* one of basic, co", 2),
@@ -101,8 +101,14 @@ WRONG = [
     # parameters of a law
     ("train model=idm model.T=3", r"5 s: type \"model.law.parameters.T.value='3 s'", 2),
     ("train model=idm +model.T=3", r"type \"model.law.parameters.T.value='3 s'", 2),
-    ("train model=idm model.T=-3", r"which lies between 0.05 s and 5 s; -3 does not", 2),
+    ("train model=idm model.T=-3", r"at least 0.05 s and at most 5 s; -3 is not", 2),
     ("train model=idm model.law.parameters.T.value=-3", "has value -3, low .*, such as '3 s'", 2),
+    (
+        "train model=idm model.law.parameters.T=-3",
+        r"parameters.T=-3: T .* at least 0.05 s and at most 5 s; -3 is not: type .*T.value='1.2 s'",
+        2,
+    ),
+    ("train model=idm data=esimas solver.method=eulerr", r"did you mean euler\?", 2),
     # values, and what is no option
     ("train trainer.max_epochs=three", "trainer.max_epochs=three: expected a whole number", 2),
     ("train seed=abc", "seed=abc: expected a whole number", 2),
@@ -136,6 +142,11 @@ WRONG = [
     ("discover 'discover.effects=[inerta]'", r"did you mean inertia\?", 2),
     ("torture 'campaigns=[kill]'", "expected some of kills, disk, folder, fuzz", 2),
     ("benchmark_discovery 'benchmark_discovery.arms=[foo]'", "expected one of single, pair", 2),
+    (
+        "train data=table data.domain=traffic data.path=none.csv trainer.drivers=atuo",
+        r"trainer.drivers=atuo is unknown, .* did you mean auto\?",
+        2,
+    ),
     ("train data=table data.domain=traffic data.path=none.csv", "error: .*csv is not there", 1),
     ("train data=table data.domain=traffic data.path=$T/empty.csv", "is empty", 1),
     ("train data=table data.domain=traffic data.path=$T/odd.csv", "Expected 2 fields in line 3", 1),
