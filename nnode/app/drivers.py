@@ -142,14 +142,15 @@ class Drivers:
 
     def summary(self) -> list[str]:
         """Lines on differences between drivers and on disturbances."""
-        rows = self.variability.iterrows()
-        estimates = {str(name): row for name, row in rows}
-        texts = {name: _estimate(row) for name, row in estimates.items()}
-        differ = [f"{name} by {texts[name]}" for name in self.differ]
-        listed = ", ".join(differ) if differ else "none that the data tell"
+        texts = {}
+        for name, row in self.variability.iterrows():
+            texts[name] = f"{row['estimate']:.3g} {row['unit']}"
+            if np.isfinite(row["lower"]):
+                texts[name] += f" [{row['lower']:.3g}, {row['upper']:.3g}]"
+        differ = ", ".join(f"{name} by {texts[name]}" for name in self.differ)
         return [
             f"{len(self.table)} drivers; parameters that differ between them (standard deviation): "
-            f"{listed}; the parameters of the table are the medians",
+            f"{differ or 'none that the data tell'}; the parameters of the table are the medians",
             f"pushes of {texts['push']} that last {texts['push_time']}; errors of measurement of "
             f"{texts['measurement']}",
         ]
@@ -164,11 +165,6 @@ class Drivers:
             "converged": self.converged,
             "table": self.table.to_dict("records"),
         }
-
-
-def _estimate(row: pd.Series) -> str:
-    ends = f" [{row['lower']:.3g}, {row['upper']:.3g}]" if np.isfinite(row["lower"]) else ""
-    return f"{row['estimate']:.3g} {row['unit']}{ends}"
 
 
 def calibrated_drivers(
@@ -239,10 +235,10 @@ def calibrated_drivers(
         table=_table(population, sequences),
         converged=population.estimate.converged,
         bias={
-            short[name]: float(np.expm1(bias) if in_logs else bias)
-            for name, bias, in_logs in zip(
-                followers.names, population.bias, followers.logs, strict=True
+            short[name]: float(
+                np.expm1(population.bias[i]) if followers.logs[i] else population.bias[i]
             )
+            for i, name in enumerate(followers.names)
         },
         observations=int(population.estimate.data.observed.sum()),
         variances=int((variances.low < variances.high).sum()),
@@ -278,27 +274,24 @@ def _intervals(
     parameters: dict[str, Any] = {}
     for i, name in enumerate(model.names):
         has_interval = bool(np.isfinite(half[i]))
+        interval = {
+            "low": float(ends[0][i]),
+            "high": float(ends[1][i]),
+            "std_error": float(error[i] * (value[i] if model.logs[i] else 1.0)),
+            "df": float(degrees[i]),
+        }
+        identified = has_interval and bool(ends[1][i] - ends[0][i] < scale[i])
         parameters[name] = {
-            "low": float(ends[0][i]) if has_interval else None,
-            "high": float(ends[1][i]) if has_interval else None,
-            "std_error": float(error[i] * (value[i] if model.logs[i] else 1.0))
-            if has_interval
-            else None,
-            "df": float(degrees[i]) if has_interval else None,
+            **(interval if has_interval else dict.fromkeys(interval)),
             "scale": "log" if model.logs[i] else "linear",
             "at_bound": "low" if low[i] else "high" if high[i] else None,
-            "identified": has_interval and bool(ends[1][i] - ends[0][i] < scale[i])
-            if number > 1
-            else None,
+            "identified": identified if number > 1 else None,
         }
     table = np.full((len(theta), len(theta)), np.nan)
     if number > 1:
         table[np.ix_(free, free)] = cluster_influence.correlation()
-    correlation = {
-        name: dict(zip(model.names, map(float, line), strict=True))
-        for name, line in zip(model.names, table, strict=True)
-    }
-    return parameters, correlation, number
+    correlation = pd.DataFrame(table, model.names, model.names).to_dict("index")
+    return parameters, cast(dict[str, dict[str, float]], correlation), number
 
 
 def _table(population: Population, sequences: list[Sequence]) -> pd.DataFrame:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,8 +30,13 @@ class Counterpart:
     missing: list[str] = field(default_factory=list)
     values: dict[str, str] = field(default_factory=dict)
 
+    @property
+    def lines(self) -> list[str]:
+        """The notes, and the missing parts as such."""
+        return [*self.notes, *(f"no counterpart: {text}" for text in self.missing)]
 
-def effects_without(system: System, first: int, counted: set[str]) -> list[str]:
+
+def effects_without(system: System, first: int = 1, counted: Collection[str] = ()) -> list[str]:
     """A line for each effect that is not ``counted``, among the terms from index ``first``."""
     return [
         f"effect {term.name}: {term.formula_for(system.order)}"

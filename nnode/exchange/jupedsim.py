@@ -170,7 +170,7 @@ def _same_law(system: System, name: str, scenes: Scenes) -> tuple[Counterpart, d
             "from walls as well"
         )
     counterpart.notes.append(_PACE)
-    counterpart.missing += effects_without(system, 1, set())
+    counterpart.missing += effects_without(system)
     return counterpart, content
 
 
@@ -218,7 +218,7 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
             "opposing_wall_friction: JuPedSim's friction at walls has the opposite sign"
         )
     counterpart.missing.append("reach: JuPedSim lets nobody feel people farther away than 2.5 m")
-    counterpart.missing += effects_without(system, 2 if relaxation else 1, set())
+    counterpart.missing += effects_without(system, 2 if relaxation else 1)
     content = _content(
         "SocialForceModel",
         {"body_force": k, "friction": kappa},

@@ -93,7 +93,7 @@ def sumo_type(
     else:
         counterpart = _krauss_of_gap(system, name, speed, length)
     counterpart.notes[:0] = interval_lines(system, intervals or {})
-    counterpart.text = _document(counterpart.values, counterpart)
+    counterpart.text = _document(counterpart)
     return counterpart
 
 
@@ -133,7 +133,7 @@ def _same_law(system: System, law: str, name: str, length: float | None) -> Coun
         counterpart.missing.append(
             "the last metre behind a vehicle at rest, which SUMO drives at decel times one step"
         )
-    counterpart.missing += effects_without(system, 1, set())
+    counterpart.missing += effects_without(system)
     return counterpart
 
 
@@ -225,11 +225,10 @@ def _exactly(value: float) -> str:
     return f"{value:.12g}"
 
 
-def _document(values: dict[str, str], counterpart: Counterpart) -> str:
+def _document(counterpart: Counterpart) -> str:
     root = ElementTree.Element("additional")
-    lines = [*counterpart.notes, *(f"no counterpart: {text}" for text in counterpart.missing)]
-    for line in lines:
+    for line in counterpart.lines:
         root.append(ElementTree.Comment(f" {line.replace('--', '- -')} "))
-    ElementTree.SubElement(root, "vType", values)
+    ElementTree.SubElement(root, "vType", counterpart.values)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=False) + "\n"

@@ -19,8 +19,7 @@ from nnode.calibrate.evaluate import Simulate
 from nnode.data._arrow import open_writer, schema, to_table
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, DataError
-from nnode.exchange.tables import write_csv
-from nnode.files import csv_safe, replacing, write_text
+from nnode.files import csv_safe, replacing, write_csv, write_text
 
 #: Format of trajectories to the domains that it supports.
 FORMATS = {

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from nnode.plots.style import OKABE_ITO, SMALL_FONT, dress, new_figure
+from nnode.plots.style import OKABE_ITO, dress, legend_above, new_figure
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,5 @@ def band_panels(vehicles: Sequence[Bands], what: str = "gap (m)") -> Figure:
             ax.set_ylim(bottom=min(0.0, float(one.measured.min())))
     for ax in panels[len(vehicles) :]:
         ax.set_visible(False)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, fontsize=SMALL_FONT, frameon=False, loc="outside upper center", ncols=4
-    )
+    legend_above(figure, panels[0].get_legend_handles_labels()[0], 4)
     return figure

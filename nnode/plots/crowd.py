@@ -29,7 +29,7 @@ from nnode.plots.interaction import (
     interaction,
 )
 from nnode.plots.settings import six_settings
-from nnode.plots.style import DIVERGING, FONT, GREY, SMALL_FONT, dress, new_figure
+from nnode.plots.style import DIVERGING, FONT, GREY, colour_bar, dress, new_figure
 
 #: Velocity differences (m/s) of the four contour panels. The paper names (2, 0) as its example
 #: and leaves the others open; these are the encounters of two people who walk at 1 m/s.
@@ -186,14 +186,10 @@ def _contours(
     assert filled is not None
     letters = sorted({"xy"[c] for _, _, c in panels})
     name = f"force on i, {' and '.join(f'$F_{letter}$' for letter in letters)} (N)"
-    bar = figure.colorbar(
-        filled, ax=[ax for ax, _, _ in panels], label=name, shrink=0.85, pad=0.02, aspect=30
-    )
+    bar = colour_bar(figure, filled, (ax for ax, *_ in panels), name, shrink=0.85)
     middles = (levels[1:] + levels[:-1]) / 2
     # every second colour, among them the neutral one
     bar.set_ticks([float(m) for m in middles[len(middles) // 2 % 2 :: 2]])
-    bar.ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
-    bar.ax.yaxis.label.set_fontsize(FONT)
     title = describe(term, part)
     left_out = omitted_effects(system)
     if left_out:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -44,11 +45,10 @@ def _settings(ahead: float, beside: float) -> tuple[Setting, ...]:
         ((0.01, ahead), (-0.01, -ahead)),
         ((beside, 0.0), (-beside, 0.0)),
     )
-    found: list[Setting] = []
-    for blue, red in places:
-        for v_blue in ((0.0, -1.0), (0.0, 1.0)):
-            found.append(Setting(f"S{len(found) + 1}", blue, red, v_blue, (0.0, 1.0)))
-    return tuple(found)
+    pairs = product(places, ((0.0, -1.0), (0.0, 1.0)))
+    return tuple(
+        Setting(f"S{i}", *place, v_blue, (0.0, 1.0)) for i, (place, v_blue) in enumerate(pairs, 1)
+    )
 
 
 #: Source: Göttlich & Totzeck, tables (data6settings) and (data6settingsNN).
@@ -85,21 +85,11 @@ def six_settings(
     chosen = SETTINGS[force_range(term)] if settings is None else tuple(settings)
     if not chosen:
         raise ConfigError("six_settings needs at least one setting, got none")
-    dx = np.array([s.x_blue for s in chosen]) - np.array([s.x_red for s in chosen])
-    dv = np.array([s.v_blue for s in chosen]) - np.array([s.v_red for s in chosen])
-    blue = evaluate_force(system, dx, dv, part)
-    red = evaluate_force(system, -dx, -dv, part)
-    table = pd.DataFrame(
-        {
-            "setting": [s.name for s in chosen],
-            **{
-                column: [getattr(s, column) for s in chosen]
-                for column in ("x_blue", "x_red", "v_blue", "v_red")
-            },
-            "force_blue": [tuple(map(float, force)) for force in blue],
-            "force_red": [tuple(map(float, force)) for force in red],
-        }
-    )
+    table = pd.DataFrame(map(vars, chosen)).rename(columns={"name": "setting"})
+    dx, dv = (np.subtract([*table[f"{k}_blue"]], [*table[f"{k}_red"]]) for k in "xv")
+    for person, sign in (("blue", 1), ("red", -1)):
+        force = evaluate_force(system, sign * dx, sign * dv, part)
+        table[f"force_{person}"] = [tuple(map(float, row)) for row in force]
     what = ", ".join(filter(None, (describe(term, part), omitted_effects(system))))
     return _quivers(table, what), table
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.axes._secondary_axes import SecondaryAxis
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -72,10 +76,41 @@ def curve_style(index: int) -> dict[str, Any]:
     }
 
 
+def set_ticks(axes: Axes | SecondaryAxis) -> None:
+    """Give the ticks of an axes their size and colour."""
+    axes.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+
+
+def colour_bar(
+    figure: Figure, drawn: ScalarMappable, axes: Iterable[Axes], label: str, **options: Any
+) -> Colorbar:
+    """Draw the scale of colours beside all panels."""
+    bar = figure.colorbar(drawn, ax=list(axes), aspect=30, pad=0.02, **options)
+    bar.set_label(label, fontsize=FONT)
+    set_ticks(bar.ax)
+    return bar
+
+
+def legend_above(figure: Figure, handles: list[Any], columns: int = 3) -> None:
+    """Draw the legend of all panels above them."""
+    figure.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=columns,
+        frameon=False,
+        fontsize=SMALL_FONT,
+    )
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A quantity's name with its unit, if it has one."""
+    return name if unit in ("", "1") else f"{name} ({unit})"
+
+
 def dress(ax: Axes, *, x: str = "", y: str = "", title: str = "", grid: bool = True) -> None:
     """Give an axes its labels (with units), fonts and, behind the data, a pale grid."""
     # set per axes: ticks are created late and would take the fonts of whoever draws
-    ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+    set_ticks(ax)
     for spine in ax.spines.values():
         spine.set_linewidth(0.6)
         spine.set_edgecolor(GREY)

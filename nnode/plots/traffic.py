@@ -28,6 +28,8 @@ from nnode.plots.style import (
     curve_style,
     dress,
     new_figure,
+    set_ticks,
+    with_unit,
 )
 
 #: Speeds (m/s) that are shown at most; the laws have a pole at gap 0.
@@ -194,7 +196,7 @@ def speed_curves(
     _limit(ax, table, [*leaders.values(), *shown], _left_out(models))
     right = ax.secondary_yaxis("right", functions=(_to_kmh, _from_kmh))
     right.set_ylabel(f"{what} (km/h)", fontsize=ax.yaxis.label.get_fontsize())
-    right.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+    set_ticks(right)
     right.spines["right"].set(linewidth=0.6, edgecolor=GREY)
     right_half = table.to_numpy()[SAMPLES // 2 :]
     bottom, top = ax.get_ylim()
@@ -400,7 +402,6 @@ def driver_figure(
         )
         ax.axvline(float(rows[name].median()), color=GREY, linewidth=0.8, linestyle="--")
         title = f"standard deviation between drivers {variability.estimate[name]:.3g} %"
-        unit = units.get(name, "")
-        label = name if unit in ("", "1") else f"{name} ({unit})"
+        label = with_unit(name, units.get(name, ""))
         dress(ax, x=label, y="driver, in order" if i == 0 else "", title=title)
     return figure

@@ -52,6 +52,13 @@ def plain_options(options: object) -> dict[str, Any]:
     return plain(OmegaConf.structured(options))
 
 
+def changed_options(options: object) -> dict[str, Any]:
+    """The options of a dataclass that differ from its defaults, without the name."""
+    defaults = plain_options(type(options)())
+    values = plain_options(options)
+    return {k: v for k, v in values.items() if v != defaults[k] and k != "name"}
+
+
 def group_defaults(section: str, group: str, command: str | None = None) -> dict[str, Any]:
     """The defaults of a configuration group; mandatory options have the value ``???``.
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from nnode.discover.report.deviation import Deviation
-from nnode.plots.style import DIVERGING, FONT, GREY, SEQUENTIAL, SMALL_FONT, dress, new_figure
+from nnode.plots.style import DIVERGING, SEQUENTIAL, colour_bar, dress, new_figure
 
 #: Smallest and largest number of cells along a side of a coloured map, with about PER_CELL values
 #: in each.
@@ -135,7 +134,7 @@ def _coloured(
         dress(ax, x=labels[0], y=labels[1], title=title, grid=False)
         ax.label_outer()
     assert mesh is not None
-    _bar(figure, mesh, axes, "both", "measured − simulated speed (m/s)")
+    colour_bar(figure, mesh, axes, "measured − simulated speed (m/s)", extend="both")
     return figure
 
 
@@ -197,17 +196,9 @@ def _arrows(
         dress(ax, x=labels[0], y=labels[1], title=f"{name}: {rms:.2g} m/s² rms")
         ax.label_outer()
     assert drawn is not None
-    _bar(figure, drawn, axes, "max", "mean of measured − simulated\nacceleration (m/s²)")
+    label = "mean of measured − simulated\nacceleration (m/s²)"
+    colour_bar(figure, drawn, axes, label, extend="max")
     return figure
-
-
-def _bar(
-    figure: Figure, drawn: ScalarMappable, axes: Iterable[Axes], extend: str, label: str
-) -> None:
-    """The scale of colours beside all panels."""
-    bar = figure.colorbar(drawn, ax=list(axes), extend=extend, aspect=30, pad=0.02)
-    bar.set_label(label, fontsize=FONT)
-    bar.ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
 
 
 def _rms(values: np.ndarray) -> float:
