@@ -23,15 +23,13 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
     table["length"] /= 0.3048
     file = saved(table.rename(columns={"veh": "Vehicle ID"}), tmp_path, "my cars.csv")
     done = script("check", str(file), f"hydra.run.dir={tmp_path / 'run'}")
-    assert done.returncode == 0, done.stderr
     assert "12 vehicles, 4812 positions, sampled every 0.1 s: 0 errors and 1 warning" in done.stdout
     assert "WARN  direction: all vehicles drive towards smaller positions" in done.stdout
     page = (tmp_path / "run" / "check.html").read_text(encoding="utf-8")
     assert "Check of my cars.csv" in page
     (line,) = [line for line in done.stdout.splitlines() if "nnode prepare_data" in line]
     words = shlex.split(line)[2:]
-    read = script("prepare_data", *words, f"hydra.run.dir={tmp_path / 'data'}")
-    assert read.returncode == 0, read.stderr
+    script("prepare_data", *words, f"hydra.run.dir={tmp_path / 'data'}")
     options = Store(tmp_path / "data").manifest["options"]
     assert (options["position_unit"], options["time_unit"]) == ("ft", "ms")
     assert options["direction"] == -1
@@ -55,7 +53,7 @@ def test_what_cannot_be_looked_at_is_told_in_a_line(
 ) -> None:
     (tmp_path / "junk.csv").write_bytes(bytes(range(256)))
     given = [option.replace("$T", str(tmp_path)) for option in options]
-    done = script("check", *given, f"hydra.run.dir={tmp_path / 'run'}")
+    done = script("check", *given, f"hydra.run.dir={tmp_path / 'run'}", status=None)
     assert done.returncode in (1, 2)
     assert words in done.stderr
     assert "Traceback" not in done.stderr

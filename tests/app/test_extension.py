@@ -182,7 +182,6 @@ def copy(folder: Path) -> Copy:
 
 def test_every_engine_and_what_drivers_do(copy: Copy, folder: Path) -> None:
     done = copy(PROGRAM)
-    assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert Path(found["package"]).parents[1] == folder
     x, gap = np.array([35.0, 80.0]), np.array([20.0, 30.0])
@@ -194,7 +193,7 @@ def test_every_engine_and_what_drivers_do(copy: Copy, folder: Path) -> None:
 def trained(copy: Copy, folder: Path) -> Path:
     """The folder of a run."""
     run = folder / "run"
-    done = copy(
+    copy(
         "train",
         "model=saturating",
         "model.leader=measured",
@@ -207,7 +206,6 @@ def trained(copy: Copy, folder: Path) -> Path:
         "trainer.max_epochs=30",
         f"hydra.run.dir={run}",
     )
-    assert done.returncode == 0, done.stderr
     return run
 
 
@@ -230,7 +228,7 @@ def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path
     head = "defaults: [formula_schema, _self_]\nname: saturating\nleader: measured\nlaw:"
     (conf / "mine.yaml").write_text(head + LAWS["saturating"], "utf-8")
     (tmp_path / "effects.py").write_text(IMPORTS + HILLS)
-    done = script(
+    script(
         "train",
         "--config-dir",
         str(conf.parent),
@@ -245,13 +243,12 @@ def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path
         f"hydra.run.dir={tmp_path / 'run'}",
         NNODE_EFFECTS=str(tmp_path / "effects.py"),
     )
-    assert done.returncode == 0, done.stderr
     assert estimates(tmp_path / "run") == pytest.approx(TRUTH, rel=0.02)
 
 
 @pytest.mark.parametrize("law", ["polite", "strolling"])
 def test_people_are_trained(copy: Copy, folder: Path, law: str, tmp_path: Path) -> None:
-    done = copy(
+    copy(
         "train",
         f"model={law}",
         *["model.effects=[waves]"] * (law == "polite"),
@@ -263,7 +260,6 @@ def test_people_are_trained(copy: Copy, folder: Path, law: str, tmp_path: Path) 
         "trainer.max_epochs=1",
         f"hydra.run.dir={tmp_path}",
     )
-    assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["solver"] == {"name": "fused", "uncompiled": None}
     assert {f"{law}.A", f"{law}.B"} <= set(result["summary"])
@@ -288,7 +284,7 @@ def test_it_is_found_and_shown(
 ) -> None:
     domain, table, *walls = data
     leader = ["model.leader=measured"] * (domain == "traffic")
-    done = copy(
+    copy(
         "discover",
         f"model={law}",
         *leader,
@@ -300,7 +296,6 @@ def test_it_is_found_and_shown(
         "discover.structure=false",
         f"hydra.run.dir={tmp_path}",
     )
-    assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "report.json").read_text())
     assert (found["verdict"], [one["name"] for one in found["effects"]]) == ("named", [effect])
     (named,) = found["effects"]
@@ -321,7 +316,7 @@ def test_it_drives_in_sumo(copy: Copy, trained: Path, tmp_path: Path) -> None:
         '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
         '</input><time><step-length value="0.1"/><end value="20"/></time></configuration>'
     )
-    done = copy(
+    copy(
         "drive",
         f"run={trained}",
         f"sumo={tmp_path / 'a.sumocfg'}",
@@ -329,7 +324,6 @@ def test_it_drives_in_sumo(copy: Copy, trained: Path, tmp_path: Path) -> None:
         "steps=scenario",
         f"hydra.run.dir={tmp_path / 'out'}",
     )
-    assert done.returncode == 0, done.stderr
     (seen,) = read_sumo(tmp_path / "out" / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
     v0, reach, w = estimates(trained).values()
     x = seen.x[..., 0]

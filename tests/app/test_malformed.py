@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-Script = Callable[..., subprocess.CompletedProcess[str]]
+from tests.app.conftest import Script
 
 HEAD = "vehicle,time,x\n"
 ROWS = "".join(f"{v},{0.2 * k:.1f},{30 * v + 5 * k}\n" for v in range(4) for k in range(6))
@@ -65,7 +64,7 @@ CASES = {
 def test_one_clear_error(script: Script, raw: Path, tmp_path: Path, case: str) -> None:
     make, words = CASES[case]
     run = tmp_path / "run"
-    done = script("train", *make(tmp_path, raw), f"hydra.run.dir={run}")
+    done = script("train", *make(tmp_path, raw), f"hydra.run.dir={run}", status=None)
     assert done.returncode != 0
     assert "Traceback" not in done.stderr
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
