@@ -61,20 +61,18 @@ def choose(store: Source, checkpoint: Checkpoint, part: str) -> tuple[str, list[
     before = set(source_hashes(checkpoint.manifest).values())
     shared = bool(before & set(source_hashes(store.manifest).values()))
     comparable = not shared or _cut_alike(store.manifest, checkpoint.manifest)
-    parts = {
-        name: set(checkpoint.split.get(name, [])) if shared and comparable else set()
-        for name in ("heldout", "train", "dropped")
-    }
+    saved = checkpoint.split if shared and comparable else {}
     names = [entry["name"] for entry in store.index]
+    train, dropped = (set(saved.get(key, [])) for key in ("train", "dropped"))
+    members = {
+        "heldout": saved.get("heldout", []),
+        "train": train,
+        "unseen": set(names) - train - dropped if comparable else (),
+        "all": names,
+    }
     indices = {
-        "heldout": [i for i, name in enumerate(names) if name in parts["heldout"]],
-        "train": [i for i, name in enumerate(names) if name in parts["train"]],
-        "unseen": [
-            i
-            for i, n in enumerate(names)
-            if comparable and n not in parts["train"] | parts["dropped"]
-        ],
-        "all": list(range(len(store))),
+        key: [i for i, name in enumerate(names) if name in chosen]
+        for key, chosen in members.items()
     }
     if part == "auto":
         part = next(name for name in ("heldout", "unseen", "all") if indices[name])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -180,7 +179,13 @@ def trainer_of(
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
     _check_pooling(options.pooling, model, optimizer_options.name)
-    _check_same_data(store, checkpoint)
+    if checkpoint is not None and source_hashes(store.manifest) != source_hashes(
+        checkpoint.manifest
+    ):
+        raise ConfigError(
+            "the data are not those of the checkpoint: the hashes of the source files differ; "
+            "point data.source= at the files it was trained on"
+        )
     parts = _parts(store, data, checkpoint)
     exact = optimizer_options.name == "gauss_newton"
     options.drivers = planned(options, model, lambda: [store[i] for i in parts.train], exact)
@@ -234,7 +239,7 @@ def trainer_of(
         Provenance(
             config=plain,
             manifest=brief(store.manifest),
-            split={k: [names[i] for i in v] for k, v in asdict(parts).items() if k in PARTS},
+            split={part: [names[i] for i in getattr(parts, part)] for part in PARTS},
             free_speed=free_speed,
         ),
         # only forces between people can be drawn
@@ -265,14 +270,12 @@ def positions(store: Source, names: Iterable[str]) -> list[int]:
 
 def _parts(store: Source, data: DataOptions, checkpoint: Checkpoint | None) -> Split:
     """The division of the sequences; a resumed run keeps that of its checkpoint."""
-    places = {entry["name"]: i for i, entry in enumerate(store.index)}
     saved = {} if checkpoint is None else checkpoint.split
-    if not saved or not {name for names in saved.values() for name in names} <= set(places):
+    names = {entry["name"] for entry in store.index}
+    if not saved or not {name for part in saved.values() for name in part} <= names:
         return split(store.index, data.split)
-    train, heldout, dropped = (
-        sorted(places[name] for name in saved.get(part, [])) for part in PARTS
-    )
-    return Split(train=train, heldout=heldout, dropped=dropped, mode="checkpoint", note="as it was")
+    parts = {part: sorted(positions(store, saved.get(part, []))) for part in PARTS}
+    return Split(**parts, mode="checkpoint", note="as it was")
 
 
 def _check_pooling(kind: Pooling, model: System, optimizer: str) -> None:
@@ -296,14 +299,4 @@ def _check_pooling(kind: Pooling, model: System, optimizer: str) -> None:
         raise ConfigError(
             f"{asked} has no place in a network: one sequence does not determine its weights; "
             "take a law such as idm without model.network, or trainer.pooling=pooled"
-        )
-
-
-def _check_same_data(store: Source, checkpoint: Checkpoint | None) -> None:
-    if checkpoint is None:
-        return
-    if source_hashes(store.manifest) != source_hashes(checkpoint.manifest):
-        raise ConfigError(
-            "the data are not those of the checkpoint: the hashes of the source files differ; "
-            "point data.source= at the files it was trained on"
         )

@@ -238,6 +238,7 @@ class Drivers:
             given[state] = self._states[state]
         self._fresh = np.zeros(len(self), bool)
 
+    @np.errstate(all="ignore")
     def _check_empty(self, lane: LaneDynamics) -> None:
         """Refuse a law without a limit for large gaps.
 
@@ -257,14 +258,11 @@ class Drivers:
             trial._states, trial._inputs = dict(self._states), dict(self._inputs)
             trial._rng = np.random.default_rng(0)
             trial.enter([()] * len(v))
-            with np.errstate(all="ignore"):
-                results.append([trial._advanced(k * self.dt, views) for k in range(3)])
+            results.append([trial._advanced(k * self.dt, views) for k in range(3)])
             results[-1] += list(trial._states.values())
-        with np.errstate(all="ignore"):
-            same = all(
-                (np.abs(a - b) <= _SAME * (1 + np.abs(b))).all()
-                for a, b in zip(*results, strict=True)
-            )
+        same = all(
+            (np.abs(a - b) <= _SAME * (1 + np.abs(b))).all() for a, b in zip(*results, strict=True)
+        )
         if not same:
             raise ConfigError(
                 f"{' with '.join(str(term.name) for term in self._terms)} has no speed on an "

@@ -192,8 +192,8 @@ def _check(blocks: list[Block]) -> None:
 
 
 def _facts(blocks: list[Block]) -> dict[str, str]:
-    found = [block.facts for block in blocks if isinstance(block, Provenance)]
-    return {name: fact for facts in found for name, fact in facts.items()}
+    provenances = (block for block in blocks if isinstance(block, Provenance))
+    return {name: fact for block in provenances for name, fact in block.facts.items()}
 
 
 def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
@@ -219,34 +219,22 @@ def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
                 parts.append(
                     f'<a id="figure-{block.name}"></a>{place}: {_without_html(block.caption)}'
                 )
-    facts = _facts(blocks)
-    if facts:
-        parts.append("---")
-        parts.append(
-            "\n".join(f"- {name}: {tables.markdown(fact)}" for name, fact in facts.items())
-        )
+    if facts := _facts(blocks):
+        lines = [f"- {name}: {tables.markdown(fact)}" for name, fact in facts.items()]
+        parts += ["---", "\n".join(lines)]
     return "\n\n".join(parts) + "\n"
 
 
 def _markdown_table(block: TableBlock) -> str:
     grid = block.grid()
-    names = [
-        tables.markdown(block.heads.get(name, tables.one_name(name)))
-        for name in block.frame.columns
-    ]
-    labels = [
-        tables.markdown(cell.text) for cell in grid.head[-1][: len(grid.head[-1]) - len(names)]
-    ]
-    sides = ["---:" if cell.right else "---" for cell in grid.head[-1][len(labels) :]]
-    lines = [labels + names, ["---"] * len(labels) + sides]
-    for row, cells in grid.rows:
-        lines.append(
-            [tables.markdown(cell.text) for cell in row]
-            + [
-                f"**{tables.markdown(c.text)}**" if c.bold else tables.markdown(c.text)
-                for c in cells
-            ]
-        )
+    names = [block.heads.get(name, tables.one_name(name)) for name in block.frame.columns]
+    head = grid.head[-1]
+    labels = [cell.text for cell in head[: len(head) - len(names)]]
+    sides = ["---:" if cell.right else "---" for cell in head[len(labels) :]]
+    lines = [list(map(tables.markdown, labels + names)), ["---"] * len(labels) + sides]
+    for row in grid.rows:
+        texts = [(tables.markdown(cell.text), cell.bold) for part in row for cell in part]
+        lines.append([f"**{text}**" if bold else text for text, bold in texts])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 

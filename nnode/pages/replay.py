@@ -156,7 +156,7 @@ def _scene(scene: Scene) -> dict[str, Any]:
     s = scene.sequence
     every = max(1, int(FINEST / s.dt + 1e-6)) if s.n_samples > 1 else 1
     keep = slice(None, None, every)
-    found: dict[str, Any] = {
+    content: dict[str, Any] = {
         "name": s.name,
         "start": round(float(s.time[0]), 3),
         "dt": round(every * s.dt, 6) if s.n_samples > 1 else 1.0,
@@ -168,12 +168,12 @@ def _scene(scene: Scene) -> dict[str, Any]:
         ],
     }
     if scene.led:
-        found["led"] = 1
+        content["led"] = 1
     if s.length is not None and _lengths(s):
-        found["length"] = [round(float(one), 2) if np.isfinite(one) else CAR for one in s.length]
+        content["length"] = [round(float(x), 2) if np.isfinite(x) else CAR for x in s.length]
     if s.walls is not None and len(s.walls):
-        found["walls"] = np.round(s.walls, 2).tolist()
-    return found
+        content["walls"] = np.round(s.walls, 2).tolist()
+    return content
 
 
 def packed(x: np.ndarray) -> list[list[int | None]]:
@@ -184,10 +184,10 @@ def packed(x: np.ndarray) -> list[list[int | None]]:
     columns = np.asarray(x, float).reshape(len(x), -1).T
     rows: list[list[int | None]] = []
     for column in columns:
-        there = np.abs(np.nan_to_num(column, nan=np.inf)) < FAR
-        steps = np.diff(np.round(100 * column[there]).astype(int), prepend=0)
+        present = np.abs(np.nan_to_num(column, nan=np.inf)) < FAR
+        steps = np.diff(np.round(100 * column[present]).astype(int), prepend=0)
         row: list[int | None] = [None] * len(column)
-        for place, step in zip(np.flatnonzero(there).tolist(), steps.tolist(), strict=True):
+        for place, step in zip(np.flatnonzero(present).tolist(), steps.tolist(), strict=True):
             row[place] = step
         rows.append(row)
     return rows

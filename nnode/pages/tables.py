@@ -118,9 +118,9 @@ def grid(
         columns.append(
             [Cell(number(value, wanted), b, right) for value, b in zip(values, fat, strict=True)]
         )
-    beside = [[Cell(_label(v)) for v in labels.iloc[:, i]] for i in range(labels.shape[1])]
+    label_cells = [[Cell(_label(v)) for v in labels.iloc[:, i]] for i in range(labels.shape[1])]
     rows = [
-        ([column[i] for column in beside], [column[i] for column in columns])
+        ([column[i] for column in label_cells], [column[i] for column in columns])
         for i in range(len(frame))
     ]
     shown = frame.rename(columns=dict(heads or {}))

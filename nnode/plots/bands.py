@@ -35,10 +35,10 @@ def band_panels(vehicles: Sequence[Bands], what: str = "gap (m)") -> Figure:
     figure = new_figure(7.2, 1.9 * rows + 0.5)
     panels = figure.subplots(rows, 2, squeeze=False).ravel()
     blue = OKABE_ITO["blue"]
-    for ax, one in zip(panels, vehicles, strict=False):
-        for level, (low, high) in sorted(one.bands.items(), reverse=True):
+    for ax, vehicle in zip(panels, vehicles, strict=False):
+        for level, (low, high) in sorted(vehicle.bands.items(), reverse=True):
             ax.fill_between(
-                one.time,
+                vehicle.time,
                 low,
                 high,
                 color=blue,
@@ -46,11 +46,11 @@ def band_panels(vehicles: Sequence[Bands], what: str = "gap (m)") -> Figure:
                 linewidth=0,
                 label=f"{100 * level:g} % of samples",
             )
-        ax.plot(one.time, one.median, color=blue, linewidth=1.0, label="median of samples")
-        ax.plot(one.time, one.measured, color="black", linewidth=1.2, label="measured")
-        dress(ax, x="time (s)", y=what, title=one.name)
+        ax.plot(vehicle.time, vehicle.median, color=blue, linewidth=1.0, label="median of samples")
+        ax.plot(vehicle.time, vehicle.measured, color="black", linewidth=1.2, label="measured")
+        dress(ax, x="time (s)", y=what, title=vehicle.name)
         if what.startswith("gap"):
-            ax.set_ylim(bottom=min(0.0, float(one.measured.min())))
+            ax.set_ylim(bottom=min(0.0, float(vehicle.measured.min())))
     for ax in panels[len(vehicles) :]:
         ax.set_visible(False)
     legend_above(figure, panels[0].get_legend_handles_labels()[0], 4)

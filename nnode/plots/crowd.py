@@ -29,7 +29,7 @@ from nnode.plots.interaction import (
     interaction,
 )
 from nnode.plots.settings import six_settings
-from nnode.plots.style import DIVERGING, FONT, GREY, colour_bar, dress, new_figure
+from nnode.plots.style import DIVERGING, FONT, GREY, colour_bar, dress, new_figure, thinned
 
 #: Velocity differences (m/s) of the four contour panels. The paper names (2, 0) as its example
 #: and leaves the others open; these are the encounters of two people who walk at 1 m/s.
@@ -93,9 +93,9 @@ def relative_positions(sequences: Iterable[Sequence], number: int = POINTS) -> n
     for s in sequences:
         away = s.x[:, :, None] - s.x[:, None]
         parts.append(away[:, ~np.eye(s.n_agents, dtype=bool)].reshape(-1, 2))
-    found = np.concatenate(parts)
-    found = found[np.abs(found).max(1, initial=0.0) <= max(EXTENT.values())]
-    return found[:: max(1, -(-len(found) // number))]
+    points = np.concatenate(parts)
+    points = points[np.abs(points).max(1, initial=0.0) <= max(EXTENT.values())]
+    return thinned(points, number)
 
 
 def head_on_figure(

@@ -101,8 +101,8 @@ def _bars(
     dress(axes, x="sequences", title=title, grid=False)
 
 
-def _panel(axes: Axes, s: Sequence, found: list[Fault], domain: Domain) -> None:
-    involved = {i for fault in found for i in fault.agents}
+def _panel(axes: Axes, s: Sequence, faults: list[Fault], domain: Domain) -> None:
+    involved = {i for fault in faults for i in fault.agents}
     finite = np.where(np.isfinite(s.x), s.x, np.nan)
     axis = 0
     if domain == "crowd" and np.isfinite(finite).any():
@@ -118,7 +118,7 @@ def _panel(axes: Axes, s: Sequence, found: list[Fault], domain: Domain) -> None:
             marker="" if domain == "crowd" else ".",
             markersize=3,
         )
-    for fault in found:
+    for fault in faults:
         colour, marker = STYLES[fault.kind]
         k = 0 if fault.time is None else int(np.argmin(np.abs(s.time - fault.time)))
         agents = list(fault.agents) or [0]

@@ -38,12 +38,12 @@ class Setting:
     v_red: Vector
 
 
-def _settings(ahead: float, beside: float) -> tuple[Setting, ...]:
-    """The six settings; people are 2 ``ahead`` (m) or 2 ``beside`` (m) apart."""
+def _settings(ahead: float, lateral: float) -> tuple[Setting, ...]:
+    """The six settings; people are 2 ``ahead`` (m) or 2 ``lateral`` (m) apart."""
     places = (
         ((0.0, ahead), (0.0, -ahead)),
         ((0.01, ahead), (-0.01, -ahead)),
-        ((beside, 0.0), (-beside, 0.0)),
+        ((lateral, 0.0), (-lateral, 0.0)),
     )
     pairs = product(places, ((0.0, -1.0), (0.0, 1.0)))
     return tuple(
@@ -53,8 +53,8 @@ def _settings(ahead: float, beside: float) -> tuple[Setting, ...]:
 
 #: Source: Göttlich & Totzeck, tables (data6settings) and (data6settingsNN).
 SETTINGS = {
-    "short": _settings(ahead=0.22, beside=0.22),
-    "long": _settings(ahead=4.0, beside=0.5),
+    "short": _settings(ahead=0.22, lateral=0.22),
+    "long": _settings(ahead=4.0, lateral=0.5),
 }
 
 

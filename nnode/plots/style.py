@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axes._secondary_axes import SecondaryAxis
 from matplotlib.cm import ScalarMappable
@@ -100,6 +101,11 @@ def legend_above(figure: Figure, handles: list[Any], columns: int = 3) -> None:
         frameon=False,
         fontsize=SMALL_FONT,
     )
+
+
+def thinned(points: np.ndarray, number: int) -> np.ndarray:
+    """At most ``number`` of the points, at equal steps."""
+    return points[:: max(1, -(-len(points) // number))]
 
 
 def with_unit(name: str, unit: str) -> str:

@@ -29,6 +29,7 @@ from nnode.plots.style import (
     dress,
     new_figure,
     set_ticks,
+    thinned,
     with_unit,
 )
 
@@ -98,8 +99,7 @@ def measured_speeds(
             gap = gap - np.tile(ahead, len(s.x))
         speed = s.v if s.v is not None else np.gradient(s.x, s.dt, axis=0)
         parts.append(np.column_stack([gap, speed[:, :-1, 0].ravel()]))
-    found = np.concatenate(parts)
-    return found[:: max(1, -(-len(found) // number))]
+    return thinned(np.concatenate(parts), number)
 
 
 @torch.no_grad()

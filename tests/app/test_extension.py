@@ -20,6 +20,7 @@ import pytest
 
 from benchmarks.recovery import by_sumo
 from nnode.data.readers.sumo import SumoOptions, read_sumo
+from nnode.data.sequence import Sequence
 from tests.app.conftest import ROOT, Script, start_script
 from tests.discover import walkers
 from tests.discover.platoons import platoons
@@ -124,6 +125,23 @@ def waves(x: np.ndarray) -> np.ndarray:
     return C * np.stack([np.sin(phase), np.cos(phase)], -1)
 
 
+def table(sequences: list[Sequence]) -> pd.DataFrame:
+    """A tidy table; agents are numbered over all sequences."""
+    frames = []
+    for i, s in enumerate(sequences):
+        n, k, dims = s.n_agents, s.n_samples, s.x.shape[2]
+        columns = dict(zip("xy", s.x.reshape(-1, dims).T, strict=False))
+        if s.destination is not None:
+            columns |= dict(zip(("dest_x", "dest_y"), np.tile(s.destination.T, k), strict=True))
+        ids = {
+            "sequence": i,
+            "time": np.repeat(s.time, n),
+            "agent": np.tile(np.arange(n) + n * i, k),
+        }
+        frames.append(pd.DataFrame(ids | columns))
+    return pd.concat(frames)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a copy of the package that has the new files, and tables of both domains."""
@@ -137,33 +155,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with (found / "nnode" / "model" / "effects" / f"{name}.py").open("a") as file:
             file.write(text)
     driven = platoons(lambda x, *_: speeds(x), number=20, seconds=25.0, seed=4)
-    frames = [
-        pd.DataFrame(
-            {
-                "sequence": i,
-                "time": np.repeat(one.time, 5),
-                "agent": np.tile(np.arange(5) + 5 * i, len(one.time)),
-                "x": one.x.ravel(),
-            }
-        )
-        for i, one in enumerate(driven)
-    ]
-    pd.concat(frames).to_csv(found / "platoons.csv", index=False)
+    table(driven).to_csv(found / "platoons.csv", index=False)
     walked = walkers.crowd(lambda x, *_: waves(x), sequences=17, samples=40)
-    frames = [
-        pd.DataFrame(
-            {
-                "sequence": i,
-                "time": np.repeat(one.time, one.n_agents),
-                "agent": np.tile(np.arange(6) + 6 * i, len(one.time)),
-                **dict(zip("xy", one.x.reshape(-1, 2).T, strict=True)),
-                **dict(zip(("dest_x", "dest_y"), np.tile(one.destination.T, 40), strict=True)),
-            }
-        )
-        for i, one in enumerate(walked)
-        if one.destination is not None
-    ]
-    pd.concat(frames).to_csv(found / "people.csv", index=False)
+    table(walked).to_csv(found / "people.csv", index=False)
     walls = pd.DataFrame(walkers.WALLS, columns=["x1", "y1", "x2", "y2"])
     walls.to_csv(found / "walls.csv", index=False)
     return found
