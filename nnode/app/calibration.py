@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from scipy.stats import t as students_t
 
 from nnode.app.drivers import AUTO, EXACT, NONE, Drivers, calibrated_drivers
-from nnode.app.training import positions, straight_loader, stream
+from nnode.app.training import batches, positions
 from nnode.calibrate.checkpoint import Checkpoint, copied, save_checkpoint
 from nnode.calibrate.evaluate import Metrics, evaluate, sensitivity
 from nnode.calibrate.optimizers.gauss_newton import GaussNewton
@@ -664,8 +664,8 @@ def _metrics(trainer: Trainer, model: System, part: str) -> Metrics:
     loader = trainer.train if part == "train" else trainer.heldout
     assert loader is not None
     data = cast(SequenceDataset, loader.dataset)
-    batches = stream(straight_loader(data.store, list(data.indices), _TOGETHER), trainer.dtype)
-    return evaluate(lambda b: trainer.solver(model, b), batches, trainer.options.cost)
+    sequences = batches(data.store, list(data.indices), _TOGETHER, trainer.dtype)
+    return evaluate(lambda b: trainer.solver(model, b), sequences, trainer.options.cost)
 
 
 def _status(trainer: Trainer, model: System, store: Source) -> str:
@@ -676,7 +676,7 @@ def _status(trainer: Trainer, model: System, store: Source) -> str:
     if not isinstance(trainer.optimizer, torch.optim.LBFGS) or len(costs) < 2:
         return "stopped"
     indices = positions(store, trainer.provenance.split["train"])
-    (batch,) = stream(straight_loader(store, indices, 0), trainer.dtype)
+    (batch,) = batches(store, indices, 0, trainer.dtype)
     model = copy.deepcopy(model).cpu()
     try:
         slope = sensitivity(model, trainer.solver, batch, trainer.options.cost)
@@ -713,7 +713,7 @@ def _by_tangents(
         start_speeds=options.start_speeds,
     )
     indices = positions(store, trainer.provenance.split["train"])
-    (batch,) = stream(straight_loader(store, indices, 0))
+    (batch,) = batches(store, indices, 0)
     double = copy.deepcopy(model).double()
     problem = make(double, batch)
     row = problem.vector.row.numpy()

@@ -15,12 +15,11 @@ from rich.table import Table
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import merge_saved, options_of
 from nnode.app.training import (
+    batches,
     build_solver,
     set_threads,
     source_hashes,
     started,
-    straight_loader,
-    stream,
 )
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention
@@ -161,8 +160,8 @@ class SavedRun:
 
     def batches(self, store: Source) -> Iterator[Batch]:
         """The chosen sequences of a store, in batches on the device."""
-        loader = straight_loader(store, self.indices, self.data.loader.batch_size)
-        return stream(loader, self.dtype, self.device)
+        size = self.data.loader.batch_size
+        return batches(store, self.indices, size, self.dtype, self.device)
 
 
 def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:

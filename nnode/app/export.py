@@ -33,9 +33,6 @@ from nnode.exchange.trajectories import (
 from nnode.files import write_json, write_text
 from nnode.model import System
 
-#: Targets, in the order of writing.
-TARGETS = ("jupedsim", "sumo", "pedpy", "fcd", "parquet", "csv")
-
 #: Value of ``trajectories=`` to the sets of trajectories.
 SOURCES = {
     "measured": ("measured",),
@@ -195,3 +192,5 @@ WRITERS: dict[str, Callable[[_Export], _Written]] = {
     "parquet": _parquet,
     "csv": _csv,
 }
+#: Targets, in the order of writing.
+TARGETS = tuple(WRITERS)

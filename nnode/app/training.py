@@ -69,15 +69,6 @@ def build_solver(options: SolverOptions, device: torch.device | None = None) -> 
     )
 
 
-def stream(
-    loader: DataLoader[Any],
-    dtype: torch.dtype = torch.float64,
-    device: torch.device | str | None = None,
-) -> Iterator[Batch]:
-    """The mini-batches of a loader in a precision and on a device."""
-    return (batch.to(device, dtype) for batch in loader)
-
-
 def started(checkpoint: Checkpoint, store: Source) -> Source:
     """Sequences with the start speeds of a checkpoint's simulations, as in its training."""
     model = checkpoint.build()
@@ -93,6 +84,17 @@ def straight_loader(
     options = LoaderOptions(batch_size=size, shuffle=False)
     rank, number = (world.rank, world.size) if world else (0, 1)
     return make_loader(SequenceDataset(store, indices), options, seed=0, rank=rank, size=number)
+
+
+def batches(
+    store: Source,
+    indices: list[int],
+    size: int,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str | None = None,
+) -> Iterator[Batch]:
+    """Sequences in order, in mini-batches with a precision and on a device."""
+    return (batch.to(device, dtype) for batch in straight_loader(store, indices, size))
 
 
 def set_threads(threads: int | None, domain: str) -> None:
@@ -224,9 +226,7 @@ def trainer_of(
     )
     free_speed = None
     if model.domain == "traffic" and world.first:
-        free_speed = best_common_speed(
-            stream(straight_loader(store, parts.train, data.loader.batch_size)), model
-        )
+        free_speed = best_common_speed(batches(store, parts.train, data.loader.batch_size), model)
     names = [entry["name"] for entry in store.index]
     return Trainer(
         model,

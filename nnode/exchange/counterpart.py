@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from nnode.model import System
-from nnode.model.laws import law_from
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, law_from
 from nnode.model.term import Term, short_names
 
 #: Address of a parameter to its interval: ``low`` and ``high``, None where unknown.
@@ -45,13 +45,13 @@ def effects_without(system: System, first: int = 1, counted: Collection[str] = (
     ]
 
 
-def field_law(system: System, described: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
+def field_law(system: System, names: Iterable[str]) -> str | None:
     """The package's law that a model has, whatever the model's name; None for other laws.
 
     Args:
-        described: name to description of laws, see :func:`nnode.model.laws.law_from`.
         names: names of the compared laws.
     """
+    described = {**CAR_FOLLOWING_LAWS, **PEDESTRIAN_LAWS}
     term = system.terms[0] if len(system.terms) else None
     for name in names:
         law = law_from(name, described[name])

@@ -26,7 +26,6 @@ from nnode.exchange.counterpart import (
     interval_lines,
 )
 from nnode.model import Law, System
-from nnode.model.laws import CAR_FOLLOWING_LAWS
 
 #: SUMO's length of a passenger car, m, for data without lengths.
 DEFAULT_LENGTH = 5.0
@@ -62,10 +61,7 @@ def equilibrium_gap(law: Law, speed: float, time_gap: float = 0.0) -> float:
 
 def has_type(system: System) -> bool:
     """Whether SUMO has a counterpart of a model's law."""
-    return (
-        system.find_law("lin", "log") is not None
-        or field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME)) is not None
-    )
+    return system.find_law("lin", "log") is not None or field_law(system, SAME) is not None
 
 
 def sumo_type(
@@ -87,7 +83,7 @@ def sumo_type(
     Raises:
         ConfigError: SUMO has no counterpart of the law.
     """
-    law = field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME))
+    law = field_law(system, SAME)
     if law is not None:
         counterpart = _same_law(system, law, name, length)
     else:

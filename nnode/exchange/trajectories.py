@@ -6,6 +6,7 @@ import gzip
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -191,13 +192,8 @@ def _directed(s: Sequence) -> Sequence:
 
 
 def _groups(sequences: Iterable[Sequence], size: int) -> Iterator[list[Sequence]]:
-    group: list[Sequence] = []
-    for s in sequences:
-        group.append(s)
-        if len(group) == size:
-            yield group
-            group = []
-    if group:
+    iterator = iter(sequences)
+    while group := list(islice(iterator, size)):
         yield group
 
 

@@ -159,31 +159,26 @@ def wrong_value(key: str, override: str, message: str, config: DictConfig | None
         config: configuration of the command's choices; None if it is unknown.
     """
     typed, _, value = override.lstrip("+").partition("=")
-    if typed != key:
-        return ConfigError(f"{override}: {key} is a value, without options of its own")
-    if match := re.search(r"could not be converted to (\w+)", message):
-        return ConfigError(f"{override}: expected {_KINDS.get(match[1], match[1].lower())}")
-    if match := re.search(r"expected one of \[(.*)\]", message):
-        valid = [item.strip() for item in match[1].split(",")]
-        near = suggestion(value, valid)
-        return ConfigError(f"{override}: expected one of {', '.join(valid)}{near}")
-    if "not a valid bool" in message:
-        return ConfigError(f"{override}: expected {_KINDS['Boolean']}")
-    if "is not a subclass of" in message or "Invalid type assigned" in message:
+    if typed != key or "convert 'dict'" in message:
+        expected = f"{key} is a value, without options of its own"
+    elif match := re.search(r"could not be converted to (\w+)", message):
+        expected = f"expected {_KINDS.get(match[1], match[1].lower())}"
+    elif match := re.search(r"expected one of \[(.*)\]", message):
+        valid = match[1].replace(" ", "").split(",")
+        expected = f"expected one of {', '.join(valid)}{suggestion(value, valid)}"
+    elif "not a valid bool" in message:
+        expected = f"expected {_KINDS['Boolean']}"
+    elif "is not a subclass of" in message or "Invalid type assigned" in message:
         node = None if config is None else OmegaConf.select(config, key)
-        options = [str(item) for item in node] if isinstance(node, DictConfig) else []
-        has = f": {', '.join(options)}" if options else ""
-        return ConfigError(
-            f"{override}: {key} has options of its own{has}; type {key}.NAME=VALUE, --help shows "
-            "them"
-        )
-    if "None" in message or "not Optional" in message:
-        return ConfigError(f"{override}: null is no value of this option; leave it out")
-    if "is not a ListConfig" in message:
-        return ConfigError(f"{override}: expected a list, such as [{value}]")
-    if "convert 'dict'" in message:
-        return ConfigError(f"{override}: {key} is a value, without options of its own")
-    return ConfigError(f"{override}: {message}")
+        has = f": {', '.join(map(str, node))}" if isinstance(node, DictConfig) and node else ""
+        expected = f"{key} has options of its own{has}; type {key}.NAME=VALUE, --help shows them"
+    elif "None" in message or "not Optional" in message:
+        expected = "null is no value of this option; leave it out"
+    elif "is not a ListConfig" in message:
+        expected = f"expected a list, such as [{value}]"
+    else:
+        expected = message
+    return ConfigError(f"{override}: {expected}")
 
 
 def refuse_added(config: DictConfig, name: str) -> None:
