@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
@@ -174,7 +173,7 @@ def _contours(
         radius = float(term.r)  # type: ignore[arg-type]
         contact = radius if chosen_part(term, part) == "wall" else 2 * radius
     lines = levels[levels > 0][:: max(1, len(levels) // 8)]
-    filled: ContourSet | None = None
+    filled: Any = None
     for (ax, *_), field in zip(panels, fields, strict=True):
         shown = np.ma.masked_invalid(field)
         filled = ax.contourf(side, side, shown, levels, cmap=DIVERGING, extend=extend)
@@ -183,7 +182,6 @@ def _contours(
         if contact is not None:
             ax.add_patch(Circle((0, 0), contact, fill=False, color=GREY, linewidth=0.8))
         ax.set_aspect("equal")
-    assert filled is not None
     letters = sorted({"xy"[c] for _, _, c in panels})
     name = f"force on i, {' and '.join(f'$F_{letter}$' for letter in letters)} (N)"
     bar = colour_bar(figure, filled, (ax for ax, *_ in panels), name, shrink=0.85)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -67,23 +67,18 @@ def simulate(
         None for a sequence whose simulation blows up.
     """
     paths: list[np.ndarray | None] = []
-    like = next(system.parameters(), torch.zeros((), dtype=torch.float64))
     for first in range(0, len(sequences), TOGETHER):
         part = sequences[first : first + TOGETHER]
         try:
-            paths += _together(system, part, step, like)
+            paths += _together(system, part, step)
         except SimulationError:
-            for sequence in part:
-                try:
-                    paths += _together(system, [sequence], step, like)
-                except SimulationError:
-                    paths.append(None)
+            single = len(part) == 1
+            paths += [None] if single else [x for s in part for x in simulate(system, [s], step)]
     return paths
 
 
-def _together(
-    system: System, sequences: list[Sequence], step: float | None, like: torch.Tensor
-) -> list[np.ndarray]:
+def _together(system: System, sequences: list[Sequence], step: float | None) -> list[np.ndarray]:
+    like = next(system.parameters(), torch.zeros((), dtype=torch.float64))
     batch = collate(sequences).to(like.device, like.dtype)
     longest = STEP[system.domain] if step is None else step
     dt = batch.dt / max(1, math.ceil(batch.dt / longest - 1e-6))
@@ -113,8 +108,8 @@ def deviation(system: System, sequences: list[Sequence], step: float | None = No
     if not parts:
         none = np.empty((0, system.dim))
         return Deviation(np.empty(0), none, none, none, np.empty((0, 2)))
-    names = [field.name for field in fields(Deviation)]
-    return Deviation(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return Deviation(*map(np.concatenate, columns))
 
 
 def _traffic(s: Sequence, x: np.ndarray, number: int) -> Deviation:

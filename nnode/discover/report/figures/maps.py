@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -119,7 +120,7 @@ def _coloured(
     axes = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
     means = [_cells(*columns, edges)[0] for columns in panels.values()]
     limit = _limit(means)
-    mesh = None
+    mesh: Any = None
     for ax, (name, (_, _, value)), mean in zip(axes, panels.items(), means, strict=True):
         ax.set_facecolor(EMPTY)
         mesh = ax.pcolormesh(
@@ -133,7 +134,6 @@ def _coloured(
         title = f"{name}: {_rms(value):.2g} m/s rms"
         dress(ax, x=labels[0], y=labels[1], title=title, grid=False)
         ax.label_outer()
-    assert mesh is not None
     colour_bar(figure, mesh, axes, "measured − simulated speed (m/s)", extend="both")
     return figure
 
@@ -170,7 +170,7 @@ def _arrows(
         fields.append((np.where(many, u, np.nan), np.where(many, v, np.nan)))
     limit = _limit([np.hypot(u, v) for u, v in fields])
     middle = np.meshgrid(*((e[1:] + e[:-1]) / 2 for e in edges), indexing="ij")
-    drawn = None
+    drawn: Any = None
     for ax, (name, (_, value)), (u, v) in zip(axes, panels.items(), fields, strict=True):
         draw_walls(ax, walls)
         length = np.hypot(u, v)
@@ -195,7 +195,6 @@ def _arrows(
         rms = _rms(np.linalg.norm(value, axis=1))
         dress(ax, x=labels[0], y=labels[1], title=f"{name}: {rms:.2g} m/s² rms")
         ax.label_outer()
-    assert drawn is not None
     label = "mean of measured − simulated\nacceleration (m/s²)"
     colour_bar(figure, drawn, axes, label, extend="max")
     return figure
