@@ -98,7 +98,7 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
             *lacking,
             *absent,
             *crowd,
-            *_OWN_TABLE,
+            *_USER_TABLE,
             Provenance({**facts, "Seed of the data": f"{seed}", "Time": f"{seconds:.0f} s"}),
         ],
         folder,
@@ -480,7 +480,7 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
     ]
 
 
-_OWN_TABLE: list[Block] = [
+_USER_TABLE: list[Block] = [
     Heading("Your own table"),
     Text(
         "A CSV file with a row per car and sample is sufficient. Columns and units are "

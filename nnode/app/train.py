@@ -43,7 +43,7 @@ RESUMABLE = (
     "trainer.figure_every",
 )
 #: Table of the separate parameters of sequences, for ``trainer.pooling``.
-OWN = "own_parameters.csv"
+SEQUENCES = "own_parameters.csv"
 #: Table of drivers, for ``trainer.drivers``.
 DRIVERS = "drivers.csv"
 SECTIONS = ("model", "data", "optimizer", "solver", "trainer", "seed")
@@ -108,7 +108,7 @@ def train(config: DictConfig, folder: Path) -> None:
         save_checkpoint(result.checkpoint, trainer.best_path)
         paths["drivers"] = write_csv(folder / DRIVERS, result.drivers.table)
     if result.own is not None:
-        paths["own parameters"] = write_csv(folder / OWN, result.own)
+        paths["own parameters"] = write_csv(folder / SEQUENCES, result.own)
     write_json(folder / RESULT, result.plain({name: str(path) for name, path in paths.items()}))
     print(result.summary())
     for what, path in paths.items():

@@ -205,7 +205,7 @@ class Drivers:
         gap = np.where(follows, views.gap, self._far)
         gap_1 = np.where(second, views.gap_1, self._far)
         v_1 = np.where(follows, views.v_1, views.v)
-        own_length = views.length_1 if self._lengths else np.zeros(n)
+        length = views.length_1 if self._lengths else np.zeros(n)
         start = np.where(self._fresh, time, self._begun)
         return {
             **self._fixed,
@@ -218,7 +218,7 @@ class Drivers:
             "v_1": v_1,
             "v_2": np.where(second, views.v_2, v_1),
             "dx_1": v_1,
-            "length_1": np.where(follows, own_length, 0.0),
+            "length_1": np.where(follows, length, 0.0),
             "second": second.astype(float),
             "t": time - start,
             "start": start,

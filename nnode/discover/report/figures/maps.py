@@ -18,7 +18,7 @@ CELLS, PER_CELL = (12, 48), 3
 #: Largest height of a map of a plane, inches.
 TALL = 6.5
 #: A mean of fewer values is not shown in maps of arrows.
-LEAST = 3
+MIN_VALUES = 3
 #: The scale of colours and arrows ends at this percentile of the map before.
 PERCENTILE = 97.0
 #: Shade of cells without data, darker than the neutral colour of the scale.
@@ -72,7 +72,9 @@ def plane_maps(maps: Mapping[str, Deviation], walls: np.ndarray | None) -> Figur
 def neighbour_maps(maps: Mapping[str, Deviation]) -> Figure:
     """Mean deviation of acceleration by where the nearest person is, seen in one's own way."""
     near = {name: np.abs(d.neighbour).max(1, initial=0) <= 3 for name, d in maps.items()}
-    panels = {name: (d.neighbour[near[name]], d.own_frame[near[name]]) for name, d in maps.items()}
+    panels = {
+        name: (d.neighbour[near[name]], d.walking_frame[near[name]]) for name, d in maps.items()
+    }
     places = next(iter(panels.values()))[0]
     labels = ("nearest person ahead (m)", "nearest person on the left (m)")
     return _arrows(panels, places, labels, person=True)
@@ -166,7 +168,7 @@ def _arrows(
         (u, number), (v, _) = (
             _cells(place[:, 0], place[:, 1], value[:, i], (edges[0], edges[1])) for i in (0, 1)
         )
-        many = number >= LEAST
+        many = number >= MIN_VALUES
         fields.append((np.where(many, u, np.nan), np.where(many, v, np.nan)))
     limit = _limit([np.hypot(u, v) for u, v in fields])
     middle = np.meshgrid(*((e[1:] + e[:-1]) / 2 for e in edges), indexing="ij")
