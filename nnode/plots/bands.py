@@ -1,4 +1,4 @@
-"""Bands of sampled gaps around what was measured."""
+"""Measured gaps with bands of sampled gaps."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from nnode.plots.style import OKABE_ITO, dress, legend_above, new_figure
 
 @dataclass(frozen=True)
 class Bands:
-    """Of one vehicle.
+    """Bands of a vehicle's gap.
 
     Attributes:
-        name: of its sequence.
+        name: name of the sequence.
         time: ``(K,)`` s after the start.
         measured, median: ``(K,)`` gaps, m.
         bands: level to ``(2, K)`` lower and upper end, m.
@@ -30,7 +30,7 @@ class Bands:
 
 
 def band_panels(vehicles: Sequence[Bands], what: str = "gap (m)") -> Figure:
-    """A panel per vehicle or person, two side by side; ``what`` is on the vertical axis."""
+    """A panel per vehicle or person in two columns; ``what`` labels the vertical axis."""
     rows = -(-len(vehicles) // 2)
     figure = new_figure(7.2, 1.9 * rows + 0.5)
     panels = figure.subplots(rows, 2, squeeze=False).ravel()

@@ -1,4 +1,4 @@
-"""What a crowd model has learned, as contour plots over the relative position.
+"""Forces of a crowd model as contour plots over the relative position.
 
 The sign of a force is explained in :mod:`nnode.plots.interaction`.
 """
@@ -43,13 +43,12 @@ HEAD_ON = (2.0, 0.0)
 
 #: Half widths (m) of the contour panels in the paper: short and long ranged forces.
 EXTENT = {"short": 0.5, "long": 4.0}
-#: Measured pairs that a figure shows at most.
+#: Largest number of measured pairs in a figure.
 POINTS = 1500
 #: An even number keeps the grid off the origin, where a repulsion has no direction.
 GRID = 160
-#: The colour scale ends at this percentile of |F| where a peak is far above it.
+#: The colour scale ends at this percentile of |F| if the peak is at least PEAK times as high.
 SCALE_PERCENTILE = 98.0
-#: ... and a peak counts as far above from this ratio on.
 PEAK = 3.0
 
 
@@ -61,8 +60,8 @@ def force_contours(
     The panels differ in the relative velocity: (0, 0), (2, 0), (0, 2) and (1, 1) m/s, see
     ``ENCOUNTERS``. All share one symmetric scale; lines are solid where the force is positive
     and dashed where it is negative, and a circle marks contact of two social-force bodies.
-    Where a narrow peak towers over the rest, the scale ends below it; the
-    title gives its height.
+    If a narrow peak is much higher than other forces, the scale ends below it, and the title states
+    its height.
 
     Args:
         component: 0 for F_x, 1 for F_y.
@@ -70,7 +69,7 @@ def force_contours(
         part: see :func:`evaluate_force`.
 
     Raises:
-        ConfigError: a component, extent or part that does not exist, or no interaction force.
+        ConfigError: an unknown component, extent or part, or a model without interaction force.
 
     Source: Göttlich & Totzeck, figures (HelbingG1), (HelbingG2), (NN_G1), (NN_G2).
     """
@@ -118,10 +117,10 @@ def head_on_figure(
 
 
 def crowd_figures(system: System) -> dict[str, Figure]:
-    """Every figure of a crowd model.
+    """All figures of a crowd model.
 
-    ``force_x``, ``force_y`` and ``settings``; where the default is a sum of pair and wall
-    force, also ``force_x_pair``, ``force_x_wall``, ``force_y_pair`` and ``force_y_wall``.
+    These are ``force_x``, ``force_y`` and ``settings``. If the default is the sum of pair and wall
+    force, there are also ``force_x_pair``, ``force_x_wall``, ``force_y_pair`` and ``force_y_wall``.
 
     Raises:
         ConfigError: the model has no interaction force.
@@ -205,7 +204,7 @@ def _contours(
 def _lines(
     ax: Axes, side: np.ndarray, field: np.ma.MaskedArray, levels: np.ndarray, style: str
 ) -> None:
-    """Contour lines, which tell the sign where colours are lost."""
+    """Draw contour lines, whose style shows the sign without colours."""
     values = field.compressed()
     met = [level for level in levels if values.size and values.min() < level < values.max()]
     if met:
@@ -213,10 +212,10 @@ def _lines(
 
 
 def _levels(fields: np.ndarray) -> tuple[np.ndarray, Any, float]:
-    """Levels, which ends are open, and the largest size of a field.
+    """Levels, the open ends of the scale, and the largest absolute value of a field.
 
-    The levels lie half a step off the multiples of the step, so that forces about zero get one
-    neutral colour instead of two.
+    The levels are shifted by half a step from the multiples of the step, so that forces about zero
+    have one neutral colour instead of two.
     """
     size = np.abs(fields[np.isfinite(fields)])
     peak = float(size.max()) if size.size else 0.0

@@ -1,4 +1,4 @@
-"""Forces on two people in six settings: who stands where, walks how, and is pushed where."""
+"""Forces on two people in six settings of positions and velocities."""
 
 from __future__ import annotations
 
@@ -63,12 +63,13 @@ def six_settings(
 ) -> tuple[Figure, pd.DataFrame]:
     """Forces on two people in the paper's six settings, drawn and as a table.
 
-    Left, the people face each other; right, they walk in the same direction. Arrows have one
-    scale in all panels, given by the keys above them; every panel has its own section of space.
+    On the left, the people face each other; on the right, they walk in the same direction. Arrows
+    have one scale in all panels, which the keys above the panels show. The panels show different
+    sections of space.
 
     Args:
-        settings: default are the paper's: 0.44 m apart for the social force, 8 m or 1 m apart
-            otherwise.
+        settings: settings; by default those of the paper, in which people are 0.44 m apart for the
+            social force, and 8 m or 1 m for other forces.
         part: see :func:`evaluate_force`.
 
     Returns:
@@ -76,7 +77,7 @@ def six_settings(
         ``v_blue``, ``v_red`` (m/s), ``force_blue``, ``force_red`` (N); each cell is (x, y).
 
     Raises:
-        ConfigError: no settings, no interaction force, or a part that does not exist.
+        ConfigError: no settings, no interaction force, or an unknown part.
 
     Source: Göttlich & Totzeck, tables (data6settings), (data6settingsNN), figures (6Helbing),
     (6NN).
@@ -135,7 +136,7 @@ def _quivers(table: pd.DataFrame, what: str) -> Figure:
 
 
 def _longest(table: pd.DataFrame, kind: str) -> float:
-    """Largest length of a vector in the table; 1 where all vanish."""
+    """Largest length of a vector in the table; 1 if all are zero."""
     norms = np.hypot(*np.array([*table[f"{kind}_blue"], *table[f"{kind}_red"]]).T)
     return float(np.max(norms[np.isfinite(norms)], initial=0.0)) or 1.0
 
@@ -143,7 +144,7 @@ def _longest(table: pd.DataFrame, kind: str) -> float:
 def _arrow(
     ax: Axes, kind: str, where: Vector, vector: Vector, scale: dict[str, float], **style: Any
 ) -> None:
-    # a length in inches reads the same in every panel, whatever space the panel shows
+    # a length in inches is the same in panels that show different sections of space
     ax.quiver(
         *where,
         *vector,
@@ -170,7 +171,7 @@ def _person(ax: Axes, person: str, where: Vector) -> None:
 
 
 def _key(ax: Axes, longest: dict[str, float], scale: dict[str, float]) -> None:
-    """One row that says what markers and arrows mean and how long they are."""
+    """Draw the legend of markers and arrows, with the lengths of the arrows."""
     width = WIDTH * 0.9  # inches, about
     ax.set(xlim=(0, 1), ylim=(0, 1))
     ax.set_axis_off()

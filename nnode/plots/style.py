@@ -1,4 +1,4 @@
-"""One restrained look for all figures: colour-blind safe, readable in grey, units on the axes."""
+"""The common style of figures: safe for colour-blind readers and in grey, with units on axes."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ DPI = 150
 
 
 class Picture(Figure):
-    """A figure that a notebook shows without Matplotlib's global state."""
+    """A figure that notebooks show without Matplotlib's global state."""
 
     def _repr_png_(self) -> bytes:
         stream = io.BytesIO()
@@ -63,12 +63,12 @@ class Picture(Figure):
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of ``width`` by ``height`` inches that no global state keeps open."""
+    """An empty figure of ``width`` by ``height`` inches, outside Matplotlib's global state."""
     return Picture(figsize=(width, height), layout="constrained")
 
 
 def curve_style(index: int) -> dict[str, Any]:
-    """Colour, line style and marker of the ``index``-th curve; they repeat after seven."""
+    """Colour, line style and marker of the ``index``-th curve, which repeat after seven."""
     i = index % len(OKABE_ITO)
     return {
         "color": list(OKABE_ITO.values())[i],
@@ -115,7 +115,7 @@ def with_unit(name: str, unit: str) -> str:
 
 def dress(ax: Axes, *, x: str = "", y: str = "", title: str = "", grid: bool = True) -> None:
     """Give an axes its labels (with units), fonts and, behind the data, a pale grid."""
-    # set per axes: ticks are created late and would take the fonts of whoever draws
+    # ticks are created late and would take the fonts that are set when the figure is drawn
     set_ticks(ax)
     for spine in ax.spines.values():
         spine.set_linewidth(0.6)
@@ -132,13 +132,13 @@ def dress(ax: Axes, *, x: str = "", y: str = "", title: str = "", grid: bool = T
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write ``figure`` as PNG with 150 dots per inch; a reader never sees half a file.
+    """Write a figure as PNG with 150 dots per inch.
 
     The file has a palette of 256 colours, which takes a third of the bytes. Missing folders are
-    made. An existing file is replaced.
+    created. An existing file is replaced as a whole.
 
     Returns:
-        The path written.
+        The path.
 
     Raises:
         ConfigError: the path does not end in ``.png``, or its folder cannot be written to.

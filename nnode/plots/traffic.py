@@ -1,4 +1,4 @@
-"""What a traffic model has learned: speed as a function of the gap."""
+"""Figures of traffic models: speed as a function of the gap, errors of followers, drivers."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from nnode.plots.style import (
     with_unit,
 )
 
-#: Speeds (m/s) that are shown at most; the laws have a pole at gap 0.
+#: Range of shown speeds (m/s); the laws have a pole at gap 0.
 SHOWN = (-20.0, 60.0)
-#: Gaps between these percentiles count as supported by the data.
+#: Percentiles between which gaps count as supported by the data.
 SUPPORT = (1.0, 99.0)
 KMH = 3.6
 SAMPLES = 481
 #: Gaps (m) of a figure.
 SPAN = (2.0, 50.0)
 BINS = 48
-#: Measured samples that a figure shows at most.
+#: Largest number of measured samples in a figure.
 POINTS = 3000
 
 
@@ -306,7 +306,7 @@ def _curve(
 
 
 def _left_out(models: Mapping[str, System]) -> list[str]:
-    """Which effects the curves are drawn without."""
+    """Remarks on effects that the curves do not include."""
     effects = {name: omitted_effects(system) for name, system in models.items()}
     having = {name: words for name, words in effects.items() if words}
     if len(having) > 2:
@@ -315,7 +315,7 @@ def _left_out(models: Mapping[str, System]) -> list[str]:
 
 
 def _limit(ax: Axes, table: pd.DataFrame, leaders: list[float], extra: list[str]) -> None:
-    """Keep the speed axis legible, and say what it cuts and what else is not shown."""
+    """Limit the axis of speeds, and note what is cut or not shown."""
     values = np.concatenate([table.to_numpy().ravel(), leaders, [0.0]])
     values = values[np.isfinite(values)]
     bottom, top = max(values.min(), SHOWN[0]), min(values.max(), SHOWN[1])
@@ -382,9 +382,9 @@ def driver_figure(
 
     Args:
         table: a row per driver with ``NAME`` and ``NAME_error``.
-        names: the parameters, a panel each.
-        variability: by name the standard deviation between drivers, ``estimate`` in %.
-        units: by name.
+        names: the parameters, one panel each.
+        variability: table by name with the standard deviation between drivers, ``estimate``, %.
+        units: name to unit.
     """
     figure = new_figure(1.2 + 3.4 * len(names), 3.4)
     panels = figure.subplots(1, len(names), squeeze=False)[0]
