@@ -60,9 +60,14 @@ def test_what_cannot_be_looked_at_is_told_in_a_line(
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_the_text_says_all(tmp_path: Path) -> None:
-    head = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
-    found = examine(text(people(), tmp_path, head, 100.0))
+@pytest.fixture
+def pedpy(tmp_path: Path) -> Path:
+    """People in the format of PedPy, in cm."""
+    return text(people(), tmp_path, "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n", 100.0)
+
+
+def test_the_text_says_all(pedpy: Path) -> None:
+    found = examine(pedpy)
     assert sentence(found).startswith("40 people, ")
     told = summary(found, ["data=pedpy", "data.path=X"])
     assert "columns: agent = column 1, frame = column 2, x = column 3, y = column 4" in told
@@ -72,12 +77,10 @@ def test_the_text_says_all(tmp_path: Path) -> None:
         assert one.text in told
 
 
-def test_in_python_it_is_an_object(tmp_path: Path) -> None:
-    head = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
-    path = text(people(), tmp_path, head, 100.0)
-    found = nnode.check(path)
+def test_in_python_it_is_an_object(pedpy: Path, tmp_path: Path) -> None:
+    found = nnode.check(pedpy)
     assert isinstance(found, nnode.Check)
-    assert repr(found).splitlines()[0] == f"{path}: {sentence(found.examination)}"
+    assert repr(found).splitlines()[0] == f"{pedpy}: {sentence(found.examination)}"
     assert found.options[0] == "data=pedpy"
     assert found.probability > 0.99
     assert "<p>40 people, " in found._repr_html_()
@@ -85,4 +88,4 @@ def test_in_python_it_is_an_object(tmp_path: Path) -> None:
         assert one.kind in found._repr_html_()
     assert found.write(tmp_path / "page").name == "check.html"
     with pytest.raises(ConfigError, match="domain=sea: expected traffic, crowd, or null"):
-        nnode.check(path, "sea")  # type: ignore[arg-type]
+        nnode.check(pedpy, "sea")  # type: ignore[arg-type]

@@ -119,8 +119,6 @@ def test_what_cannot_be_sampled(run: Path, tmp_path: Path) -> None:
         nnode.simulate(tmp_path / "none")
     with pytest.raises(ConfigError, match="samples=10: a band of 95 % needs at least 39"):
         nnode.simulate(run, samples=10)
-    with pytest.raises(ConfigError, match="part=some is unknown"):
-        nnode.simulate(run, part="some")
 
 
 def test_the_lines_of_the_page(
