@@ -201,15 +201,15 @@ class Calibration:
     def fit(self) -> Fit:
         """The goodness of fit on the training sequences, which are simulated once."""
         items = self._sequences("train")
-        square, before, after, lagged, agents, samples, dims = 0.0, 0.0, 0.0, 0.0, 0, 0, 1
+        sums, agents, samples, dims = np.zeros(4), 0, 0, 1
         for s, path in zip(items, self.simulated(items), strict=True):
             error = (s.x - path.x)[1:, _counted(self.model, s)[-1]]
             dims = error.shape[2]
             agents, samples = agents + error.shape[1], samples + error.shape[0] * error.shape[1]
-            square += float((error**2).sum())
-            before += float((error[:-1] ** 2).sum())
-            after += float((error[1:] ** 2).sum())
-            lagged += float((error[1:] * error[:-1]).sum())
+            now, past = error[1:], error[:-1]
+            products = ((error, error), (past, past), (now, now), (now, past))
+            sums += [(a * b).sum() for a, b in products]
+        square, before, after, lagged = map(float, sums)
         number = max(samples * dims, 1)
         variance = max(square / number, np.finfo(float).tiny)
         trained = sum(p.numel() for p in self.model.parameters() if p.requires_grad)
@@ -435,11 +435,8 @@ class Calibration:
         if self.correlation is not None:
             table = self.correlation.loc[names, names].to_numpy(dtype=float)
             variables["correlation"] = (("parameter", "other"), table)  # type: ignore[assignment]
-        for key in (key for key in self.history if str(key).startswith("cost/")):
-            variables[str(key).replace("/", "_")] = (
-                "epoch",
-                self.history[key].to_numpy(dtype=float),
-            )
+        for key, costs in self.history.filter(regex="^cost/").items():
+            variables[str(key).replace("/", "_")] = ("epoch", costs.to_numpy(dtype=float))
         coords = {
             "parameter": names,
             "unit": ("parameter", self.parameters["unit"].to_list()),

@@ -234,7 +234,8 @@ def _loaded(program: str) -> tuple[Any, str]:
         home = os.environ.get("SUMO_HOME")
     binary = shutil.which("sumo")
     if home:
-        sys.path.append(str(Path(home, "tools")))  # traci comes with SUMO
+        if (tools := str(Path(home, "tools"))) not in sys.path:
+            sys.path.append(tools)  # traci comes with SUMO
         binary = str(Path(home, "bin", "sumo"))
     try:
         # libsumo warns of other versions of pyarrow, which only matters for its table output
