@@ -6,7 +6,7 @@ Every message says what was expected, what was found, where (file, row, option) 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from typing import Any
 
@@ -35,14 +35,32 @@ def printable(text: str, limit: int = LONGEST) -> str:
     return shown[: left - left // 3] + note + shown[len(shown) - left // 3 :]
 
 
-def suggestion(word: str, words: Iterable[str], cutoff: float = 0.6) -> str:
-    """The end of a message that suggests the most similar of some words; empty for none.
+def suggestion(word: str, words: Iterable[str] | Mapping[str, str], cutoff: float = 0.6) -> str:
+    """The end of a message that suggests the most similar word, ignoring case; empty for none.
 
     Args:
+        words: the words, or word to the text that suggests it.
         cutoff: smallest similarity, see :func:`difflib.get_close_matches`.
     """
-    near = get_close_matches(word, list(words), n=1, cutoff=cutoff)
-    return f"; did you mean {near[0]}?" if near else ""
+    texts = words if isinstance(words, Mapping) else {name: name for name in words}
+    folded = {name.casefold(): text for name, text in texts.items()}
+    near = get_close_matches(word.casefold(), list(folded), n=1, cutoff=cutoff)
+    return f"; did you mean {folded[near[0]]}?" if near else ""
+
+
+def unknown_value(
+    option: str, value: object, choices: Iterable[str], hint: str = ""
+) -> ConfigError:
+    """The error for a value that is none of an option's choices, with the most similar one.
+
+    Args:
+        hint: text after the list of choices.
+    """
+    names = list(choices)
+    return ConfigError(
+        f"{option}={value} is unknown, expected one of {', '.join(names)}{hint}"
+        f"{suggestion(str(value), names)}"
+    )
 
 
 class NNodeError(Exception):

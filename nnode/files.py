@@ -131,6 +131,11 @@ def csv_text(frame: pd.DataFrame) -> str:
     return safe.to_csv(index=False)
 
 
+def write_csv(path: Path, frame: pd.DataFrame) -> Path:
+    """Write a data frame as :func:`csv_text`; returns the path."""
+    return write_text(path, csv_text(frame))
+
+
 def csv_safe(cell: Any) -> Any:
     """A cell that a spreadsheet does not take for a formula, see :func:`csv_text`."""
     if not isinstance(cell, str) or not _FORMULA.match(cell):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import signal
 import time
 from importlib import import_module
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Protocol, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.calibrate.interrupt import BreakingGuard, Interrupted
-from nnode.errors import ConfigError
+from nnode.calibrate.interrupt import BreakingGuard
+from nnode.errors import unknown_value
 from nnode.machine import cores, how_made
 from nnode.pages.page import Block, Provenance, write_page
 from studies.cluster import on_cluster
@@ -64,32 +63,22 @@ def study(config: DictConfig, folder: Path) -> None:
     """
     options = cast(StudyOptions, OmegaConf.to_object(config.study))
     if options.name not in STUDIES:
-        raise ConfigError(
-            f"study.name={options.name} is unknown, expected one of {', '.join(STUDIES)}"
-        )
+        raise unknown_value("study.name", options.name, STUDIES)
     options = checked(options)
     options.workers = options.workers or cores()
     folder = folder / QUICK if options.quick else folder
     start, before = time.monotonic(), len(list((folder / KEPT).glob("*.json")))
-    with BreakingGuard() as guard:
-        try:
-            module = cast(Study, import_module(STUDIES[options.name]))
-            with on_cluster(options.cluster):
-                blocks = module.run(options, folder)
-            made = _made(time.monotonic() - start, options.workers, before)
-            paths = write_page(
-                [*blocks, made],
-                folder,
-                title=module.TITLE + (" (quick)" if options.quick else ""),
-                subtitle=module.SUBTITLE,
-            )
-        except KeyboardInterrupt:
-            number = guard.requested or signal.SIGINT
-            raise Interrupted(
-                f"stopped by {signal.Signals(number).name}: what is done is kept in {folder}; "
-                "the same command goes on from there",
-                number,
-            ) from None
+    with BreakingGuard(f": what is done is kept in {folder}; the same command goes on from there"):
+        module = cast(Study, import_module(STUDIES[options.name]))
+        with on_cluster(options.cluster):
+            blocks = module.run(options, folder)
+        made = _made(time.monotonic() - start, options.workers, before)
+        paths = write_page(
+            [*blocks, made],
+            folder,
+            title=module.TITLE + (" (quick)" if options.quick else ""),
+            subtitle=module.SUBTITLE,
+        )
     for path, what in zip(paths, ("page", "as Markdown"), strict=False):
         print(f"{what}: {path}")
     print(f"tables: {sum(p.suffix == '.csv' for p in paths)} CSV files in {folder}")

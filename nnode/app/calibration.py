@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from html import escape
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from scipy.stats import t as students_t
 
 from nnode.app.drivers import AUTO, EXACT, NONE, Drivers, calibrated_drivers
-from nnode.app.training import positions, straight_loader, stream
+from nnode.app.training import batches, positions
 from nnode.calibrate.checkpoint import Checkpoint, copied, save_checkpoint
 from nnode.calibrate.evaluate import Metrics, evaluate, sensitivity
 from nnode.calibrate.optimizers.gauss_newton import GaussNewton
@@ -46,6 +46,15 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _BOUND = {"low": "lower", "high": "upper"}
+#: Columns of the table of parameters, by the names of :func:`nnode.calibrate.intervals.intervals`.
+_COLUMNS = ("estimate", "low", "high", "unit", "at_bound", "identified", "std_error", "df", "scale")
+#: Row of a parameter without an interval.
+_NO_INTERVAL = {
+    **dict.fromkeys(("low", "high", "std_error", "df"), float("nan")),
+    "at_bound": "",
+    "identified": None,
+    "scale": "linear",
+}
 #: Relative change of the cost by the relative change of a parameter below which a minimum is
 #: reached. For ``sf`` on Jülich data it is at most 5e-6 at minima, and 0.11 and 0.24 where L-BFGS
 #: stalls from two starts. For ``lin`` on a noisy platoon it is 1.2e-3 at a minimum with the cost of
@@ -192,15 +201,15 @@ class Calibration:
     def fit(self) -> Fit:
         """The goodness of fit on the training sequences, which are simulated once."""
         items = self._sequences("train")
-        square, before, after, lagged, agents, samples, dims = 0.0, 0.0, 0.0, 0.0, 0, 0, 1
-        for s, path in zip(items, self._simulated(items), strict=True):
+        sums, agents, samples, dims = np.zeros(4), 0, 0, 1
+        for s, path in zip(items, self.simulated(items), strict=True):
             error = (s.x - path.x)[1:, _counted(self.model, s)[-1]]
             dims = error.shape[2]
             agents, samples = agents + error.shape[1], samples + error.shape[0] * error.shape[1]
-            square += float((error**2).sum())
-            before += float((error[:-1] ** 2).sum())
-            after += float((error[1:] ** 2).sum())
-            lagged += float((error[1:] * error[:-1]).sum())
+            now, past = error[1:], error[:-1]
+            products = ((error, error), (past, past), (now, now), (now, past))
+            sums += [(a * b).sum() for a, b in products]
+        square, before, after, lagged = map(float, sums)
         number = max(samples * dims, 1)
         variance = max(square / number, np.finfo(float).tiny)
         trained = sum(p.numel() for p in self.model.parameters() if p.requires_grad)
@@ -261,12 +270,15 @@ class Calibration:
         return lines
 
     def _costs(self) -> list[str]:
-        unit = self.cost_unit
-        lines = [f"cost of a training sequence: {self.cost_start:.4g} -> {self.cost:.4g} {unit}"]
-        if np.isfinite(self.cost_heldout):
-            before, after = self.heldout_start, self.cost_heldout
-            lines.append(f"cost of a held-out sequence: {before:.4g} -> {after:.4g} {unit}")
-        return lines
+        costs = {
+            "training": (self.cost_start, self.cost),
+            "held-out": (self.heldout_start, self.cost_heldout),
+        }
+        return [
+            f"cost of a {part} sequence: {before:.4g} -> {after:.4g} {self.cost_unit}"
+            for part, (before, after) in costs.items()
+            if np.isfinite(after)
+        ]
 
     def _remarks(self) -> list[str]:
         """Remarks on the data and the method."""
@@ -324,18 +336,14 @@ class Calibration:
         half = students_t.ppf(1 - alpha / 2, table["df"].to_numpy(dtype=float)) * error
         in_logs = (table["scale"] == "log").to_numpy()
         relative = np.where(in_logs, half / value, 0.0)
-        limits = physical_bounds(self.model)
-        low = [limits[str(name)].low for name in table.index]
-        high = [limits[str(name)].high for name in table.index]
-        ends = {
-            "lower": np.where(in_logs, value * np.exp(-relative), value - half),
-            "upper": np.where(in_logs, value * np.exp(relative), value + half),
-        }
-        clipped = {key: np.clip(end, low, high) for key, end in ends.items()}
-        shown = np.isfinite(table["lower"].to_numpy(dtype=float))
-        return pd.DataFrame(
-            {key: np.where(shown, end, np.nan) for key, end in clipped.items()}, index=table.index
-        )
+        limits = [physical_bounds(self.model)[str(name)] for name in table.index]
+        low, high = ([getattr(limit, end) for limit in limits] for end in ("low", "high"))
+        has_interval = np.isfinite(table["lower"].to_numpy(dtype=float))
+        ends = {}
+        for end, sign in (("lower", -1), ("upper", 1)):
+            edge = np.where(in_logs, value * np.exp(sign * relative), value + sign * half)
+            ends[end] = np.where(has_interval, np.clip(edge, low, high), np.nan)
+        return pd.DataFrame(ends, index=table.index)
 
     def residuals(self, part: str = "train") -> pd.DataFrame:
         """Measured minus simulated positions, m.
@@ -357,7 +365,7 @@ class Calibration:
         items = self._sequences(part)
         if not items:
             raise DataError("no sequence is held out; fit with heldout=0.2, for example")
-        paths = list(self._simulated(items))
+        paths = list(self.simulated(items))
         table, simulated_table = (
             Sequences(part_sequences).to_dataframe() for part_sequences in (items, paths)
         )
@@ -379,9 +387,10 @@ class Calibration:
     def _sequences(self, part: str) -> list[Sequence]:
         return [self.measured[i] for i in self._indices(part)]
 
-    def _simulated(self, items: list[Sequence]) -> Iterator[Sequence]:
+    def simulated(self, sequences: Iterable[Sequence]) -> Iterator[Sequence]:
+        """The sequences as the model simulates them from their first measured states."""
         dtype = next(self.model.parameters()).dtype
-        return simulated(lambda b: self.solver(self.model, b), items, size=_TOGETHER, dtype=dtype)
+        return simulated(lambda b: self.solver(self.model, b), sequences, dtype=dtype)
 
     def _started(self) -> str:
         """The remark on noisy first speeds; empty if the noise is small."""
@@ -426,11 +435,8 @@ class Calibration:
         if self.correlation is not None:
             table = self.correlation.loc[names, names].to_numpy(dtype=float)
             variables["correlation"] = (("parameter", "other"), table)  # type: ignore[assignment]
-        for key in (key for key in self.history if str(key).startswith("cost/")):
-            variables[str(key).replace("/", "_")] = (
-                "epoch",
-                self.history[key].to_numpy(dtype=float),
-            )
+        for key, costs in self.history.filter(regex="^cost/").items():
+            variables[str(key).replace("/", "_")] = ("epoch", costs.to_numpy(dtype=float))
         coords = {
             "parameter": names,
             "unit": ("parameter", self.parameters["unit"].to_list()),
@@ -536,7 +542,10 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         }
         checkpoint = replace(checkpoint, model=copied(dict(model.state_dict())))
         values = {name: float(value) for name, (value, _) in model.physical().items()}
-        costs = {part: _cost(trainer, model, part) for part in costs}
+        costs = {
+            part: _metrics(trainer, model, part).J if part == "train" or trainer.heldout else cost
+            for part, cost in costs.items()
+        }
         speeds = {k: v for k, v in speeds.items() if k not in ("change", "sequences")}
         speeds["kind"] = "fitted to each driver"
         status = "converged" if drivers.converged else "stopped"
@@ -544,18 +553,22 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         status = _status(trainer, model, store)
     if status == "stalled":
         log.warning("%s", STALLED)
-    interval_of = estimated.get("parameters", {})
+    intervals = estimated.get("parameters", {})
     rows = {
-        name: _row(values[name], unit, interval_of.get(name))
+        name: {
+            **_NO_INTERVAL,
+            **{key: v for key, v in intervals.get(name, {}).items() if v is not None},
+            "estimate": values[name],
+            "unit": unit,
+        }
         for name, (_, unit) in model.physical().items()
         if name in values
     }
-    columns = ["estimate", "lower", "upper", "unit", "at_bound", "identified"]
-    columns += ["std_error", "df", "scale"]
+    parameters = pd.DataFrame(rows.values(), index=list(rows), columns=_COLUMNS)
     correlation = estimated.get("correlation")
     return Calibration(
         model=model,
-        parameters=pd.DataFrame.from_dict(rows, orient="index", columns=columns),
+        parameters=parameters.rename(columns=_BOUND),
         correlation=None if correlation is None else pd.DataFrame.from_dict(correlation, "index"),
         clusters=estimated.get("clusters"),
         cost=costs["train"],
@@ -608,22 +621,22 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     drivers = trainer.options.drivers
     if drivers == NONE:
         return None
-    if drivers in (None, AUTO):
-        rmse = _metrics(trainer, trainer.model, "train").rmse
-        if rmse <= EXACT:
-            log.info(
-                "all drivers share their parameters, which explain the paths to %.2g m "
-                "(root mean square)",
-                rmse,
-            )
-            return None
+    if (
+        drivers in (None, AUTO)
+        and (rmse := _metrics(trainer, trainer.model, "train").rmse) <= EXACT
+    ):
+        log.info(
+            "all drivers share their parameters, which explain the paths to %.2g m "
+            "(root mean square)",
+            rmse,
+        )
+        return None
     indices = positions(store, trainer.provenance.split["train"])
     log.info("calibrating to %d sequences with drivers who differ", len(indices))
     seed = int(trainer.provenance.config["seed"])
     first = _logged_parameters(trainer.model, trainer.history[0])
-    drivers_fit, estimated = None, False
     try:
-        drivers_fit = calibrated_drivers(
+        fit = calibrated_drivers(
             copy.deepcopy(trainer.model).cpu(),
             first,
             [store[i] for i in indices],
@@ -631,17 +644,16 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
             clusters(store.index)[indices],
             seed,
         )
-        estimated = drivers_fit is None or drivers is not None or drivers_fit.converged
+        if fit is None or drivers is not None or fit.converged:
+            return fit
     except ConfigError:
         if drivers is not None:
             raise
-    if not estimated:
-        log.warning(
-            "how drivers differ could not be estimated: all share their parameters, whose "
-            "intervals do not contain that they differ"
-        )
-        return None
-    return drivers_fit
+    log.warning(
+        "how drivers differ could not be estimated: all share their parameters, whose "
+        "intervals do not contain that they differ"
+    )
+    return None
 
 
 def _metrics(trainer: Trainer, model: System, part: str) -> Metrics:
@@ -649,15 +661,8 @@ def _metrics(trainer: Trainer, model: System, part: str) -> Metrics:
     loader = trainer.train if part == "train" else trainer.heldout
     assert loader is not None
     data = cast(SequenceDataset, loader.dataset)
-    batches = stream(straight_loader(data.store, list(data.indices), _TOGETHER), trainer.dtype)
-    return evaluate(lambda b: trainer.solver(model, b), batches, trainer.options.cost)
-
-
-def _cost(trainer: Trainer, model: System, part: str) -> float:
-    """Mean cost of a sequence; NaN if none is held out."""
-    if part == "heldout" and trainer.heldout is None:
-        return float("nan")
-    return _metrics(trainer, model, part).J
+    sequences = batches(data.store, list(data.indices), _TOGETHER, trainer.dtype)
+    return evaluate(lambda b: trainer.solver(model, b), sequences, trainer.options.cost)
 
 
 def _status(trainer: Trainer, model: System, store: Source) -> str:
@@ -667,10 +672,8 @@ def _status(trainer: Trainer, model: System, store: Source) -> str:
     costs = [row["cost/train"] for row in trainer.history]
     if not isinstance(trainer.optimizer, torch.optim.LBFGS) or len(costs) < 2:
         return "stopped"
-    indices = [
-        i for i, e in enumerate(store.index) if e["name"] in trainer.provenance.split["train"]
-    ]
-    (batch,) = stream(straight_loader(store, indices, 0), trainer.dtype)
+    indices = positions(store, trainer.provenance.split["train"])
+    (batch,) = batches(store, indices, 0, trainer.dtype)
     model = copy.deepcopy(model).cpu()
     try:
         slope = sensitivity(model, trainer.solver, batch, trainer.options.cost)
@@ -707,7 +710,7 @@ def _by_tangents(
         start_speeds=options.start_speeds,
     )
     indices = positions(store, trainer.provenance.split["train"])
-    (batch,) = stream(straight_loader(store, indices, 0))
+    (batch,) = batches(store, indices, 0)
     double = copy.deepcopy(model).double()
     problem = make(double, batch)
     row = problem.vector.row.numpy()
@@ -726,34 +729,9 @@ def _by_tangents(
     return estimated, separate, speeds
 
 
-def _row(value: float, unit: str, interval: dict[str, Any] | None) -> tuple[Any, ...]:
-    """A row of the table of parameters."""
-    entry = {"at_bound": None, "identified": None, "scale": "linear", **(interval or {})}
-    low, high, error, df = (
-        float("nan") if entry.get(key) is None else entry[key]
-        for key in ("low", "high", "std_error", "df")
-    )
-    return (
-        value,
-        low,
-        high,
-        unit,
-        entry["at_bound"] or "",
-        entry["identified"],
-        error,
-        df,
-        entry["scale"],
-    )
-
-
-def _rows(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
+def _rows(table: pd.DataFrame) -> dict[str, Any]:
     """The rows of a table by name."""
-    columns = [str(name) for name in table]
-    values = zip(*(table[name].to_list() for name in table), strict=True)
-    return {
-        str(name): dict(zip(columns, row, strict=True))
-        for name, row in zip(table.index, values, strict=True)
-    }
+    return {str(name): row for name, row in table.to_dict("index").items()}
 
 
 def _remark(row: dict[str, Any]) -> str:

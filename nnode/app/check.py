@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 from omegaconf import DictConfig
 
-from nnode.app.cli.typed import changes, group_defaults, plain_options
+from nnode.app.cli.typed import changed_options, changes, group_defaults
 from nnode.data.check.examine import Examination, examine
 from nnode.data.clusters import index_of
 from nnode.data.identity import identify
-from nnode.data.limits import AGREE, INTERVAL, USUAL, Range
+from nnode.data.limits import AGREE, INTERVAL, USUAL
 from nnode.data.quality import Finding
 from nnode.data.readers.columns import floats, quoted
 from nnode.data.sequence import Domain, Sequence
@@ -64,7 +64,10 @@ class Check:
     def write(self, folder: str | Path) -> Path:
         """Write the page ``check.html`` with its tables, and return its path."""
         return write_page(
-            [*blocks(self.examination, self.options), _provenance()],
+            [
+                *blocks(self.examination, self.options),
+                Provenance(how_made(("numpy", "pandas", "scipy", "matplotlib"))),
+            ],
             Path(folder),
             title=f"Check of {self.examination.path.name}",
             subtitle=sentence(self.examination),
@@ -108,17 +111,14 @@ def check(config: DictConfig, folder: Path) -> None:
 def command(examination: Examination) -> list[str]:
     """The overrides, quoted for the shell, with which the commands read the file."""
     source = examination.source
-    values = plain_options(source.options)
     defaults = group_defaults("data", source.group, "prepare_data")
-    field_defaults = plain_options(type(source.options)())
     # options that were not recognised keep the group's values
-    changed_values = {k: v for k, v in values.items() if v != field_defaults[k] and k != "name"}
-    return [f"data={source.group}", *changes("data", changed_values, defaults)]
+    return [f"data={source.group}", *changes("data", changed_options(source.options), defaults)]
 
 
 def sentence(examination: Examination) -> str:
     """What there is, in a sentence."""
-    levels = [one.level for one in examination.findings]
+    levels = [finding.level for finding in examination.findings]
     errors, looks = levels.count("error"), levels.count("warning")
     wrong = f"{errors} error{'s' * (errors != 1)} and {looks} warning{'s' * (looks != 1)}"
     who = "people" if examination.scale.domain == "crowd" else "vehicles"
@@ -175,12 +175,10 @@ def _sound_sequences(examination: Examination) -> list[Sequence]:
 
 def _heldout(examination: Examination, sequences: list[Sequence]) -> bool:
     """Whether some of the sequences can be held out."""
+    if not sequences:
+        return True
     try:
-        return (
-            bool(split(index_of(sequences), examination.source.options.split).heldout)
-            if sequences
-            else True
-        )
+        return bool(split(index_of(sequences), examination.source.options.split).heldout)
     except NNodeError:
         return False
 
@@ -194,17 +192,11 @@ def python_lines(examination: Examination) -> list[str]:
     """Lines of Python that read the file with all recognised options and calibrate a model."""
     group, *_ = command(examination)
     holdout = "" if _heldout(examination, _sound_sequences(examination)) else ", heldout=0"
-    field_defaults = plain_options(type(examination.source.options)())
-    values = plain_options(examination.source.options)
-    changed_values = {
-        k: v for k, v in values.items() if v != field_defaults[k] and k not in ("name", "path")
-    }
-    path = values.get("path") or ""
+    options = changed_options(examination.source.options)
+    path = options.pop("path", "")
     arguments = [repr(path)] if path else []
-    arguments += [
-        f"data={group.partition('=')[2]!r}",
-        *(f"{k}={v!r}" for k, v in changed_values.items()),
-    ]
+    options = {"data": group.partition("=")[2], **options}
+    arguments += [f"{key}={value!r}" for key, value in options.items()]
     return [
         "import nnode",
         f"data = nnode.sequences({', '.join(arguments)})",
@@ -234,10 +226,8 @@ def blocks(examination: Examination, lines: list[str]) -> list[Block]:
 
 
 def _rows(findings: list[Finding]) -> pd.DataFrame:
-    rows = [
-        {"": finding.level, "what": finding.kind, "in words": finding.text} for finding in findings
-    ]
-    return pd.DataFrame(rows).set_index("")
+    rows = [(finding.level, finding.kind, finding.text) for finding in findings]
+    return pd.DataFrame(rows, columns=["", "what", "in words"]).set_index("")
 
 
 def _findings(findings: list[Finding]) -> list[Block]:
@@ -298,26 +288,31 @@ def _columns(examination: Examination) -> list[Block]:
 def _units_blocks(examination: Examination) -> list[Block]:
     scale, measured = examination.scale, examination.known
     ranges = USUAL[scale.domain]
-    values = {
-        "speed of moving agents (m/s)": (measured.speed * scale.metres / scale.seconds, "speed"),
-        "distance to the nearest agent (m)": (measured.nearest * scale.metres, "nearest"),
-        "length (m)": (measured.length * scale.metres, "length"),
-        "sway (1/s)": (measured.sway / scale.seconds, "sway"),
-        "sampling interval (s)": (measured.dt * scale.seconds, INTERVAL),
-        "speed from positions / speed in the file": (
+    values = [
+        (
+            "speed of moving agents (m/s)",
+            measured.speed * scale.metres / scale.seconds,
+            ranges.get("speed"),
+        ),
+        (
+            "distance to the nearest agent (m)",
+            measured.nearest * scale.metres,
+            ranges.get("nearest"),
+        ),
+        ("length (m)", measured.length * scale.metres, ranges.get("length")),
+        ("sway (1/s)", measured.sway / scale.seconds, ranges.get("sway")),
+        ("sampling interval (s)", measured.dt * scale.seconds, INTERVAL),
+        (
+            "speed from positions / speed in the file",
             measured.ratio * scale.metres / (scale.per_second * scale.seconds),
             AGREE,
         ),
+    ]
+    rows = {
+        name: {"here": value, "usual": f"{usual.low:g} to {usual.high:g}", "source": usual.source}
+        for name, value, usual in values
+        if np.isfinite(value) and usual is not None
     }
-    rows = {}
-    for name, (value, where) in values.items():
-        range_ = ranges.get(where) if isinstance(where, str) else where
-        if np.isfinite(value) and isinstance(range_, Range):
-            rows[name] = {
-                "here": value,
-                "usual": f"{range_.low:g} to {range_.high:g}",
-                "source": range_.source,
-            }
     blocks: list[Block] = [
         Heading("Units and time scale"),
         Text(f"Assumed: {_units(examination)} ({certainty(share(examination.scales))})."),
@@ -329,18 +324,13 @@ def _units_blocks(examination: Examination) -> list[Block]:
         ),
     ]
     if len(examination.scales) > 1:
+        columns = ["of", "positions", "times", "frames/s", "speeds", "probability"]
         table = pd.DataFrame(
             [
-                {
-                    "of": s.domain,
-                    "positions": s.position,
-                    "times": s.time,
-                    "frames/s": s.rate,
-                    "speeds": s.speed,
-                    "probability": s.probability,
-                }
+                (s.domain, s.position, s.time, s.rate, s.speed, s.probability)
                 for s in examination.scales
-            ]
+            ],
+            columns=columns,
         )
         blocks.append(
             TableBlock(
@@ -386,7 +376,3 @@ def _figures(examination: Examination) -> list[Block]:
             )
         )
     return shown
-
-
-def _provenance() -> Provenance:
-    return Provenance(how_made(("numpy", "pandas", "scipy", "matplotlib")))

@@ -44,6 +44,7 @@ from nnode.pages.page import (
     write_page,
 )
 from nnode.plots import force_figure, measured_gaps, speed_curves
+from nnode.plots.style import with_unit
 from nnode.simulation.base import DEFAULT_STEP
 
 #: Steps of Euler's scheme of the compared calibrations, s: the paper's, and ten times that.
@@ -97,12 +98,14 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
             *lacking,
             *absent,
             *crowd,
-            *_own_table(),
+            *_USER_TABLE,
             Provenance({**facts, "Seed of the data": f"{seed}", "Time": f"{seconds:.0f} s"}),
         ],
         folder,
         title="nnode: a missing effect, found in a table of platoons",
-        subtitle=_headline(report, nothing),
+        subtitle="One table of synthetic platoons contains a hidden slow zone, and the diagnosis "
+        f"names **{_names(report)}**. The second table contains none, and the diagnosis names "
+        f"**{_names(nothing)}**.",
         stem=PAGE,
     )
     _step("Results")
@@ -131,7 +134,8 @@ def _summary(report: Report, nothing: Report, truth: SlowZone) -> list[Block]:
     ]
     if report.effects:
         hidden = f"alpha = {truth.alpha:g}, a = {truth.a:g} m, b = {truth.b:g} m"
-        lines.insert(1, f"**Estimate:** {_named(report)}. **Hidden:** {hidden}.")
+        named = "; ".join(f"{effect.name}: {interval(effect)}" for effect in report.effects)
+        lines.insert(1, f"**Estimate:** {named}. **Hidden:** {hidden}.")
     figure = report.plot("map")
     for ax in figure.axes[: 1 + bool(report.effects)]:
         for place in (truth.a, truth.b):
@@ -156,17 +160,8 @@ def _summary(report: Report, nothing: Report, truth: SlowZone) -> list[Block]:
     ]
 
 
-def _headline(report: Report, nothing: Report) -> str:
-    names = ", ".join(effect.name for effect in report.effects) or "nothing"
-    other = ", ".join(effect.name for effect in nothing.effects) or "nothing"
-    return (
-        "One table of synthetic platoons contains a hidden slow zone, and the diagnosis names "
-        f"**{names}**. The second table contains none, and the diagnosis names **{other}**."
-    )
-
-
-def _named(report: Report) -> str:
-    return "; ".join(f"{effect.name}: {interval(effect)}" for effect in report.effects)
+def _names(report: Report) -> str:
+    return ", ".join(effect.name for effect in report.effects) or "nothing"
 
 
 # -- data and check --------------------------------------------------------------------------------
@@ -194,13 +189,13 @@ def _checked(path: Path, folder: Path) -> list[Block]:
     check = nnode.check(path)
     check.write(folder / "check")
     print(check)
-    rows = [{"level": one.level, "kind": one.kind, "finding": one.text} for one in check.findings]
+    rows = [(finding.level, finding.kind, finding.text) for finding in check.findings]
     return [
         Heading("Check"),
         Text(f"```sh\nnnode check {path}\n```"),
         TableBlock(
             "findings",
-            pd.DataFrame(rows),
+            pd.DataFrame(rows, columns=["level", "kind", "finding"]),
             "Findings of `nnode check`. The page `check/check.html` contains the details.",
         ),
     ]
@@ -279,9 +274,7 @@ def _with_truth(rows: dict[str, tuple[float, float, float, float]]) -> pd.DataFr
     table = pd.DataFrame(rows, index=["truth", "estimate", "lower", "upper"]).T
     inside = (table["lower"] <= table["truth"]) & (table["truth"] <= table["upper"])
     has_interval = table["lower"].notna() & table["upper"].notna()
-    table["covered"] = [
-        ("yes" if a else "no") if b else "–" for a, b in zip(inside, has_interval, strict=True)
-    ]
+    table["covered"] = np.where(has_interval, np.where(inside, "yes", "no"), "–")
     return table
 
 
@@ -354,29 +347,16 @@ def _lacking(report: Report, truth: SlowZone) -> list[Block]:
     zone = next((estimate for estimate in report.effects if estimate.name == "speed_zone"), None)
     coefficients = {} if zone is None else zone.coefficients
     rows = {
-        f"speed_zone.{name}"
-        + ("" if coefficients[name].unit == "1" else f" ({coefficients[name].unit})"): (
-            value,
-            coefficients[name].value,
-            coefficients[name].low,
-            coefficients[name].high,
-        )
-        for name, value in hidden.items()
-        if name in coefficients
+        with_unit(f"speed_zone.{name}", c.unit): (hidden[name], c.value, c.low, c.high)
+        for name, c in coefficients.items()
+        if name in hidden
     }
-    nan = float("nan")
-    rows |= {
-        f"{name} ({d.base[f'lin.{name}']['unit']})": (
-            value,
-            d.base[f"lin.{name}"]["after"],
-            nan,
-            nan,
-        )
-        for name, value in (("v0", truth.v0), ("L", truth.L))
-    }
-    for estimate in d.drivers:
-        if estimate.name == "v0":
-            values = estimate.estimate, estimate.lower, estimate.upper
+    for name, value in (("v0", truth.v0), ("L", truth.L)):
+        entry = d.base[f"lin.{name}"]
+        rows[with_unit(name, entry["unit"])] = (value, entry["after"], np.nan, np.nan)
+    for row in d.drivers:
+        if row.name == "v0":
+            values = row.estimate, row.lower, row.upper
             rows["v0 between drivers (%)"] = (100 * truth.drivers, *values)
     table = _with_truth(rows)
     print(table.to_string())
@@ -466,12 +446,8 @@ def _missed(report: Report) -> str:
 
 def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
     register()
-    words = [
-        "experiment=demo_crowd",
-        f"data.source={path.parents[1].absolute()}",
-        f"trainer.max_epochs={epochs}",
-    ]
-    config = composed("train", words)
+    source, options = path.parents[1], ["experiment=demo_crowd", f"trainer.max_epochs={epochs}"]
+    config = composed("train", [*options, f"data.source={source.absolute()}"])
     with open_dict(config):
         groups = config.pop("hydra").runtime.choices
         config.groups = {name: groups[name] for name in GROUPS}
@@ -480,7 +456,7 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
     checkpoint = folder / "checkpoints" / "best.pt"
     model, store, forces = nnode.load(checkpoint), Store(folder / "data"), Forces()
     reach = 2 * forces.r + forces.B * np.log(forces.A / _WEAK)
-    command = f"nnode train experiment=demo_crowd data.source={path.parents[1]}"
+    command = f"nnode train experiment=demo_crowd data.source={source}"
     return [
         Heading("Forces in a crowd"),
         Text(
@@ -504,17 +480,16 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
     ]
 
 
-def _own_table() -> list[Block]:
-    return [
-        Heading("Your own table"),
-        Text(
-            "A CSV file with a row per car and sample is sufficient. Columns and units are "
-            "recognised.\n\n"
-            "```sh\nnnode check mine.csv\n```\n\n"
-            "```python\nimport nnode\n\nreport = nnode.diagnose('mine.csv', model='idm', "
-            "folder='runs/mine')\nprint(report.summary())\n```"
-        ),
-    ]
+_USER_TABLE: list[Block] = [
+    Heading("Your own table"),
+    Text(
+        "A CSV file with a row per car and sample is sufficient. Columns and units are "
+        "recognised.\n\n"
+        "```sh\nnnode check mine.csv\n```\n\n"
+        "```python\nimport nnode\n\nreport = nnode.diagnose('mine.csv', model='idm', "
+        "folder='runs/mine')\nprint(report.summary())\n```"
+    ),
+]
 
 
 if __name__ == "__main__":

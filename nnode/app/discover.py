@@ -87,28 +87,21 @@ def discover(config: DictConfig, folder: Path) -> None:
         Interrupted: a signal stopped the diagnosis.
     """
     start = time.monotonic()
-    with BreakingGuard() as guard:
-        try:
-            config = with_prepared(config)
-            plain = plain_config(config)
-            options: DiscoverOptions = options_of(config.discover)
-            data: DataOptions = options_of(config.data)
-            read = partial(read_inputs, data, folder / "data")
-            job = _job(plain["model"], data, plain["data"], plain["groups"], options, read)
-            diagnoses = diagnosed(job, Stages)
-            with Stages("drawing", {"drawing": 5.0}) as stages:
-                stages.begin("drawing")
-                written = [
-                    _drawn(diagnosed_job, outcome, place)
-                    for diagnosed_job, outcome, place in _places(diagnoses, folder)
-                ]
-        except KeyboardInterrupt:
-            number = guard.requested or signal.SIGINT
-            raise Interrupted(
-                f"stopped by {signal.Signals(number).name}: the diagnosis was not finished and "
-                f"nothing of it is written to {folder}; the same command starts it again",
-                number,
-            ) from None
+    left = (
+        f": the diagnosis was not finished and nothing of it is written to {folder}; the same "
+        "command starts it again"
+    )
+    with BreakingGuard(left):
+        config = with_prepared(config)
+        plain = plain_config(config)
+        options: DiscoverOptions = options_of(config.discover)
+        data: DataOptions = options_of(config.data)
+        read = partial(read_inputs, data, folder / "data")
+        job = _job(plain["model"], data, plain["data"], plain["groups"], options, read)
+        diagnoses = diagnosed(job, Stages)
+        with Stages("drawing", {"drawing": 5.0}) as stages:
+            stages.begin("drawing")
+            written = [_drawn(*result) for result in _places(diagnoses, folder)]
     with InterruptGuard() as guard:
         paths = [write() for write in reversed(written)][::-1]
     _print(diagnoses[0][1], paths[0], time.monotonic() - start)
@@ -120,6 +113,7 @@ def discover(config: DictConfig, folder: Path) -> None:
         raise Interrupted(f"stopped by {name} when all was written", guard.requested)
 
 
+@python_words()
 def diagnose_table(
     data: Table | Sequences,
     domain: str | None = None,
@@ -152,33 +146,9 @@ def diagnose_table(
     Raises:
         NNodeError: see :func:`discover`.
     """
-    with python_words():
-        return _diagnosed_table(
-            data,
-            domain,
-            model,
-            walls,
-            leader,
-            None if folder is None else Path(folder),
-            seed,
-            options,
-            reading,
-        )
-
-
-def _diagnosed_table(
-    data: Table | Sequences,
-    domain: str | None,
-    model: str | Mapping[str, Any],
-    walls: str | Path | None,
-    leader: str,
-    place: Path | None,
-    seed: int,
-    options: DiscoverOptions | None,
-    reading: Mapping[str, Any],
-) -> Report:
     plain_model = model_options(model, leader)
-    chosen = DiscoverOptions(**{**vars(options or DiscoverOptions()), "seed": seed})
+    chosen = replace(options or DiscoverOptions(), seed=seed)
+    place = None if folder is None else Path(folder)
     source: Any = data
     if isinstance(data, Sequences):
         refuse_reading(None, {"walls": walls, **reading})
@@ -193,8 +163,8 @@ def _diagnosed_table(
     job = _job(plain_model, data_options, plain_options(data_options), groups, chosen, read)
     diagnoses = diagnosed(job, unwatched)
     if place is not None:
-        for diagnosed_job, outcome, folder in reversed(_places(diagnoses, place)):
-            _drawn(diagnosed_job, outcome, folder)()
+        for result in reversed(_places(diagnoses, place)):
+            _drawn(*result)()
     first, *others = [
         Report(
             diagnosis=outcome.diagnosis,

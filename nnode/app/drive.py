@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
+from nnode.app.cli.saved import options_of
 from nnode.app.export import checkpoint_of
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.data.store import MANIFEST, Store
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.exchange.drive import Drive, drive
 from nnode.exchange.drivers import drivable
 from nnode.exchange.running_sumo import Steps
@@ -76,7 +76,7 @@ def drive_run(
     place = Path(mkdtemp(prefix="nnode-drive-")) if folder is None else Path(folder)
     run_steps = steps_of(checkpoint, model)
     if steps not in STEPS:
-        raise ConfigError(f"steps={steps} is unknown, expected {', '.join(STEPS)}")
+        raise unknown_value("steps", steps, STEPS)
     if steps == "run" and run_steps.method not in _PLACED[order]:
         raise ConfigError(
             f"steps=run: the run was calibrated with {run_steps}, SUMO can make "
@@ -110,10 +110,7 @@ def drive_run(
 
 def drive_scenario(config: DictConfig, folder: Path) -> None:
     """The command: run :func:`drive_run`, and print the result."""
-    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    assert isinstance(plain, dict)
-    asked: dict[str, Any] = {str(key): value for key, value in plain.items()}
-    result = drive_run(asked.pop("run"), folder=folder, **asked)
+    result = drive_run(folder=folder, **vars(options_of(config)))
     speed = "nobody drove" if result.mean_speed is None else f"mean {result.mean_speed:.2f} m/s"
     print(
         f"driven: {result.driven} vehicles, {speed}; {result.seconds:g} s in {result.steps} "

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from nnode.calibrate.options import Pooling, TrainerOptions
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.model import System
 from nnode.model.term import Term, short_names
 from nnode.plots.traffic import driver_figure
@@ -65,12 +65,7 @@ def planned(
         training = sequences()
         possible = obstacle(model, training) is None and drivers_differ(model, training)
         return None if possible else NONE
-    if given != AUTO and not _names(given):
-        raise ConfigError(
-            f"trainer.drivers={given} is unknown, expected auto, none, or a list of parameters of "
-            "the law such as [T, v0]"
-        )
-    asked = f"trainer.drivers={_words(given)}"
+    asked = f"trainer.drivers={given if given == AUTO else '[' + ', '.join(given) + ']'}"
     if options.pooling is not Pooling.pooled:
         raise ConfigError(
             f"{asked} and trainer.pooling={options.pooling.value} both give drivers parameters of "
@@ -86,14 +81,18 @@ def planned(
     return list(given)
 
 
-def _names(given: Any) -> bool:
-    """Whether an option is a list of words."""
-    listed = isinstance(given, ListLike) and not isinstance(given, str)
-    return bool(listed and len(given) and all(isinstance(name, str) for name in given))
+def check_drivers(given: Any) -> None:
+    """Refuse a value of ``trainer.drivers`` that is neither a choice nor a list of names.
 
-
-def _words(given: Any) -> str:
-    return f"[{', '.join(given)}]" if _names(given) else str(given)
+    Raises:
+        ConfigError: another value.
+    """
+    listed = isinstance(given, ListLike) and not isinstance(given, str) and len(given) > 0
+    if given not in (None, AUTO, NONE) and not (
+        listed and all(isinstance(name, str) for name in given)
+    ):
+        hint = ", or a list of parameters of the law such as [T, v0]"
+        raise unknown_value("trainer.drivers", given, (AUTO, NONE), hint)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,14 +142,15 @@ class Drivers:
 
     def summary(self) -> list[str]:
         """Lines on differences between drivers and on disturbances."""
-        rows = self.variability.iterrows()
-        estimates = {str(name): row for name, row in rows}
-        texts = {name: _estimate(row) for name, row in estimates.items()}
-        differ = [f"{name} by {texts[name]}" for name in self.differ]
-        listed = ", ".join(differ) if differ else "none that the data tell"
+        texts = {}
+        for name, row in self.variability.iterrows():
+            texts[name] = f"{row['estimate']:.3g} {row['unit']}"
+            if np.isfinite(row["lower"]):
+                texts[name] += f" [{row['lower']:.3g}, {row['upper']:.3g}]"
+        differ = ", ".join(f"{name} by {texts[name]}" for name in self.differ)
         return [
             f"{len(self.table)} drivers; parameters that differ between them (standard deviation): "
-            f"{listed}; the parameters of the table are the medians",
+            f"{differ or 'none that the data tell'}; the parameters of the table are the medians",
             f"pushes of {texts['push']} that last {texts['push_time']}; errors of measurement of "
             f"{texts['measurement']}",
         ]
@@ -165,11 +165,6 @@ class Drivers:
             "converged": self.converged,
             "table": self.table.to_dict("records"),
         }
-
-
-def _estimate(row: pd.Series) -> str:
-    ends = f" [{row['lower']:.3g}, {row['upper']:.3g}]" if np.isfinite(row["lower"]) else ""
-    return f"{row['estimate']:.3g} {row['unit']}{ends}"
 
 
 def calibrated_drivers(
@@ -240,10 +235,10 @@ def calibrated_drivers(
         table=_table(population, sequences),
         converged=population.estimate.converged,
         bias={
-            short[name]: float(np.expm1(bias) if in_logs else bias)
-            for name, bias, in_logs in zip(
-                followers.names, population.bias, followers.logs, strict=True
+            short[name]: float(
+                np.expm1(population.bias[i]) if followers.logs[i] else population.bias[i]
             )
+            for i, name in enumerate(followers.names)
         },
         observations=int(population.estimate.data.observed.sum()),
         variances=int((variances.low < variances.high).sum()),
@@ -279,27 +274,24 @@ def _intervals(
     parameters: dict[str, Any] = {}
     for i, name in enumerate(model.names):
         has_interval = bool(np.isfinite(half[i]))
+        interval = {
+            "low": float(ends[0][i]),
+            "high": float(ends[1][i]),
+            "std_error": float(error[i] * (value[i] if model.logs[i] else 1.0)),
+            "df": float(degrees[i]),
+        }
+        identified = has_interval and bool(ends[1][i] - ends[0][i] < scale[i])
         parameters[name] = {
-            "low": float(ends[0][i]) if has_interval else None,
-            "high": float(ends[1][i]) if has_interval else None,
-            "std_error": float(error[i] * (value[i] if model.logs[i] else 1.0))
-            if has_interval
-            else None,
-            "df": float(degrees[i]) if has_interval else None,
+            **(interval if has_interval else dict.fromkeys(interval)),
             "scale": "log" if model.logs[i] else "linear",
             "at_bound": "low" if low[i] else "high" if high[i] else None,
-            "identified": has_interval and bool(ends[1][i] - ends[0][i] < scale[i])
-            if number > 1
-            else None,
+            "identified": identified if number > 1 else None,
         }
     table = np.full((len(theta), len(theta)), np.nan)
     if number > 1:
         table[np.ix_(free, free)] = cluster_influence.correlation()
-    correlation = {
-        name: dict(zip(model.names, map(float, line), strict=True))
-        for name, line in zip(model.names, table, strict=True)
-    }
-    return parameters, correlation, number
+    correlation = pd.DataFrame(table, model.names, model.names).to_dict("index")
+    return parameters, cast(dict[str, dict[str, float]], correlation), number
 
 
 def _table(population: Population, sequences: list[Sequence]) -> pd.DataFrame:

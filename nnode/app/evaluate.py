@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +15,11 @@ from rich.table import Table
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import merge_saved, options_of
 from nnode.app.training import (
+    batches,
     build_solver,
     set_threads,
     source_hashes,
     started,
-    straight_loader,
-    stream,
 )
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.calibrate.cost import Convention
@@ -28,9 +29,14 @@ from nnode.calibrate.options import Device, SolverOptions
 from nnode.data.dataset import Source
 from nnode.data.options import DataOptions
 from nnode.data.prepare import NOT_PREPARATION, open_data
-from nnode.errors import ConfigError
+from nnode.data.sequence import Batch
+from nnode.data.store import Store
+from nnode.errors import ConfigError, unknown_value
 from nnode.files import write_json
+from nnode.model import System
 from nnode.progress import Stages
+from nnode.simulation import Solver
+from nnode.simulation.base import Trajectory
 
 PARTS = ("auto", "heldout", "train", "unseen", "all")
 
@@ -50,24 +56,22 @@ def choose(store: Source, checkpoint: Checkpoint, part: str) -> tuple[str, list[
         ConfigError: an unknown part, or a part without sequences.
     """
     if part not in PARTS:
-        raise ConfigError(f"part={part} is unknown, expected one of {', '.join(PARTS)}")
+        raise unknown_value("part", part, PARTS)
     before = set(source_hashes(checkpoint.manifest).values())
     shared = bool(before & set(source_hashes(store.manifest).values()))
     comparable = not shared or _cut_alike(store.manifest, checkpoint.manifest)
-    parts = {
-        name: set(checkpoint.split.get(name, [])) if shared and comparable else set()
-        for name in ("heldout", "train", "dropped")
-    }
+    saved = checkpoint.split if shared and comparable else {}
     names = [entry["name"] for entry in store.index]
+    train, dropped = (set(saved.get(key, [])) for key in ("train", "dropped"))
+    members = {
+        "heldout": saved.get("heldout", []),
+        "train": train,
+        "unseen": set(names) - train - dropped if comparable else (),
+        "all": names,
+    }
     indices = {
-        "heldout": [i for i, name in enumerate(names) if name in parts["heldout"]],
-        "train": [i for i, name in enumerate(names) if name in parts["train"]],
-        "unseen": [
-            i
-            for i, n in enumerate(names)
-            if comparable and n not in parts["train"] | parts["dropped"]
-        ],
-        "all": list(range(len(store))),
+        key: [i for i, name in enumerate(names) if name in chosen]
+        for key, chosen in members.items()
     }
     if part == "auto":
         part = next(name for name in ("heldout", "unseen", "all") if indices[name])
@@ -89,6 +93,77 @@ def _cut_alike(*manifests: dict[str, Any]) -> bool:
     return all(first[key] == second[key] for key in first.keys() & second.keys() - {*ignored})
 
 
+@dataclass(frozen=True)
+class SavedRun:
+    """A checkpoint's model, and sequences that it can be evaluated on.
+
+    Attributes:
+        checkpoint: the checkpoint.
+        data: options of the data.
+        store: all sequences.
+        part, indices, trained: the chosen sequences, see :func:`choose`.
+        model: the model, on the device.
+        solver: the solver.
+        device: the device.
+    """
+
+    checkpoint: Checkpoint
+    data: DataOptions
+    store: Store
+    part: str
+    indices: list[int]
+    trained: int | None
+    model: System
+    solver: Solver
+    device: torch.device
+
+    @classmethod
+    def of(cls, checkpoint: Checkpoint, config: DictConfig, folder: Path) -> SavedRun:
+        """Read the data of a command whose defaults are those of the checkpoint.
+
+        Args:
+            config: the command's configuration, with ``data``, ``solver``, ``part`` and ``device``.
+            folder: folder of the command's results.
+
+        Raises:
+            NNodeError: the data do not exist, or have no sequences of the part.
+        """
+        config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
+        data: DataOptions = options_of(config.data)
+        solver_options: SolverOptions = options_of(config.solver)
+        set_threads(checkpoint.config["trainer"]["threads"], data.domain)
+        store = open_data(data, folder / "data")
+        device = World().use(Device(config.device), "device")
+        solver = build_solver(solver_options, device)
+        chosen = choose(store, checkpoint, config.part)
+        return cls(checkpoint, data, store, *chosen, checkpoint.build().to(device), solver, device)
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+        return str(self.checkpoint.config["model"]["name"])
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating-point type of the training."""
+        dtype: torch.dtype = getattr(torch, self.checkpoint.config["trainer"]["dtype"])
+        return dtype
+
+    @property
+    def convention(self) -> Convention:
+        """The cost of the training."""
+        return Convention(self.checkpoint.config["trainer"]["cost"])
+
+    def simulate(self, batch: Batch) -> Trajectory:
+        """Simulate a batch by the model."""
+        return self.solver(self.model, batch)
+
+    def batches(self, store: Source) -> Iterator[Batch]:
+        """The chosen sequences of a store, in batches on the device."""
+        size = self.data.loader.batch_size
+        return batches(store, self.indices, size, self.dtype, self.device)
+
+
 def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     """Write ``metrics.json`` and ``replay.html``, and print errors of the model and baselines.
 
@@ -98,64 +173,48 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
         NNodeError: the checkpoint or the data do not exist, or the data have another domain.
     """
     checkpoint = load_checkpoint(config.checkpoint)
-    config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
-    data: DataOptions = options_of(config.data)
-    solver_options: SolverOptions = options_of(config.solver)
-    set_threads(checkpoint.config["trainer"]["threads"], data.domain)
-    store = open_data(data, folder / "data")
-    part, indices, trained = choose(store, checkpoint, config.part)
-    if trained is None:
+    run = SavedRun.of(checkpoint, config, folder)
+    if run.trained is None:
         print("these files were cut into sequences in another way than in training: some of what")
         print("is evaluated may have been trained on")
-    elif trained and part != "train":
-        print(f"{trained} of the {len(indices)} sequences were trained on")
-    device = World().use(Device(config.device), "device")
-    source = started(checkpoint, store)
-    model, solver = checkpoint.build().to(device), build_solver(solver_options, device)
-    dtype = getattr(torch, checkpoint.config["trainer"]["dtype"])
-    convention = Convention(checkpoint.config["trainer"]["cost"])
+    elif run.trained and run.part != "train":
+        print(f"{run.trained} of the {len(run.indices)} sequences were trained on")
+    source = started(checkpoint, run.store)
+    others = baselines(run.model, run.solver, checkpoint.free_speed)
 
-    def measure(simulate: Simulate) -> Metrics:
-        size = data.loader.batch_size
-        batches = stream(straight_loader(source, indices, size), dtype, device)
-        return evaluate(simulate, batches, convention)
+    def measured(title: str, simulate: Simulate) -> Metrics:
+        stages.begin(title)
+        return evaluate(simulate, run.batches(source), run.convention)
 
-    name = checkpoint.config["model"]["name"]
-    baselines_of = baselines(model, solver, checkpoint.free_speed)
-    shares = {name: 1.0, **{f"baseline {key}": 0.5 for key in baselines_of}}
+    shares = {run.name: 1.0, **{f"baseline {key}": 0.5 for key in others}}
     with Stages("evaluating", shares) as stages:
-        stages.begin(name)
-        metrics = measure(lambda batch: solver(model, batch))
-        baseline_metrics = {}
-        for key, simulate in baselines_of.items():
-            stages.begin(f"baseline {key}")
-            baseline_metrics[key] = measure(simulate)
+        metrics = measured(run.name, run.simulate)
+        errors = {key: measured(f"baseline {key}", other) for key, other in others.items()}
     write_json(
         folder / "metrics.json",
         {
             **metrics.plain(),
-            "model": name,
-            "data": data.name,
-            "part": part,
-            "trained_on": trained,
-            "unit": convention.unit,
+            "model": run.name,
+            "data": run.data.name,
+            "part": run.part,
+            "trained_on": run.trained,
+            "unit": run.convention.unit,
             # the usual name in car following
             **({"spacing_rmse": metrics.objectives["spacing"]} if metrics.objectives else {}),
-            "parameters": {k: float(v) for k, (v, _) in model.physical().items()},
+            "parameters": {k: float(v) for k, (v, _) in run.model.physical().items()},
             "free_speed": checkpoint.free_speed,
-            "baselines": {key: metrics.plain() for key, metrics in baseline_metrics.items()},
+            "baselines": {key: error.plain() for key, error in errors.items()},
         },
     )
     _print(
-        {name: metrics, **baseline_metrics},
-        f"{data.name}, {part}: {metrics.sequences} sequences",
-        convention,
+        {run.name: metrics, **errors},
+        f"{run.data.name}, {run.part}: {metrics.sequences} sequences",
+        run.convention,
     )
-    if data.domain == "traffic":
+    if run.data.domain == "traffic":
         from nnode.app.followers import follower_errors, write_followers  # loads Matplotlib
 
-        batches = stream(straight_loader(source, indices, data.loader.batch_size), dtype, device)
-        rows = follower_errors(lambda batch: solver(model, batch), batches, store.index)
+        rows = follower_errors(run.simulate, run.batches(source), run.store.index)
         if len(rows):
             write_followers(rows, folder)
     print(f"metrics: {folder / 'metrics.json'}")
@@ -166,13 +225,13 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
             stages.begin("drawing")
             path = write_replay(
                 folder / "replay.html",
-                store,
-                indices,
-                lambda batch: solver(model, batch),
-                model,
-                name,
-                dtype=dtype,
-                device=device,
+                run.store,
+                run.indices,
+                run.simulate,
+                run.model,
+                run.name,
+                dtype=run.dtype,
+                device=run.device,
             )
         print(f"replay: {path}")
 

@@ -10,24 +10,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig
 
-from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.runs import RESULT
-from nnode.app.cli.saved import merge_saved, options_of, path_given, saved_groups
-from nnode.app.evaluate import choose
-from nnode.app.training import build_solver, set_threads, straight_loader, stream
-from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
-from nnode.calibrate.cost import Convention
-from nnode.calibrate.distributed import World
-from nnode.calibrate.evaluate import Simulate, evaluate
-from nnode.calibrate.options import Device, SolverOptions
-from nnode.data.dataset import SequenceDataset
-from nnode.data.options import DataOptions
-from nnode.data.prepare import open_data
+from nnode.app.cli.saved import path_given, saved_groups
+from nnode.app.evaluate import SavedRun
+from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.exchange.counterpart import Counterpart, Intervals
 from nnode.exchange.jupedsim import has_parameters, jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import has_type, sumo_type, traffic_of
@@ -41,9 +32,6 @@ from nnode.exchange.trajectories import (
 )
 from nnode.files import write_json, write_text
 from nnode.model import System
-
-#: Targets, in the order of writing.
-TARGETS = ("jupedsim", "sumo", "pedpy", "fcd", "parquet", "csv")
 
 #: Value of ``trajectories=`` to the sets of trajectories.
 SOURCES = {
@@ -79,31 +67,22 @@ def groups_of_run(overrides: list[str], groups: tuple[str, ...] = ("data", "solv
     return saved_groups([*overrides, *checkpoint], "checkpoint", groups)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Export:
     """Arguments of all writers."""
 
+    run: SavedRun
     folder: Path
-    checkpoint: Checkpoint
-    model: System
-    simulate: Simulate
-    sequences: SequenceDataset
-    device: torch.device
     sources: tuple[str, ...]
-    batch_size: int
     intervals: Intervals
 
-    @property
-    def dtype(self) -> torch.dtype:
-        dtype: torch.dtype = getattr(torch, self.checkpoint.config["trainer"]["dtype"])
-        return dtype
-
     def trajectories(self, source: str) -> Iterator[Sequence]:
-        measured = (self.sequences[i] for i in range(len(self.sequences)))
+        run = self.run
+        measured = (run.store[i] for i in run.indices)
         if source == "measured":
             return measured
-        size = self.batch_size or len(self.sequences)
-        return simulated(self.simulate, measured, size=size, dtype=self.dtype, device=self.device)
+        size = run.data.loader.batch_size or len(run.indices)
+        return simulated(run.simulate, measured, size=size, dtype=run.dtype, device=run.device)
 
 
 def export(config: DictConfig, folder: Path) -> None:
@@ -114,33 +93,14 @@ def export(config: DictConfig, folder: Path) -> None:
             model.
     """
     checkpoint = load_checkpoint(checkpoint_of(config.run))
-    config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
-    model = checkpoint.build()
-    targets = targets_of(config.to, model)
+    targets = targets_of(config.to, checkpoint.build())
     if config.trajectories not in SOURCES:
-        raise ConfigError(
-            f"trajectories={config.trajectories} is unknown, expected {', '.join(SOURCES)}"
-        )
-    data: DataOptions = options_of(config.data)
-    solver_options: SolverOptions = options_of(config.solver)
-    set_threads(checkpoint.config["trainer"]["threads"], data.domain)
-    store = open_data(data, folder / "data")
-    part, indices, _ = choose(store, checkpoint, config.part)
-    device = World().use(Device(config.device), "device")
-    model, solver = model.to(device), build_solver(solver_options, device)
-    model.scene(next(stream(straight_loader(store, indices[:1], 1))))  # checks the domain
-    job = _Export(
-        folder=folder,
-        checkpoint=checkpoint,
-        model=model,
-        simulate=lambda batch: solver(model, batch),
-        sequences=SequenceDataset(store, indices),
-        device=device,
-        sources=SOURCES[config.trajectories],
-        batch_size=data.loader.batch_size,
-        intervals=intervals_of(config.run),
-    )
-    print(f"{data.name}, {part}: {len(indices)} sequences, model {_label(checkpoint)}")
+        raise unknown_value("trajectories", config.trajectories, SOURCES)
+    run = SavedRun.of(checkpoint, config, folder)
+    run.model.scene(next(run.batches(run.store)))  # checks the domain
+    job = _Export(run, folder, SOURCES[config.trajectories], intervals_of(config.run))
+    number = len(run.indices)
+    print(f"{run.data.name}, {run.part}: {number} sequences, model {run.name}")
     written: dict[str, Any] = {}
     for target in targets:
         files, counterpart = WRITERS[target](job)
@@ -150,14 +110,13 @@ def export(config: DictConfig, folder: Path) -> None:
             "no_counterpart": counterpart.missing,
         }
         place = files[0] if len(files) == 1 else os.path.commonpath(files)
-        number = "" if len(files) == 1 else f" ({len(files)} files)"
-        print(f"{target}: {place}{number}")
-        for line in counterpart.notes:
+        print(f"{target}: {place}" + (f" ({len(files)} files)" if len(files) > 1 else ""))
+        for line in counterpart.lines:
             print(f"  {line}")
-        for line in counterpart.missing:
-            print(f"  no counterpart: {line}")
-    account = {"run": str(config.run), "part": part, "sequences": len(indices), "written": written}
-    write_json(folder / "export.json", account)
+    write_json(
+        folder / "export.json",
+        {"run": str(config.run), "part": run.part, "sequences": number, "written": written},
+    )
     print(f"account: {folder / 'export.json'}")
 
 
@@ -178,7 +137,7 @@ def targets_of(asked: Any, model: System) -> list[str]:
     names = [asked] if isinstance(asked, str) else list(asked or [])
     for name in names:
         if name not in TARGETS:
-            raise ConfigError(f"to={name} is unknown, expected auto or any of {', '.join(TARGETS)}")
+            raise unknown_value("to", name, ("auto", *TARGETS))
         if name in FORMATS:
             check_format("to", name, model.domain)
     if not names:
@@ -186,22 +145,18 @@ def targets_of(asked: Any, model: System) -> list[str]:
     return [name for name in TARGETS if name in names]
 
 
-def _label(checkpoint: Checkpoint) -> str:
-    return str(checkpoint.config["model"]["name"])
-
-
 _Written = tuple[list[Path], Counterpart]
 
 
 def _jupedsim(job: _Export) -> _Written:
-    scenes = scenes_of(job.trajectories("measured"), job.model.wall_spacing)
-    counterpart = jupedsim_parameters(job.model, scenes, job.intervals)
+    scenes = scenes_of(job.trajectories("measured"), job.run.model.wall_spacing)
+    counterpart = jupedsim_parameters(job.run.model, scenes, job.intervals)
     return [write_text(job.folder / "jupedsim.json", counterpart.text + "\n")], counterpart
 
 
 def _sumo(job: _Export) -> _Written:
     speed, length = traffic_of(job.trajectories("measured"))
-    counterpart = sumo_type(job.model, _label(job.checkpoint), speed, length, job.intervals)
+    counterpart = sumo_type(job.run.model, job.run.name, speed, length, job.intervals)
     return [write_text(job.folder / "vtype.add.xml", counterpart.text)], counterpart
 
 
@@ -209,7 +164,7 @@ def _paths(name: str, job: _Export) -> _Written:
     files: list[Path] = []
     for source in job.sources:
         paths = job.trajectories(source)
-        files += write_trajectories(job.folder, source, name, paths, job.model.dim)
+        files += write_trajectories(job.folder, source, name, paths, job.run.model.dim)
     return files, Counterpart()
 
 
@@ -223,12 +178,10 @@ def _parquet(job: _Export) -> _Written:
 
 
 def _csv(job: _Export) -> _Written:
-    convention = Convention(job.checkpoint.config["trainer"]["cost"])
-    loader = straight_loader(job.sequences.store, list(job.sequences.indices), job.batch_size)
-    metrics = evaluate(job.simulate, stream(loader, job.dtype, job.device), convention)
-    unit = convention.unit
-    folder = job.folder / "csv"
-    return write_results(folder, job.checkpoint, job.model, metrics, unit), Counterpart()
+    run = job.run
+    metrics = evaluate(run.simulate, run.batches(run.store), run.convention)
+    folder, unit = job.folder / "csv", run.convention.unit
+    return write_results(folder, run.checkpoint, run.model, metrics, unit), Counterpart()
 
 
 WRITERS: dict[str, Callable[[_Export], _Written]] = {
@@ -239,3 +192,5 @@ WRITERS: dict[str, Callable[[_Export], _Written]] = {
     "parquet": _parquet,
     "csv": _csv,
 }
+#: Targets, in the order of writing.
+TARGETS = tuple(WRITERS)

@@ -16,7 +16,7 @@ from nnode.calibrate.evaluate import Simulate
 from nnode.data.clusters import Index
 from nnode.data.sequence import Batch
 from nnode.errors import printable
-from nnode.files import csv_text, write_text
+from nnode.files import write_csv
 from nnode.plots import traffic
 from nnode.plots.style import save
 
@@ -54,14 +54,10 @@ def follower_errors(simulate: Simulate, batches: Iterable[Batch], index: Index) 
     for batch in batches:
         trajectory = simulate(batch)
         error = (trajectory.x - batch.x)[..., 0]
-        speed = (
-            trajectory.v[..., 0]
-            if trajectory.v is not None
-            else _slopes(trajectory.x[..., 0], batch.dt)
-        )
-        measured = (
-            batch.v[..., 0] if trajectory.v is not None else _slopes(batch.x[..., 0], batch.dt)
-        )
+        if trajectory.v is None:
+            speed, measured = (_slopes(x[..., 0], batch.dt) for x in (trajectory.x, batch.x))
+        else:
+            speed, measured = trajectory.v[..., 0], batch.v[..., 0]
         speed_error = speed - measured
         for b, name in enumerate(batch.names):
             entry = entries[name]
@@ -93,23 +89,13 @@ def _slopes(x: torch.Tensor, dt: float) -> torch.Tensor:
 
 def by_driver(rows: pd.DataFrame) -> pd.DataFrame:
     """One row per driver, pooled over all samples of the driver's sequences."""
-    weight = rows["samples"]
-    sums = (
-        pd.DataFrame(
-            {
-                **{key: rows[key] for key in ("recording", "driver", "samples", "final_error")},
-                "sequences": 1,
-                **{key: rows[key] ** 2 * weight for key in ("spacing_rmse", "speed_rmse")},
-                **{key: rows[key] * weight for key in ("spacing_bias", "speed_bias")},
-            }
-        )
-        .groupby(["recording", "driver"], sort=False)
-        .sum()
-    )
-    for key in ("spacing_rmse", "speed_rmse"):
-        sums[key] = np.sqrt(sums[key] / sums["samples"])
-    for key in ("spacing_bias", "speed_bias"):
-        sums[key] /= sums["samples"]
+    squares, biases = ["spacing_rmse", "speed_rmse"], ["spacing_bias", "speed_bias"]
+    pooled = rows[["recording", "driver", "samples", "final_error"]].assign(sequences=1)
+    pooled[squares] = (rows[squares] ** 2).mul(rows["samples"], axis=0)
+    pooled[biases] = rows[biases].mul(rows["samples"], axis=0)
+    sums = pooled.groupby(["recording", "driver"], sort=False).sum()
+    sums[squares] = np.sqrt(sums[squares].div(sums["samples"], axis=0))
+    sums[biases] = sums[biases].div(sums["samples"], axis=0)
     sums["final_error"] /= sums["sequences"]
     return sums.reset_index()
 
@@ -119,7 +105,7 @@ def write_followers(rows: pd.DataFrame, folder: Path) -> None:
     drivers = by_driver(rows)
     heads_of = {"pairs": ("sequence", "driver"), "drivers": ("recording", "driver", "sequences")}
     for (name, heads), table in zip(heads_of.items(), (rows, drivers), strict=True):
-        write_text(folder / f"{name}.csv", csv_text(table))
+        write_csv(folder / f"{name}.csv", table)
         _print(name, table.nlargest(SHOWN, "spacing_rmse"), heads, len(table))
     print(f"plot: {save(traffic.follower_errors(rows), folder / 'pairs.png')}")
 

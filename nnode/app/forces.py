@@ -13,7 +13,7 @@ from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.errors import ConfigError, DownloadError
-from nnode.files import csv_text, file_name, write_text
+from nnode.files import file_name, write_csv
 from nnode.model import System
 from nnode.plots import (
     curve_table,
@@ -80,7 +80,7 @@ def _traffic(
         print(f"no histogram of gaps: {error}")
         gaps = None
     save(speed_curves(models, gaps), folder / "forces.png")
-    write_text(folder / "forces.csv", csv_text(curve_table(models, np.linspace(2, 50, 97))))
+    write_csv(folder / "forces.csv", curve_table(models, np.linspace(2, 50, 97)))
     return [folder / "forces.png", folder / "forces.csv"]
 
 
@@ -97,6 +97,6 @@ def _crowd(models: dict[str, System], extent: float | None, folder: Path) -> lis
             written.append(path)
         figure, table = six_settings(model)
         save(figure, folder / f"{stem}_settings.png")
-        write_text(folder / f"{stem}_settings.csv", csv_text(table))
+        write_csv(folder / f"{stem}_settings.csv", table)
         written += [folder / f"{stem}_settings.png", folder / f"{stem}_settings.csv"]
     return written

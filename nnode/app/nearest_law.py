@@ -189,10 +189,10 @@ def _diagnoses(
 
 def _compared(job: Job, laws: dict[str, System], watch: Watch) -> tuple[Laws, dict[str, System]]:
     with watch("laws", {"comparing laws": 10.0}) as stages:
-        if stages is None:
-            return compare_laws(laws, job.inputs.sequences, job.options)
-        stages.begin("comparing laws")
-        return compare_laws(laws, job.inputs.sequences, job.options, stages.within)
+        if stages is not None:
+            stages.begin("comparing laws")
+        within = [] if stages is None else [stages.within]
+        return compare_laws(laws, job.inputs.sequences, job.options, *within)
 
 
 def _diagnose(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import signal
 import time
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from nnode.calibrate.trainer import Trainer
 from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.data.store import Store
-from nnode.files import csv_text, write_json, write_text
+from nnode.files import write_csv, write_json
 from nnode.progress import Stages
 
 log = logging.getLogger(__name__)
@@ -44,7 +43,7 @@ RESUMABLE = (
     "trainer.figure_every",
 )
 #: Table of the separate parameters of sequences, for ``trainer.pooling``.
-OWN = "own_parameters.csv"
+SEQUENCES = "own_parameters.csv"
 #: Table of drivers, for ``trainer.drivers``.
 DRIVERS = "drivers.csv"
 SECTIONS = ("model", "data", "optimizer", "solver", "trainer", "seed")
@@ -107,11 +106,9 @@ def train(config: DictConfig, folder: Path) -> None:
     }
     if result.drivers is not None:
         save_checkpoint(result.checkpoint, trainer.best_path)
-        paths["drivers"] = folder / DRIVERS
-        write_text(folder / DRIVERS, csv_text(result.drivers.table))
+        paths["drivers"] = write_csv(folder / DRIVERS, result.drivers.table)
     if result.own is not None:
-        paths["own parameters"] = folder / OWN
-        write_text(folder / OWN, csv_text(result.own))
+        paths["own parameters"] = write_csv(folder / SEQUENCES, result.own)
     write_json(folder / RESULT, result.plain({name: str(path) for name, path in paths.items()}))
     print(result.summary())
     for what, path in paths.items():
@@ -125,17 +122,10 @@ def _result(trainer: Trainer, store: Store, start: float) -> Calibration:
     Raises:
         Interrupted: on a signal; the last checkpoint contains the training.
     """
-    with BreakingGuard() as guard, Stages("results", {"costs and intervals": 1.0}) as stages:
+    left = f" while results were computed; the training is in {trainer.last_path}"
+    with BreakingGuard(left), Stages("results", {"costs and intervals": 1.0}) as stages:
         stages.begin("costs and intervals")
-        try:
-            return calibrated(trainer, store, time.monotonic() - start)
-        except KeyboardInterrupt:
-            number = guard.requested or signal.SIGINT
-            raise Interrupted(
-                f"stopped by {signal.Signals(number).name} while results were computed; the "
-                f"training is in {trainer.last_path}",
-                number,
-            ) from None
+        return calibrated(trainer, store, time.monotonic() - start)
 
 
 def _composed(config: DictConfig) -> tuple[DictConfig, Checkpoint | None]:

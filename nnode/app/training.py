@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from omegaconf import DictConfig
 from torch.utils.data import DataLoader
 
 from nnode.app.cli.saved import options_of
-from nnode.app.drivers import NONE, planned
+from nnode.app.drivers import NONE, check_drivers, planned
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed
@@ -38,6 +37,10 @@ from nnode.plots import force_figure
 from nnode.simulation import Solver, TorchdiffeqSolver, substeps
 
 log = logging.getLogger(__name__)
+
+#: Smallest values of the trainer's options.
+_LOWEST = {"max_epochs": 0, "evaluate_every": 1, "figure_every": 0, "save_every": 0}
+_LOWEST |= {"patience": 1, "threads": 1}
 
 #: Parts of a split, as checkpoints name them.
 PARTS = ("train", "heldout", "dropped")
@@ -66,15 +69,6 @@ def build_solver(options: SolverOptions, device: torch.device | None = None) -> 
     )
 
 
-def stream(
-    loader: DataLoader[Any],
-    dtype: torch.dtype = torch.float64,
-    device: torch.device | str | None = None,
-) -> Iterator[Batch]:
-    """The mini-batches of a loader in a precision and on a device."""
-    return (batch.to(device, dtype) for batch in loader)
-
-
 def started(checkpoint: Checkpoint, store: Source) -> Source:
     """Sequences with the start speeds of a checkpoint's simulations, as in its training."""
     model = checkpoint.build()
@@ -92,10 +86,19 @@ def straight_loader(
     return make_loader(SequenceDataset(store, indices), options, seed=0, rank=rank, size=number)
 
 
+def batches(
+    store: Source,
+    indices: list[int],
+    size: int,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str | None = None,
+) -> Iterator[Batch]:
+    """Sequences in order, in mini-batches with a precision and on a device."""
+    return (batch.to(device, dtype) for batch in straight_loader(store, indices, size))
+
+
 def set_threads(threads: int | None, domain: str) -> None:
     """Set torch's threads; by default one for traffic, whose tensors are small."""
-    if threads is not None and threads < 1:
-        raise ConfigError(f"trainer.threads={threads} must be at least 1, or null")
     if threads is not None or domain == "traffic":
         torch.set_num_threads(threads or 1)
 
@@ -117,13 +120,11 @@ def check(config: DictConfig) -> None:
         ConfigError: an option is out of its range.
     """
     trainer = config.trainer
-    for name, low in (("max_epochs", 0), ("evaluate_every", 1), ("figure_every", 0)):
-        if trainer[name] < low:
-            raise ConfigError(f"trainer.{name}={trainer[name]} must be at least {low}")
-    if trainer.save_every < 0:
-        raise ConfigError(f"trainer.save_every={trainer.save_every} must be at least 0 s")
-    if trainer.patience is not None and trainer.patience < 1:
-        raise ConfigError(f"trainer.patience={trainer.patience} must be at least 1, or null")
+    for name, low in _LOWEST.items():
+        if trainer[name] is not None and trainer[name] < low:
+            hint = ", or null" if name in ("patience", "threads") else ""
+            raise ConfigError(f"trainer.{name}={trainer[name]} must be at least {low}{hint}")
+    check_drivers(trainer.drivers)
 
 
 def model_of(config: DictConfig) -> System:
@@ -180,7 +181,13 @@ def trainer_of(
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
     _check_pooling(options.pooling, model, optimizer_options.name)
-    _check_same_data(store, checkpoint)
+    if checkpoint is not None and source_hashes(store.manifest) != source_hashes(
+        checkpoint.manifest
+    ):
+        raise ConfigError(
+            "the data are not those of the checkpoint: the hashes of the source files differ; "
+            "point data.source= at the files it was trained on"
+        )
     parts = _parts(store, data, checkpoint)
     exact = optimizer_options.name == "gauss_newton"
     options.drivers = planned(options, model, lambda: [store[i] for i in parts.train], exact)
@@ -219,9 +226,7 @@ def trainer_of(
     )
     free_speed = None
     if model.domain == "traffic" and world.first:
-        free_speed = best_common_speed(
-            stream(straight_loader(store, parts.train, data.loader.batch_size)), model
-        )
+        free_speed = best_common_speed(batches(store, parts.train, data.loader.batch_size), model)
     names = [entry["name"] for entry in store.index]
     return Trainer(
         model,
@@ -234,7 +239,7 @@ def trainer_of(
         Provenance(
             config=plain,
             manifest=brief(store.manifest),
-            split={k: [names[i] for i in v] for k, v in asdict(parts).items() if k in PARTS},
+            split={part: [names[i] for i in getattr(parts, part)] for part in PARTS},
             free_speed=free_speed,
         ),
         # only forces between people can be drawn
@@ -265,14 +270,12 @@ def positions(store: Source, names: Iterable[str]) -> list[int]:
 
 def _parts(store: Source, data: DataOptions, checkpoint: Checkpoint | None) -> Split:
     """The division of the sequences; a resumed run keeps that of its checkpoint."""
-    places = {entry["name"]: i for i, entry in enumerate(store.index)}
     saved = {} if checkpoint is None else checkpoint.split
-    if not saved or not {name for names in saved.values() for name in names} <= set(places):
+    names = {entry["name"] for entry in store.index}
+    if not saved or not {name for part in saved.values() for name in part} <= names:
         return split(store.index, data.split)
-    train, heldout, dropped = (
-        sorted(places[name] for name in saved.get(part, [])) for part in PARTS
-    )
-    return Split(train=train, heldout=heldout, dropped=dropped, mode="checkpoint", note="as it was")
+    parts = {part: sorted(positions(store, saved.get(part, []))) for part in PARTS}
+    return Split(**parts, mode="checkpoint", note="as it was")
 
 
 def _check_pooling(kind: Pooling, model: System, optimizer: str) -> None:
@@ -296,14 +299,4 @@ def _check_pooling(kind: Pooling, model: System, optimizer: str) -> None:
         raise ConfigError(
             f"{asked} has no place in a network: one sequence does not determine its weights; "
             "take a law such as idm without model.network, or trainer.pooling=pooled"
-        )
-
-
-def _check_same_data(store: Source, checkpoint: Checkpoint | None) -> None:
-    if checkpoint is None:
-        return
-    if source_hashes(store.manifest) != source_hashes(checkpoint.manifest):
-        raise ConfigError(
-            "the data are not those of the checkpoint: the hashes of the source files differ; "
-            "point data.source= at the files it was trained on"
         )

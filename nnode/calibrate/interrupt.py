@@ -61,7 +61,27 @@ class BreakingGuard(InterruptGuard):
     """Inside the context, the first SIGINT or SIGTERM raises KeyboardInterrupt at once.
 
     For work that may be interrupted anywhere; :attr:`requested` is the number of the signal.
+
+    Args:
+        consequence: what the interruption leaves, the end of the message of :class:`Interrupted`,
+            which then replaces KeyboardInterrupt at the end of the context.
     """
+
+    def __init__(self, consequence: str = "") -> None:
+        super().__init__()
+        self._consequence = consequence
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        super().__exit__(kind, error, trace)
+        if self._consequence and isinstance(error, KeyboardInterrupt):
+            number = self.requested or signal.SIGINT
+            name = signal.Signals(number).name
+            raise Interrupted(f"stopped by {name}{self._consequence}", number) from None
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         super()._handle(number, frame)

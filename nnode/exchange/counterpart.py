@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from nnode.model import System
-from nnode.model.laws import law_from
+from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, law_from
 from nnode.model.term import Term, short_names
 
 #: Address of a parameter to its interval: ``low`` and ``high``, None where unknown.
@@ -30,8 +30,13 @@ class Counterpart:
     missing: list[str] = field(default_factory=list)
     values: dict[str, str] = field(default_factory=dict)
 
+    @property
+    def lines(self) -> list[str]:
+        """The notes, and the missing parts as such."""
+        return [*self.notes, *(f"no counterpart: {text}" for text in self.missing)]
 
-def effects_without(system: System, first: int, counted: set[str]) -> list[str]:
+
+def effects_without(system: System, first: int = 1, counted: Collection[str] = ()) -> list[str]:
     """A line for each effect that is not ``counted``, among the terms from index ``first``."""
     return [
         f"effect {term.name}: {term.formula_for(system.order)}"
@@ -40,13 +45,13 @@ def effects_without(system: System, first: int, counted: set[str]) -> list[str]:
     ]
 
 
-def field_law(system: System, described: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
+def field_law(system: System, names: Iterable[str]) -> str | None:
     """The package's law that a model has, whatever the model's name; None for other laws.
 
     Args:
-        described: name to description of laws, see :func:`nnode.model.laws.law_from`.
         names: names of the compared laws.
     """
+    described = {**CAR_FOLLOWING_LAWS, **PEDESTRIAN_LAWS}
     term = system.terms[0] if len(system.terms) else None
     for name in names:
         law = law_from(name, described[name])

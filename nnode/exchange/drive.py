@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -91,8 +92,8 @@ def drive(
     order = drivable(system).order
     folder.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    sumo = RunningSumo(program, scenario, folder / TRAJECTORIES, forced_steps)
-    try:
+    result = Drive(trajectories=folder / TRAJECTORIES)
+    with closing(RunningSumo(program, scenario, result.trajectories, forced_steps)) as sumo:
         sumo.check_types(types)
         steps = _steps(sumo, order, scenario)
         if expected is not None:
@@ -102,10 +103,8 @@ def drive(
         while sumo.continues(end):
             if steer is not None:
                 steer(sumo)
-            job.step()
-        result = job.result(folder / TRAJECTORIES)
-    finally:
-        sumo.close()
+            job.step(result)
+    job.count(result)
     result.step, result.method = steps.seconds, steps.method
     result.seconds = result.steps * steps.seconds
     result.wall = time.perf_counter() - start
@@ -157,11 +156,10 @@ class _Job:
         self._every: set[str] = set()
         self._crashed: set[tuple[str, str]] = set()
         self._stranded: set[str] = set()
-        self._teleports, self._steps, self._in_sumo = 0, 0, 0.0
         self._speeds, self._number = 0.0, 0
         self._take(sumo.vehicles)
 
-    def step(self) -> None:
+    def step(self, result: Drive) -> None:
         """Set the speeds of controlled vehicles, and run a step of SUMO."""
         sumo, drivers, subscribed = self._sumo, self._drivers, self._sumo.subscriptions()
         stays = np.array([name in subscribed for name in self._names], bool)
@@ -178,12 +176,14 @@ class _Job:
             self._number += len(self._names)
         before = time.perf_counter()
         sumo.step()
-        self._in_sumo += time.perf_counter() - before
-        self._steps += 1
-        self._crashed.update(sumo.collisions())
-        self._stranded.update(sumo.stranded())
-        self._teleports += sumo.teleports()
-        self._take(sumo.departed)
+        result.in_sumo += time.perf_counter() - before
+        result.steps += 1
+        simulation = sumo.api.simulation
+        result.teleports += simulation.getStartingTeleportNumber()
+        self._crashed.update((c.collider, c.victim) for c in simulation.getCollisions())
+        # vehicles that SUMO stopped at the end of their lane
+        self._stranded.update(simulation.getEmergencyStoppingVehiclesIDList())
+        self._take(simulation.getDepartedIDList())
 
     def _take(self, vehicles: Sequence[str]) -> None:
         """Take control of vehicles of the controlled types."""
@@ -198,15 +198,10 @@ class _Job:
         self._names += taken
         self._every.update(taken)
 
-    def result(self, trajectories: Path) -> Drive:
-        return Drive(
-            trajectories=trajectories,
-            driven=len(self._every),
-            steps=self._steps,
-            mean_speed=self._speeds / self._number if self._number else None,
-            collisions=len(self._crashed),
-            driven_collisions=sum(not self._every.isdisjoint(pair) for pair in self._crashed),
-            teleports=self._teleports,
-            stranded=len(self._stranded & self._every),
-            in_sumo=self._in_sumo,
-        )
+    def count(self, result: Drive) -> None:
+        """Add the numbers of vehicles and their mean speed to a result."""
+        result.driven = len(self._every)
+        result.mean_speed = self._speeds / self._number if self._number else None
+        result.collisions = len(self._crashed)
+        result.driven_collisions = sum(not self._every.isdisjoint(p) for p in self._crashed)
+        result.stranded = len(self._stranded & self._every)

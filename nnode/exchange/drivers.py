@@ -205,7 +205,7 @@ class Drivers:
         gap = np.where(follows, views.gap, self._far)
         gap_1 = np.where(second, views.gap_1, self._far)
         v_1 = np.where(follows, views.v_1, views.v)
-        own_length = views.length_1 if self._lengths else np.zeros(n)
+        length = views.length_1 if self._lengths else np.zeros(n)
         start = np.where(self._fresh, time, self._begun)
         return {
             **self._fixed,
@@ -218,7 +218,7 @@ class Drivers:
             "v_1": v_1,
             "v_2": np.where(second, views.v_2, v_1),
             "dx_1": v_1,
-            "length_1": np.where(follows, own_length, 0.0),
+            "length_1": np.where(follows, length, 0.0),
             "second": second.astype(float),
             "t": time - start,
             "start": start,
@@ -238,6 +238,7 @@ class Drivers:
             given[state] = self._states[state]
         self._fresh = np.zeros(len(self), bool)
 
+    @np.errstate(all="ignore")
     def _check_empty(self, lane: LaneDynamics) -> None:
         """Refuse a law without a limit for large gaps.
 
@@ -257,14 +258,11 @@ class Drivers:
             trial._states, trial._inputs = dict(self._states), dict(self._inputs)
             trial._rng = np.random.default_rng(0)
             trial.enter([()] * len(v))
-            with np.errstate(all="ignore"):
-                results.append([trial._advanced(k * self.dt, views) for k in range(3)])
+            results.append([trial._advanced(k * self.dt, views) for k in range(3)])
             results[-1] += list(trial._states.values())
-        with np.errstate(all="ignore"):
-            same = all(
-                (np.abs(a - b) <= _SAME * (1 + np.abs(b))).all()
-                for a, b in zip(*results, strict=True)
-            )
+        same = all(
+            (np.abs(a - b) <= _SAME * (1 + np.abs(b))).all() for a, b in zip(*results, strict=True)
+        )
         if not same:
             raise ConfigError(
                 f"{' with '.join(str(term.name) for term in self._terms)} has no speed on an "

@@ -30,7 +30,6 @@ from nnode.exchange.counterpart import (
     interval_lines,
 )
 from nnode.model import Law, System
-from nnode.model.laws import PEDESTRIAN_LAWS
 from nnode.model.scene import Scene, wall_points
 
 
@@ -93,10 +92,7 @@ _PACE = "desired_speed: the median of people's preferred speeds; each has his ow
 
 def has_parameters(system: System) -> bool:
     """Whether JuPedSim has a counterpart of a model."""
-    return (
-        system.find_law("social_force") is not None
-        or field_law(system, PEDESTRIAN_LAWS, SAME) is not None
-    )
+    return system.find_law("social_force") is not None or field_law(system, SAME) is not None
 
 
 def jupedsim_parameters(
@@ -111,7 +107,7 @@ def jupedsim_parameters(
     Raises:
         ConfigError: JuPedSim has no counterpart of the model.
     """
-    name = field_law(system, PEDESTRIAN_LAWS, SAME)
+    name = field_law(system, SAME)
     if name is not None:
         counterpart, content = _same_law(system, name, scenes)
     else:
@@ -170,7 +166,7 @@ def _same_law(system: System, name: str, scenes: Scenes) -> tuple[Counterpart, d
             "from walls as well"
         )
     counterpart.notes.append(_PACE)
-    counterpart.missing += effects_without(system, 1, set())
+    counterpart.missing += effects_without(system)
     return counterpart, content
 
 
@@ -218,7 +214,7 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
             "opposing_wall_friction: JuPedSim's friction at walls has the opposite sign"
         )
     counterpart.missing.append("reach: JuPedSim lets nobody feel people farther away than 2.5 m")
-    counterpart.missing += effects_without(system, 2 if relaxation else 1, set())
+    counterpart.missing += effects_without(system, 2 if relaxation else 1)
     content = _content(
         "SocialForceModel",
         {"body_force": k, "friction": kappa},

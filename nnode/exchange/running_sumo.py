@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from functools import cache
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.exchange.drivers import DriverInputs
 
 #: Supported programs.
@@ -93,9 +94,8 @@ class RunningSumo:
         except (self.api.TraCIException, self.api.FatalTraCIError) as error:
             raise ConfigError(f"sumo={scenario} cannot be loaded by SUMO: {error}") from error
         self._constants = self.api.constants
-        self._speed = self._constants.VAR_SPEED
-        self._length: dict[str, float] = {}
-        self._min_gap: dict[str, float] = {}
+        self._length = cache(self.api.vehicle.getLength)
+        self._min_gap = cache(self.api.vehicle.getMinGap)
 
     @property
     def ballistic(self) -> bool:
@@ -123,9 +123,8 @@ class RunningSumo:
         Raises:
             ConfigError: a type is not suitable.
         """
-        types_of_scenario = [
-            t for t in self.api.vehicletype.getIDList() if not t.startswith("DEFAULT_")
-        ]
+        every = self.api.vehicletype.getIDList()
+        types_of_scenario = [name for name in every if not name.startswith("DEFAULT_")]
         for name in types:
             if name not in types_of_scenario:
                 raise ConfigError(
@@ -148,11 +147,6 @@ class RunningSumo:
         """All vehicles on the road."""
         return tuple(self.api.vehicle.getIDList())
 
-    @property
-    def departed(self) -> tuple[str, ...]:
-        """Vehicles that entered the road in the last step."""
-        return tuple(self.api.simulation.getDepartedIDList())
-
     def type_of(self, vehicle: str) -> str:
         return str(self.api.vehicle.getTypeID(vehicle))
 
@@ -171,9 +165,8 @@ class RunningSumo:
 
     def set_speeds(self, vehicles: Iterable[str], speeds: np.ndarray) -> None:
         """Command speeds at the end of the step that begins now, m/s."""
-        command = self.api.vehicle.setSpeed
         for vehicle, speed in zip(vehicles, speeds.tolist(), strict=True):
-            command(vehicle, speed)
+            self.api.vehicle.setSpeed(vehicle, speed)
 
     def subscriptions(self) -> Subscriptions:
         """Subscribed values of controlled vehicles that have not arrived."""
@@ -189,7 +182,7 @@ class RunningSumo:
             subscribed: see :meth:`subscriptions`.
             second: whether the second vehicle ahead is needed.
         """
-        speed, leader, vehicle_api = self._speed, self._constants.VAR_LEADER, self.api.vehicle
+        speed, leader = self._constants.VAR_SPEED, self._constants.VAR_LEADER
         n = len(vehicles)
         number = {vehicle: i for i, vehicle in enumerate(vehicles)}
         v = np.array([max(subscribed[vehicle][speed], 0.0) for vehicle in vehicles])
@@ -201,57 +194,30 @@ class RunningSumo:
             if not ahead or not ahead[0] or subscribed[vehicle][speed] < _OFF_ROAD:
                 continue
             name = ahead[0]
-            length[i] = self._length_of(name)
+            length[i] = self._length(name)
             # SUMO's distance excludes minGap
-            gap[i] = ahead[1] + self._min_gap_of(vehicle) + length[i]
+            gap[i] = ahead[1] + self._min_gap(vehicle) + length[i]
             at = number.get(name, -1)
             if at < 0 and name not in others:
-                others[name] = max(float(vehicle_api.getSpeed(name)), 0.0)
+                others[name] = max(self.api.vehicle.getSpeed(name), 0.0)
             lead[i], v_1[i] = at, v[at] if at >= 0 else others[name]
-            after = vehicle_api.getLeader(name, MAX_DISTANCE) if second and at < 0 else None
+            after = self.api.vehicle.getLeader(name, MAX_DISTANCE) if second and at < 0 else None
             if after and after[0]:
-                gap_1[i] = after[1] + self._min_gap_of(name) + self._length_of(after[0])
-                v_2[i] = max(float(vehicle_api.getSpeed(after[0])), 0.0)
+                gap_1[i] = after[1] + self._min_gap(name) + self._length(after[0])
+                v_2[i] = max(self.api.vehicle.getSpeed(after[0]), 0.0)
         led = np.flatnonzero(lead >= 0)
         gap_1[led], v_2[led] = gap[lead[led]], v_1[lead[led]]
         return DriverInputs(
             v=v, gap=gap, v_1=v_1, length_1=length, lead=lead, gap_1=gap_1, v_2=v_2, x=np.zeros(n)
         )
 
-    def places(
-        self, vehicles: Sequence[str], subscribed: Subscriptions
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """``(n,)`` each: position along the lane, and distance since the departure, m."""
-        lane, driven = self._constants.VAR_LANEPOSITION, self._constants.VAR_DISTANCE
-        return tuple(np.array([subscribed[v][key] for v in vehicles]) for key in (lane, driven))  # type: ignore[return-value]
-
-    def collisions(self) -> list[tuple[str, str]]:
-        """Pairs of colliding vehicle and victim."""
-        return [
-            (collision.collider, collision.victim)
-            for collision in self.api.simulation.getCollisions()
-        ]
-
-    def teleports(self) -> int:
-        """Number of vehicles whose teleport began in the last step."""
-        return int(self.api.simulation.getStartingTeleportNumber())
-
-    def stranded(self) -> tuple[str, ...]:
-        """Vehicles that SUMO stopped in the last step at the end of their lane."""
-        return tuple(self.api.simulation.getEmergencyStoppingVehiclesIDList())
+    def places(self, vehicles: Sequence[str], subscribed: Subscriptions) -> np.ndarray:
+        """``(2, n)``: position along the lane, and distance since the departure, m."""
+        keys = (self._constants.VAR_LANEPOSITION, self._constants.VAR_DISTANCE)
+        return np.array([[subscribed[vehicle][key] for vehicle in vehicles] for key in keys])
 
     def close(self) -> None:
         self.api.close()
-
-    def _length_of(self, vehicle: str) -> float:
-        if vehicle not in self._length:
-            self._length[vehicle] = float(self.api.vehicle.getLength(vehicle))
-        return self._length[vehicle]
-
-    def _min_gap_of(self, vehicle: str) -> float:
-        if vehicle not in self._min_gap:
-            self._min_gap[vehicle] = float(self.api.vehicle.getMinGap(vehicle))
-        return self._min_gap[vehicle]
 
 
 def _loaded(program: str) -> tuple[Any, str]:
@@ -261,12 +227,16 @@ def _loaded(program: str) -> tuple[Any, str]:
         ConfigError: the program is unknown or not installed.
     """
     if program not in PROGRAMS:
-        raise ConfigError(f"program={program} is unknown, expected {' or '.join(PROGRAMS)}")
-    home = _home()
-    tools = str(home / "tools") if home else None
-    if tools is not None and tools not in sys.path:
-        sys.path.append(tools)  # traci comes with SUMO
-    binary = str(home / "bin" / "sumo") if home else shutil.which("sumo")
+        raise unknown_value("program", program, PROGRAMS)
+    try:
+        home = importlib.import_module("sumo").SUMO_HOME
+    except ImportError:
+        home = os.environ.get("SUMO_HOME")
+    binary = shutil.which("sumo")
+    if home:
+        if (tools := str(Path(home, "tools"))) not in sys.path:
+            sys.path.append(tools)  # traci comes with SUMO
+        binary = str(Path(home, "bin", "sumo"))
     try:
         # libsumo warns of other versions of pyarrow, which only matters for its table output
         with redirect_stdout(StringIO()):
@@ -279,12 +249,3 @@ def _loaded(program: str) -> tuple[Any, str]:
     if binary is None and program == "traci":
         raise ConfigError("no program sumo is found; pip install eclipse-sumo, or set SUMO_HOME")
     return module, binary or "sumo"
-
-
-def _home() -> Path | None:
-    """SUMO's folder."""
-    try:
-        return Path(importlib.import_module("sumo").SUMO_HOME)
-    except ImportError:
-        folder = os.environ.get("SUMO_HOME")
-        return Path(folder) if folder else None

@@ -26,7 +26,6 @@ from nnode.exchange.counterpart import (
     interval_lines,
 )
 from nnode.model import Law, System
-from nnode.model.laws import CAR_FOLLOWING_LAWS
 
 #: SUMO's length of a passenger car, m, for data without lengths.
 DEFAULT_LENGTH = 5.0
@@ -62,10 +61,7 @@ def equilibrium_gap(law: Law, speed: float, time_gap: float = 0.0) -> float:
 
 def has_type(system: System) -> bool:
     """Whether SUMO has a counterpart of a model's law."""
-    return (
-        system.find_law("lin", "log") is not None
-        or field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME)) is not None
-    )
+    return system.find_law("lin", "log") is not None or field_law(system, SAME) is not None
 
 
 def sumo_type(
@@ -87,13 +83,13 @@ def sumo_type(
     Raises:
         ConfigError: SUMO has no counterpart of the law.
     """
-    law = field_law(system, CAR_FOLLOWING_LAWS, tuple(SAME))
+    law = field_law(system, SAME)
     if law is not None:
         counterpart = _same_law(system, law, name, length)
     else:
         counterpart = _krauss_of_gap(system, name, speed, length)
     counterpart.notes[:0] = interval_lines(system, intervals or {})
-    counterpart.text = _document(counterpart.values, counterpart)
+    counterpart.text = _document(counterpart)
     return counterpart
 
 
@@ -133,7 +129,7 @@ def _same_law(system: System, law: str, name: str, length: float | None) -> Coun
         counterpart.missing.append(
             "the last metre behind a vehicle at rest, which SUMO drives at decel times one step"
         )
-    counterpart.missing += effects_without(system, 1, set())
+    counterpart.missing += effects_without(system)
     return counterpart
 
 
@@ -225,11 +221,10 @@ def _exactly(value: float) -> str:
     return f"{value:.12g}"
 
 
-def _document(values: dict[str, str], counterpart: Counterpart) -> str:
+def _document(counterpart: Counterpart) -> str:
     root = ElementTree.Element("additional")
-    lines = [*counterpart.notes, *(f"no counterpart: {text}" for text in counterpart.missing)]
-    for line in lines:
+    for line in counterpart.lines:
         root.append(ElementTree.Comment(f" {line.replace('--', '- -')} "))
-    ElementTree.SubElement(root, "vType", values)
+    ElementTree.SubElement(root, "vType", counterpart.values)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=False) + "\n"

@@ -9,7 +9,7 @@ import pandas as pd
 
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.evaluate import Metrics
-from nnode.files import csv_text, write_text
+from nnode.files import write_csv
 from nnode.model import System
 
 
@@ -25,36 +25,31 @@ def write_results(
         metrics: errors of the model on the exported sequences.
         unit: unit of the sequences' costs.
     """
-    parameters = [
-        {"parameter": name, "value": float(value), "unit": of}
-        for name, (value, of) in model.physical().items()
-    ]
-    history = [
-        {"epoch": row.get("epoch"), "quantity": name, "value": value}
-        for row in checkpoint.history
-        for name, value in row.items()
-        if name != "epoch"
-    ]
     part = {name: key for key, names in checkpoint.split.items() for name in names}
-    sequences = [
-        {"sequence": name, "part": part.get(name, ""), "cost": cost, "unit": unit}
-        for name, cost in metrics.costs.items()
-    ]
-    horizons = [
-        {"time_s": row["t"], "rmse_m": row["rmse"], "samples": row["n"]} for row in metrics.horizons
-    ]
-    tables: dict[str, tuple[list[dict[str, Any]], list[str]]] = {
-        "parameters": (parameters, ["parameter", "value", "unit"]),
-        "history": (history, ["epoch", "quantity", "value"]),
-        "sequences": (sequences, ["sequence", "part", "cost", "unit"]),
-        "horizons": (horizons, ["time_s", "rmse_m", "samples"]),
+    tables: dict[str, tuple[list[str], list[tuple[Any, ...]]]] = {
+        "parameters": (
+            ["parameter", "value", "unit"],
+            [(name, float(value), of) for name, (value, of) in model.physical().items()],
+        ),
+        "history": (
+            ["epoch", "quantity", "value"],
+            [
+                (row.get("epoch"), name, value)
+                for row in checkpoint.history
+                for name, value in row.items()
+                if name != "epoch"
+            ],
+        ),
+        "sequences": (
+            ["sequence", "part", "cost", "unit"],
+            [(name, part.get(name, ""), cost, unit) for name, cost in metrics.costs.items()],
+        ),
+        "horizons": (
+            ["time_s", "rmse_m", "samples"],
+            [(row["t"], row["rmse"], row["n"]) for row in metrics.horizons],
+        ),
     }
     return [
         write_csv(folder / f"{name}.csv", pd.DataFrame(rows, columns=columns))
-        for name, (rows, columns) in tables.items()
+        for name, (columns, rows) in tables.items()
     ]
-
-
-def write_csv(path: Path, table: pd.DataFrame) -> Path:
-    """Write a table, with full precision and without row numbers."""
-    return write_text(path, csv_text(table))

@@ -6,6 +6,7 @@ import gzip
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -19,8 +20,7 @@ from nnode.calibrate.evaluate import Simulate
 from nnode.data._arrow import open_writer, schema, to_table
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, DataError
-from nnode.exchange.tables import write_csv
-from nnode.files import csv_safe, replacing, write_text
+from nnode.files import csv_safe, replacing, write_csv, write_text
 
 #: Format of trajectories to the domains that it supports.
 FORMATS = {
@@ -192,13 +192,8 @@ def _directed(s: Sequence) -> Sequence:
 
 
 def _groups(sequences: Iterable[Sequence], size: int) -> Iterator[list[Sequence]]:
-    group: list[Sequence] = []
-    for s in sequences:
-        group.append(s)
-        if len(group) == size:
-            yield group
-            group = []
-    if group:
+    iterator = iter(sequences)
+    while group := list(islice(iterator, size)):
         yield group
 
 

@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 
 from nnode.data.sequence import Domain
-from nnode.errors import ConfigError, suggestion
+from nnode.errors import ConfigError, suggestion, unknown_value
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.base import Effect
 from nnode.model.effects.own import VARIABLE, load_own
@@ -71,10 +71,7 @@ def build_model(options: Options, seed: int = 0, dtype: torch.dtype = torch.floa
     term, generator = str(options["term"]), torch.Generator().manual_seed(seed)
     terms = [name for name, entry in entries().items() if entry.get("model")] + ["formula"]
     if term not in terms:
-        raise ConfigError(
-            f"model.term={term} is unknown, expected one of {', '.join(terms)}"
-            f"{suggestion(term, terms)}"
-        )
+        raise unknown_value("model.term", term, terms)
     try:
         laws = _laws(options, generator)
         model: System

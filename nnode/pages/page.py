@@ -1,4 +1,4 @@
-"""A page of results: text, tables and figures as one HTML file, as Markdown, and as CSV."""
+"""Pages of results: text, tables and figures as one HTML file, as Markdown, and as CSV."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from nnode.pages import tables
 from nnode.pages.replay import ReplayBlock
 from nnode.plots.style import save
 
-#: Folder of the figures beside the page.
+#: Folder of the figures in the folder of the page.
 FIGURES = "figures"
 
 #: Pixels of a style sheet in an inch.
@@ -41,7 +41,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 @dataclass
 class Heading:
-    """Begins a section; level 2 is the highest, below the page's title.
+    """The heading of a section; level 2 is the highest, below the page's title.
 
     A folded section is opened by its heading, by a link into it, and when the page is printed. In
     Markdown it is an ordinary section.
@@ -64,13 +64,13 @@ class TableBlock:
     """A table, and the file ``<name>.csv`` with its numbers in full.
 
     Attributes:
-        name: of the file; ``[text](#table-<name>)`` refers to the table.
-        frame: what is shown; its index labels the rows.
-        caption: in Markdown; says what to see, and the units.
-        bold: which cells are set in bold.
-        digits: after the point, for all columns or by column.
-        full: what the CSV holds, where that is more than what is shown.
-        heads: headings of columns whose name in the CSV is another one.
+        name: name of the file; ``[text](#table-<name>)`` refers to the table.
+        frame: the shown table; its index labels the rows.
+        caption: caption in Markdown, with the units.
+        bold: True for the cells in bold.
+        digits: number of digits after the point, for all columns or by column.
+        full: the content of the CSV file, if it is more than the shown table.
+        heads: column to its heading on the page, if it differs from that in the CSV file.
     """
 
     name: str
@@ -82,11 +82,11 @@ class TableBlock:
     heads: dict[str, str] = field(default_factory=dict)
 
     def grid(self) -> tables.Grid:
-        """The table as text."""
+        """The table as cells of text."""
         return tables.grid(self.frame, digits=self.digits, bold=self.bold, heads=self.heads)
 
     def csv(self) -> str:
-        """The table in full."""
+        """The full table as CSV."""
         return tables.csv(self.frame if self.full is None else self.full)
 
 
@@ -95,10 +95,10 @@ class FigureBlock:
     """A figure, and the file ``figures/<name>.png``.
 
     Attributes:
-        name: of the file; ``[text](#figure-<name>)`` refers to the figure.
-        figure: drawn by :mod:`nnode.plots`.
-        caption: in Markdown; says what to see.
-        alt: what the figure shows, in words, for those who cannot see it.
+        name: name of the file; ``[text](#figure-<name>)`` refers to the figure.
+        figure: a figure of :mod:`nnode.plots`.
+        caption: caption in Markdown.
+        alt: description of the figure for readers who cannot see it.
     """
 
     name: str
@@ -109,7 +109,7 @@ class FigureBlock:
 
 @dataclass
 class Provenance:
-    """How a page was made, by what: goes to the page's foot. Several add up."""
+    """Facts on how a page was made, which stand at its foot. Several blocks are joined."""
 
     facts: dict[str, str]
 
@@ -122,22 +122,21 @@ def write_page(
 ) -> list[Path]:
     """Write ``<stem>.html``, ``<stem>.md``, a CSV per table and a PNG per figure.
 
-    The HTML needs no other file and no network: style, figures, players and the tables' CSV are in
-    it.
-    The Markdown refers to the CSV and PNG files beside it. Each file is replaced as a whole, the
-    pages last.
+    The HTML file contains the style, figures, players and the tables' CSV. It needs no other file
+    and no network. The Markdown file refers to the CSV and PNG files. Each file is replaced as a
+    whole, the pages last.
 
     Args:
-        blocks: the page in its order; headings begin sections.
-        folder: made where it is missing.
+        blocks: the content of the page, in order.
+        folder: folder of the files, created if it is missing.
         subtitle: one sentence in Markdown below the title.
 
     Returns:
         The paths: HTML, Markdown, then the tables and figures in their order.
 
     Raises:
-        ValueError: two blocks of the same name, a name that is no file name, a figure without
-            alternative text.
+        ValueError: two blocks have the same name, a name cannot be that of a file, or a figure has
+            no alternative text.
         ConfigError: the folder cannot be written to.
     """
     _check(blocks)
@@ -158,7 +157,7 @@ def write_page(
 
 
 def write_player(block: ReplayBlock, path: Path, *, title: str) -> Path:
-    """Write a page that holds a player alone; it needs no other file and no network.
+    """Write a page with one player; it needs no other file and no network.
 
     Raises:
         ConfigError: the path does not end in ``.html``, or cannot be written to.
@@ -192,8 +191,8 @@ def _check(blocks: list[Block]) -> None:
 
 
 def _facts(blocks: list[Block]) -> dict[str, str]:
-    found = [block.facts for block in blocks if isinstance(block, Provenance)]
-    return {name: fact for facts in found for name, fact in facts.items()}
+    provenances = (block for block in blocks if isinstance(block, Provenance))
+    return {name: fact for block in provenances for name, fact in block.facts.items()}
 
 
 def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
@@ -219,39 +218,27 @@ def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
                 parts.append(
                     f'<a id="figure-{block.name}"></a>{place}: {_without_html(block.caption)}'
                 )
-    facts = _facts(blocks)
-    if facts:
-        parts.append("---")
-        parts.append(
-            "\n".join(f"- {name}: {tables.markdown(fact)}" for name, fact in facts.items())
-        )
+    if facts := _facts(blocks):
+        lines = [f"- {name}: {tables.markdown(fact)}" for name, fact in facts.items()]
+        parts += ["---", "\n".join(lines)]
     return "\n\n".join(parts) + "\n"
 
 
 def _markdown_table(block: TableBlock) -> str:
     grid = block.grid()
-    names = [
-        tables.markdown(block.heads.get(name, tables.one_name(name)))
-        for name in block.frame.columns
-    ]
-    labels = [
-        tables.markdown(cell.text) for cell in grid.head[-1][: len(grid.head[-1]) - len(names)]
-    ]
-    sides = ["---:" if cell.right else "---" for cell in grid.head[-1][len(labels) :]]
-    lines = [labels + names, ["---"] * len(labels) + sides]
-    for row, cells in grid.rows:
-        lines.append(
-            [tables.markdown(cell.text) for cell in row]
-            + [
-                f"**{tables.markdown(c.text)}**" if c.bold else tables.markdown(c.text)
-                for c in cells
-            ]
-        )
+    names = [block.heads.get(name, tables.column_name(name)) for name in block.frame.columns]
+    head = grid.head[-1]
+    labels = [cell.text for cell in head[: len(head) - len(names)]]
+    sides = ["---:" if cell.right else "---" for cell in head[len(labels) :]]
+    lines = [list(map(tables.markdown, labels + names)), ["---"] * len(labels) + sides]
+    for row in grid.rows:
+        texts = [(tables.markdown(cell.text), cell.bold) for part in row for cell in part]
+        lines.append([f"**{text}**" if bold else text for text, bold in texts])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _without_html(markdown: str) -> str:
-    """The text of a block without HTML and images, as the page in HTML shows it."""
+    """The text of a block without HTML and images, as on the HTML page."""
     parts, end = [], 0
     for code in _CODE.finditer(markdown.strip()):
         parts += [_plain(markdown.strip()[end : code.start()]), code.group()]
@@ -316,7 +303,7 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
 
 
 def _slug(words: str, taken: Counter[str]) -> str:
-    """A heading's address, as Markdown's readers make it, unique on the page."""
+    """The anchor of a heading, as Markdown viewers derive it; unique on the page."""
     slug = re.sub(r"[^\w\- ]", "", words.lower()).strip().replace(" ", "-") or "section"
     taken[slug] += 1
     return slug if taken[slug] == 1 else f"{slug}-{taken[slug] - 1}"

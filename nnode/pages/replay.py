@@ -1,4 +1,4 @@
-"""A player: measured and simulated agents move side by side, one sequence at a time."""
+"""A player of measured and simulated agents, one sequence at a time."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from nnode.plots.style import GREY, OKABE_ITO
 
 T = TypeVar("T")
 
-#: A player's sequences take at most so many bytes, and are at most so many.
+#: Largest number of bytes and of sequences of a player.
 BYTES, MOST = 1_000_000, 60
-#: Samples that are closer in time are thinned out, s; in between, agents move evenly.
+#: Shortest time between the samples of a player, s. Agents move evenly between samples.
 FINEST = 0.1
-#: Positions farther away, m, come from a simulation that went astray, and are not shown.
+#: Positions farther away, m, result from a diverged simulation and are not shown.
 FAR = 1e7
-#: Length of a car that is drawn where lengths are unknown, m.
+#: Drawn length of cars of unknown length, m.
 CAR = 4.5
-#: Radius that is drawn of people, m.
+#: Drawn radius of people, m.
 BODY = 0.2
 
-#: Colours of up to three simulations, those of the still figures.
+#: Colours of up to three simulations, the same as in figures.
 COLOURS = (OKABE_ITO["vermillion"], OKABE_ITO["blue"], OKABE_ITO["green"])
 
 
 @dataclass(frozen=True)
 class Zone:
-    """A named place or time, shaded.
+    """A shaded place or time with a name.
 
     Attributes:
-        label: says what it is.
-        x, y: from and to, m; None: everywhere.
-        t: from and to on the recording's clock, s; None: always.
-        circle: x, y, radius, m.
+        label: the name.
+        x, y: intervals, m; None for everywhere.
+        t: interval on the recording's clock, s; None for all times.
+        circle: centre x, y and radius, m.
     """
 
     label: str
@@ -49,22 +49,22 @@ class Zone:
     circle: tuple[float, float, float] | None = None
 
     def plain(self) -> dict[str, Any]:
-        """For the page."""
+        """The zone in plain types."""
         return {key: value for key, value in vars(self).items() if value is not None}
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One sequence as measured and as models simulate it.
+    """A measured sequence and its simulations.
 
     Attributes:
-        sequence: as measured.
-        simulated: ``(K, N, D)`` m by title, in the order of :data:`COLOURS`. Where it is no number
-            nothing is shown.
-        notes: words by title that the player adds to it, as the error of the simulation.
-        restart: samples after which all simulations start again from the measurement; None: they
-            run through.
-        led: whether the leader follows its measured path; the error that is shown leaves it out.
+        sequence: the measured sequence.
+        simulated: title to positions ``(K, N, D)``, m, in the order of :data:`COLOURS`. NaN is not
+            shown.
+        notes: title to a note that the player adds, such as the error of the simulation.
+        restart: number of samples after which simulations restart from the measurement; None for
+            simulations of the whole sequence.
+        led: whether the leader follows its measured path; the shown error excludes it.
     """
 
     sequence: Sequence
@@ -79,14 +79,13 @@ class ReplayBlock:
     """A player on a page; in Markdown, a link to it.
 
     Attributes:
-        name: ``[text](#figure-<name>)`` refers to the player.
-        scenes: in the order of the list; as many as :data:`BYTES` and :data:`MOST` allow are kept,
-            at equal steps.
-            The player opens on the :func:`typical` one.
-        caption: in Markdown; says what to see.
-        alt: what moves, in words, for those who cannot see it.
-        zones: shaded in all scenes.
-        total: sequences that the scenes were chosen from; by default their number.
+        name: name of the player; ``[text](#figure-<name>)`` refers to it.
+        scenes: the sequences, in order. At most as many as :data:`BYTES` and :data:`MOST` allow are
+            kept, at equal steps. The player opens on the :func:`typical` scene.
+        caption: caption in Markdown.
+        alt: description for readers who cannot see the player.
+        zones: zones that are shaded in all scenes.
+        total: number of sequences from which the scenes were chosen; by default their number.
     """
 
     name: str
@@ -97,7 +96,7 @@ class ReplayBlock:
     total: int | None = None
 
     def data(self) -> tuple[str, str]:
-        """What the page holds, as JSON, and what must be said of it."""
+        """The data of the page as JSON, and remarks on them."""
         scenes = list(self.scenes)
         total = len(scenes) if self.total is None else self.total
         scenes = evenly(scenes, MOST)
@@ -125,13 +124,13 @@ class ReplayBlock:
 
 
 def evenly(items: Sequenced[T], number: int) -> list[T]:
-    """At most ``number`` of the items, at equal steps of their order."""
+    """At most ``number`` of the items, at equal steps."""
     chosen = np.linspace(0, len(items) - 1, min(number, len(items))).round().astype(int)
     return [items[i] for i in chosen]
 
 
 def typical(scenes: list[Scene]) -> int:
-    """Number of the scene whose first simulation has the median error."""
+    """Index of the scene whose first simulation has the median error."""
 
     def error(scene: Scene) -> float:
         square = (next(iter(scene.simulated.values())) - scene.sequence.x) ** 2
@@ -156,7 +155,7 @@ def _scene(scene: Scene) -> dict[str, Any]:
     s = scene.sequence
     every = max(1, int(FINEST / s.dt + 1e-6)) if s.n_samples > 1 else 1
     keep = slice(None, None, every)
-    found: dict[str, Any] = {
+    content: dict[str, Any] = {
         "name": s.name,
         "start": round(float(s.time[0]), 3),
         "dt": round(every * s.dt, 6) if s.n_samples > 1 else 1.0,
@@ -168,26 +167,27 @@ def _scene(scene: Scene) -> dict[str, Any]:
         ],
     }
     if scene.led:
-        found["led"] = 1
+        content["led"] = 1
     if s.length is not None and _lengths(s):
-        found["length"] = [round(float(one), 2) if np.isfinite(one) else CAR for one in s.length]
+        content["length"] = [round(float(x), 2) if np.isfinite(x) else CAR for x in s.length]
     if s.walls is not None and len(s.walls):
-        found["walls"] = np.round(s.walls, 2).tolist()
-    return found
+        content["walls"] = np.round(s.walls, 2).tolist()
+    return content
 
 
 def packed(x: np.ndarray) -> list[list[int | None]]:
     """Positions ``(K, N, D)`` in m as ``N D`` rows of whole centimetres.
 
-    A number is the step from the one before it in its row, which keeps it short; None: absent.
+    A number is the difference from the previous one in its row, which keeps the text short. Absent
+    positions are None.
     """
     columns = np.asarray(x, float).reshape(len(x), -1).T
     rows: list[list[int | None]] = []
     for column in columns:
-        there = np.abs(np.nan_to_num(column, nan=np.inf)) < FAR
-        steps = np.diff(np.round(100 * column[there]).astype(int), prepend=0)
+        present = np.abs(np.nan_to_num(column, nan=np.inf)) < FAR
+        steps = np.diff(np.round(100 * column[present]).astype(int), prepend=0)
         row: list[int | None] = [None] * len(column)
-        for place, step in zip(np.flatnonzero(there).tolist(), steps.tolist(), strict=True):
+        for place, step in zip(np.flatnonzero(present).tolist(), steps.tolist(), strict=True):
             row[place] = step
         rows.append(row)
     return rows

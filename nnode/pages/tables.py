@@ -1,4 +1,4 @@
-"""Numbers of a table as text: for HTML, for Markdown, and in full as CSV."""
+"""Tables as text for HTML and Markdown, and in full precision as CSV."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ import pandas as pd
 from nnode.errors import printable
 from nnode.files import csv_text
 
-#: What Markdown could take for a link, an image, code, emphasis, HTML or the end of a cell.
+#: Characters that are markup in Markdown: links, images, code, emphasis, and the end of a cell.
 _MARKS = re.compile(r"[\\`*\[!|]|(?<!\w)_|_(?!\w)")
 _ENTITY = re.compile(r"&(?=#?\w+;)")
 
 #: A number, an interval or a number with its error, as text.
 _NUMBER = re.compile(r"[+\-−±≤≥<>~ ]*\d[\d.,%±+\-−≤≥<>~\[\] e∞]*(to [\d.]+)?")
 
-#: Digits after the point where nothing else is asked for.
+#: Default number of digits after the point.
 DIGITS = 2
 
-#: From here on numbers are written with a power of ten.
+#: Numbers from this value on are written with a power of ten.
 _LARGE = 1e7
 
 NOTHING = "–"
@@ -34,7 +34,7 @@ NOTHING = "–"
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell as text; ``span`` columns wide."""
+    """A cell of text that spans ``span`` columns."""
 
     text: str
     bold: bool = False
@@ -44,23 +44,22 @@ class Cell:
 
 @dataclass(frozen=True)
 class Grid:
-    """A table as text: rows of the head, and of each row its labels and its cells."""
+    """A table of text: the rows of the head, and the labels and cells of each row."""
 
     head: list[list[Cell]]
     rows: list[tuple[list[Cell], list[Cell]]]
 
 
 def markdown(text: str) -> str:
-    """A text, such as a name from a file, as Markdown that shows it as it is, in one line."""
+    """A text, such as a name from a file, escaped for Markdown and in one line."""
     line = _ENTITY.sub("&amp;", re.sub(r"\s+", " ", printable(text)))
     return _MARKS.sub(r"\\\g<0>", line).replace("<", "&lt;")
 
 
 def number(value: Any, digits: int = DIGITS) -> str:
-    """A value as text: fixed digits, a true minus, a dash for what is missing.
+    """A value as text: fixed digits, a minus sign, a dash for missing values.
 
-    Numbers that the fixed digits would show as nought, and very large ones, are written with two
-    significant digits.
+    Very large numbers, and numbers that would be rounded to zero, have two significant digits.
     """
     if value is None or value is pd.NA or value is pd.NaT:
         return NOTHING
@@ -91,15 +90,15 @@ def grid(
     bold: pd.DataFrame | None,
     heads: Mapping[str, str] | None = None,
 ) -> Grid:
-    """A frame as text; its index becomes the labels of the rows.
+    """A data frame as text; its index becomes the labels of the rows.
 
-    A nameless index that only counts the rows is left out.
+    An index without a name that only counts the rows is left out.
 
     Args:
-        frame: of numbers, strings, or both.
-        digits: after the point, for all columns or by column.
-        bold: of the same shape; true cells are set in bold.
-        heads: headings of columns that are not their names.
+        frame: numbers, strings, or both.
+        digits: number of digits after the point, for all columns or by column.
+        bold: table of the same shape, True for cells in bold.
+        heads: column to its heading, if it differs from the name.
 
     Raises:
         ValueError: ``bold`` has other rows or columns than the frame.
@@ -118,9 +117,9 @@ def grid(
         columns.append(
             [Cell(number(value, wanted), b, right) for value, b in zip(values, fat, strict=True)]
         )
-    beside = [[Cell(_label(v)) for v in labels.iloc[:, i]] for i in range(labels.shape[1])]
+    label_cells = [[Cell(_label(v)) for v in labels.iloc[:, i]] for i in range(labels.shape[1])]
     rows = [
-        ([column[i] for column in beside], [column[i] for column in columns])
+        ([column[i] for column in label_cells], [column[i] for column in columns])
         for i in range(len(frame))
     ]
     shown = frame.rename(columns=dict(heads or {}))
@@ -128,12 +127,12 @@ def grid(
 
 
 def _label(value: Any) -> str:
-    """A row's label: fixed digits are for the cells."""
+    """The label of a row, without fixed digits."""
     return f"{value:g}".replace("-", "−") if isinstance(value, float) else number(value)
 
 
 def _labels(frame: pd.DataFrame) -> pd.DataFrame:
-    """The index as columns, those without a name with an empty one."""
+    """The index as columns; levels without a name have an empty one."""
     index = frame.index
     if isinstance(index, pd.RangeIndex) and index.name is None:
         return pd.DataFrame(index=index)
@@ -143,7 +142,7 @@ def _labels(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _head(frame: pd.DataFrame, labels: list[str], columns: list[list[Cell]]) -> list[list[Cell]]:
-    """One row per level of the columns; neighbours of the same name share a cell."""
+    """The rows of the head, one per level of the columns; equal neighbours share a cell."""
     depth = frame.columns.nlevels
     names = [name if isinstance(name, tuple) else (name,) for name in frame.columns]
     right = [bool(column) and column[0].right for column in columns]
@@ -161,23 +160,23 @@ def _head(frame: pd.DataFrame, labels: list[str], columns: list[list[Cell]]) -> 
 
 
 def _like_number(value: Any) -> bool:
-    """Whether a value stands well at the right: a number, also as text."""
+    """Whether a value is aligned to the right: a number, also as text."""
     if isinstance(value, str):
         return value in ("", NOTHING) or _NUMBER.fullmatch(value) is not None
     return value is None or isinstance(value, Real) or value is pd.NA
 
 
 def csv(frame: pd.DataFrame) -> str:
-    """A frame in full: one line of names, numbers that read back as the same ones."""
+    """A data frame as CSV with one line of names, in full precision."""
     labels = _labels(frame)
     body = frame.reset_index(drop=True)
-    body.columns = pd.Index([one_name(name) for name in frame.columns])
+    body.columns = pd.Index([column_name(name) for name in frame.columns])
     whole = pd.concat([labels.reset_index(drop=True), body], axis=1)
     return csv_text(whole)
 
 
-def one_name(name: Any) -> str:
-    """A column's name; the levels of a nested one side by side."""
+def column_name(name: Any) -> str:
+    """The name of a column; the levels of a nested one are joined."""
     if not isinstance(name, tuple):
         return str(name)
     return " ".join(str(part) for part in name if str(part))

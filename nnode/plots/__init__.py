@@ -1,4 +1,4 @@
-"""Figures: what a model has learned, and what data look like."""
+"""Figures of calibrated models and of data."""
 
 from nnode.plots.crowd import crowd_figures, force_contours, six_settings
 from nnode.plots.force import force_figure

@@ -1,4 +1,4 @@
-"""Bands of sampled gaps around what was measured."""
+"""Measured gaps with bands of sampled gaps."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from nnode.plots.style import OKABE_ITO, SMALL_FONT, dress, new_figure
+from nnode.plots.style import OKABE_ITO, dress, legend_above, new_figure
 
 
 @dataclass(frozen=True)
 class Bands:
-    """Of one vehicle.
+    """Bands of a vehicle's gap.
 
     Attributes:
-        name: of its sequence.
+        name: name of the sequence.
         time: ``(K,)`` s after the start.
         measured, median: ``(K,)`` gaps, m.
         bands: level to ``(2, K)`` lower and upper end, m.
@@ -46,10 +46,10 @@ def band_panels(
     figure = new_figure(7.2, 1.9 * rows + 0.5)
     panels = figure.subplots(rows, 2, squeeze=False).ravel()
     blue = OKABE_ITO["blue"]
-    for ax, one in zip(panels, vehicles, strict=False):
-        for level, (low, high) in sorted(one.bands.items(), reverse=True):
+    for ax, vehicle in zip(panels, vehicles, strict=False):
+        for level, (low, high) in sorted(vehicle.bands.items(), reverse=True):
             ax.fill_between(
-                one.time,
+                vehicle.time,
                 low,
                 high,
                 color=blue,
@@ -57,15 +57,12 @@ def band_panels(
                 linewidth=0,
                 label=f"{100 * level:g} % {band}",
             )
-        ax.plot(one.time, one.median, color=blue, linewidth=1.0, label=median)
-        ax.plot(one.time, one.measured, color="black", linewidth=1.2, label="measured")
-        dress(ax, x="time (s)", y=what, title=one.name)
+        ax.plot(vehicle.time, vehicle.median, color=blue, linewidth=1.0, label=median)
+        ax.plot(vehicle.time, vehicle.measured, color="black", linewidth=1.2, label="measured")
+        dress(ax, x="time (s)", y=what, title=vehicle.name)
         if what.startswith("gap"):
-            ax.set_ylim(bottom=min(0.0, float(one.measured.min())))
+            ax.set_ylim(bottom=min(0.0, float(vehicle.measured.min())))
     for ax in panels[len(vehicles) :]:
         ax.set_visible(False)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, fontsize=SMALL_FONT, frameon=False, loc="outside upper center", ncols=4
-    )
+    legend_above(figure, panels[0].get_legend_handles_labels()[0], 4)
     return figure

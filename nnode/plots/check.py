@@ -12,7 +12,7 @@ from nnode.data.trajectories import Trajectories
 from nnode.data.units import displacements
 from nnode.plots.style import GREY, OKABE_ITO, dress, new_figure
 
-#: Paths and positions of each that are drawn; more would not be seen.
+#: Largest number of drawn paths, and of drawn positions of each.
 PATHS, POINTS = 300, 200
 
 
@@ -36,7 +36,7 @@ def speeds(rows: Trajectories, usual: Range) -> Figure:
 
 
 def presence(rows: Trajectories, domain: Domain) -> Figure:
-    """Positions along the way of agents over time, and their number."""
+    """Positions of agents over time along the axis of their motion, and their number."""
     figure = new_figure(8.6, 4.6)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
     start, end = rows.ends()

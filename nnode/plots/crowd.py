@@ -1,4 +1,4 @@
-"""What a crowd model has learned, as contour plots over the relative position.
+"""Forces of a crowd model as contour plots over the relative position.
 
 The sign of a force is explained in :mod:`nnode.plots.interaction`.
 """
@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
@@ -29,7 +28,7 @@ from nnode.plots.interaction import (
     interaction,
 )
 from nnode.plots.settings import six_settings
-from nnode.plots.style import DIVERGING, FONT, GREY, SMALL_FONT, dress, new_figure
+from nnode.plots.style import DIVERGING, FONT, GREY, colour_bar, dress, new_figure, thinned
 
 #: Velocity differences (m/s) of the four contour panels. The paper names (2, 0) as its example
 #: and leaves the others open; these are the encounters of two people who walk at 1 m/s.
@@ -44,13 +43,12 @@ HEAD_ON = (2.0, 0.0)
 
 #: Half widths (m) of the contour panels in the paper: short and long ranged forces.
 EXTENT = {"short": 0.5, "long": 4.0}
-#: Measured pairs that a figure shows at most.
+#: Largest number of measured pairs in a figure.
 POINTS = 1500
 #: An even number keeps the grid off the origin, where a repulsion has no direction.
 GRID = 160
-#: The colour scale ends at this percentile of |F| where a peak is far above it.
+#: The colour scale ends at this percentile of |F| if the peak is at least PEAK times as high.
 SCALE_PERCENTILE = 98.0
-#: ... and a peak counts as far above from this ratio on.
 PEAK = 3.0
 
 
@@ -62,8 +60,8 @@ def force_contours(
     The panels differ in the relative velocity: (0, 0), (2, 0), (0, 2) and (1, 1) m/s, see
     ``ENCOUNTERS``. All share one symmetric scale; lines are solid where the force is positive
     and dashed where it is negative, and a circle marks contact of two social-force bodies.
-    Where a narrow peak towers over the rest, the scale ends below it; the
-    title gives its height.
+    If a narrow peak is much higher than other forces, the scale ends below it, and the title states
+    its height.
 
     Args:
         component: 0 for F_x, 1 for F_y.
@@ -71,7 +69,7 @@ def force_contours(
         part: see :func:`evaluate_force`.
 
     Raises:
-        ConfigError: a component, extent or part that does not exist, or no interaction force.
+        ConfigError: an unknown component, extent or part, or a model without interaction force.
 
     Source: Göttlich & Totzeck, figures (HelbingG1), (HelbingG2), (NN_G1), (NN_G2).
     """
@@ -93,9 +91,9 @@ def relative_positions(sequences: Iterable[Sequence], number: int = POINTS) -> n
     for s in sequences:
         away = s.x[:, :, None] - s.x[:, None]
         parts.append(away[:, ~np.eye(s.n_agents, dtype=bool)].reshape(-1, 2))
-    found = np.concatenate(parts)
-    found = found[np.abs(found).max(1, initial=0.0) <= max(EXTENT.values())]
-    return found[:: max(1, -(-len(found) // number))]
+    points = np.concatenate(parts)
+    points = points[np.abs(points).max(1, initial=0.0) <= max(EXTENT.values())]
+    return thinned(points, number)
 
 
 def head_on_figure(
@@ -119,10 +117,10 @@ def head_on_figure(
 
 
 def crowd_figures(system: System) -> dict[str, Figure]:
-    """Every figure of a crowd model.
+    """All figures of a crowd model.
 
-    ``force_x``, ``force_y`` and ``settings``; where the default is a sum of pair and wall
-    force, also ``force_x_pair``, ``force_x_wall``, ``force_y_pair`` and ``force_y_wall``.
+    These are ``force_x``, ``force_y`` and ``settings``. If the default is the sum of pair and wall
+    force, there are also ``force_x_pair``, ``force_x_wall``, ``force_y_pair`` and ``force_y_wall``.
 
     Raises:
         ConfigError: the model has no interaction force.
@@ -174,7 +172,7 @@ def _contours(
         radius = float(term.r)  # type: ignore[arg-type]
         contact = radius if chosen_part(term, part) == "wall" else 2 * radius
     lines = levels[levels > 0][:: max(1, len(levels) // 8)]
-    filled: ContourSet | None = None
+    filled: Any = None
     for (ax, *_), field in zip(panels, fields, strict=True):
         shown = np.ma.masked_invalid(field)
         filled = ax.contourf(side, side, shown, levels, cmap=DIVERGING, extend=extend)
@@ -183,17 +181,12 @@ def _contours(
         if contact is not None:
             ax.add_patch(Circle((0, 0), contact, fill=False, color=GREY, linewidth=0.8))
         ax.set_aspect("equal")
-    assert filled is not None
     letters = sorted({"xy"[c] for _, _, c in panels})
     name = f"force on i, {' and '.join(f'$F_{letter}$' for letter in letters)} (N)"
-    bar = figure.colorbar(
-        filled, ax=[ax for ax, _, _ in panels], label=name, shrink=0.85, pad=0.02, aspect=30
-    )
+    bar = colour_bar(figure, filled, (ax for ax, *_ in panels), name, shrink=0.85)
     middles = (levels[1:] + levels[:-1]) / 2
     # every second colour, among them the neutral one
     bar.set_ticks([float(m) for m in middles[len(middles) // 2 % 2 :: 2]])
-    bar.ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
-    bar.ax.yaxis.label.set_fontsize(FONT)
     title = describe(term, part)
     left_out = omitted_effects(system)
     if left_out:
@@ -211,7 +204,7 @@ def _contours(
 def _lines(
     ax: Axes, side: np.ndarray, field: np.ma.MaskedArray, levels: np.ndarray, style: str
 ) -> None:
-    """Contour lines, which tell the sign where colours are lost."""
+    """Draw contour lines, whose style shows the sign without colours."""
     values = field.compressed()
     met = [level for level in levels if values.size and values.min() < level < values.max()]
     if met:
@@ -219,10 +212,10 @@ def _lines(
 
 
 def _levels(fields: np.ndarray) -> tuple[np.ndarray, Any, float]:
-    """Levels, which ends are open, and the largest size of a field.
+    """Levels, the open ends of the scale, and the largest absolute value of a field.
 
-    The levels lie half a step off the multiples of the step, so that forces about zero get one
-    neutral colour instead of two.
+    The levels are shifted by half a step from the multiples of the step, so that forces about zero
+    have one neutral colour instead of two.
     """
     size = np.abs(fields[np.isfinite(fields)])
     peak = float(size.max()) if size.size else 0.0

@@ -1,4 +1,4 @@
-"""One compact figure of what a model has learned, whatever its domain."""
+"""A compact figure of a model of either domain."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def force_figure(system: System, sequences: Iterable[Sequence] = ()) -> Figure:
     """The speed curve of a traffic model, or both force components of a head-on pair of people.
 
     Args:
-        sequences: measured ones, which are drawn behind: gaps and speeds of followers, or positions
+        sequences: measured sequences, drawn as points: gaps and speeds of followers, or positions
             of people relative to others.
 
     Raises:

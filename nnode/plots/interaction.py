@@ -69,7 +69,7 @@ def evaluate_force(
 
 
 def force_range(term: InteractionForce) -> str:
-    """``short`` for the social force, ``long`` for others: the paper draws them differently."""
+    """``short`` for the social force, ``long`` for others; the paper draws them differently."""
     return "short" if term.entry == "social_force" else "long"
 
 
@@ -85,7 +85,7 @@ def chosen_part(term: InteractionForce, part: str | None) -> str:
 
 
 def describe(term: InteractionForce, part: str | None) -> str:
-    """What is drawn, for a title."""
+    """The name of the force and its part, for a title."""
     part = chosen_part(term, part)
     if part == "sum":
         part = "pair + wall" if term.walls else "pair"

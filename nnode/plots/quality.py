@@ -1,4 +1,4 @@
-"""Pictures of faulty sequences, to be judged by eye."""
+"""Figures of sequences with faults, for a visual check."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nnode.data.quality import KINDS, Fault
 from nnode.data.sequence import Domain, Sequence
 from nnode.plots.style import GREY, OKABE_ITO, SMALL_FONT, dress, new_figure, save
 
-#: Faulty sequences in one figure; more would not be legible.
+#: Largest number of faulty sequences in a figure.
 MAX_PANELS = 60
 COLUMNS = 5
 
@@ -47,14 +47,14 @@ def faults_figure(
     domain: Domain,
     most: int = MAX_PANELS,
 ) -> Figure:
-    """The faulty ones of some sequences as space-time lines, faults marked.
+    """Space-time lines of sequences with faults, which are marked.
 
     Args:
-        sequences: with and without faults.
-        faults: by the sequence's name.
+        sequences: sequences with and without faults.
+        faults: name of a sequence to its faults.
         domain: in a crowd the axis of the greater extent is drawn, and people without a fault
             are grey.
-        most: sequences that are drawn.
+        most: largest number of drawn sequences.
     """
     faulty = [s for s in sequences if faults.get(s.name)]
     shown = faulty[:most]
@@ -101,8 +101,8 @@ def _bars(
     dress(axes, x="sequences", title=title, grid=False)
 
 
-def _panel(axes: Axes, s: Sequence, found: list[Fault], domain: Domain) -> None:
-    involved = {i for fault in found for i in fault.agents}
+def _panel(axes: Axes, s: Sequence, faults: list[Fault], domain: Domain) -> None:
+    involved = {i for fault in faults for i in fault.agents}
     finite = np.where(np.isfinite(s.x), s.x, np.nan)
     axis = 0
     if domain == "crowd" and np.isfinite(finite).any():
@@ -118,7 +118,7 @@ def _panel(axes: Axes, s: Sequence, found: list[Fault], domain: Domain) -> None:
             marker="" if domain == "crowd" else ".",
             markersize=3,
         )
-    for fault in found:
+    for fault in faults:
         colour, marker = STYLES[fault.kind]
         k = 0 if fault.time is None else int(np.argmin(np.abs(s.time - fault.time)))
         agents = list(fault.agents) or [0]

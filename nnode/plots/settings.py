@@ -1,9 +1,10 @@
-"""Forces on two people in six settings: who stands where, walks how, and is pushed where."""
+"""Forces on two people in six settings of positions and velocities."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -37,24 +38,23 @@ class Setting:
     v_red: Vector
 
 
-def _settings(ahead: float, beside: float) -> tuple[Setting, ...]:
-    """The six settings; people are 2 ``ahead`` (m) or 2 ``beside`` (m) apart."""
+def _settings(ahead: float, lateral: float) -> tuple[Setting, ...]:
+    """The six settings; people are 2 ``ahead`` (m) or 2 ``lateral`` (m) apart."""
     places = (
         ((0.0, ahead), (0.0, -ahead)),
         ((0.01, ahead), (-0.01, -ahead)),
-        ((beside, 0.0), (-beside, 0.0)),
+        ((lateral, 0.0), (-lateral, 0.0)),
     )
-    found: list[Setting] = []
-    for blue, red in places:
-        for v_blue in ((0.0, -1.0), (0.0, 1.0)):
-            found.append(Setting(f"S{len(found) + 1}", blue, red, v_blue, (0.0, 1.0)))
-    return tuple(found)
+    pairs = product(places, ((0.0, -1.0), (0.0, 1.0)))
+    return tuple(
+        Setting(f"S{i}", *place, v_blue, (0.0, 1.0)) for i, (place, v_blue) in enumerate(pairs, 1)
+    )
 
 
 #: Source: Göttlich & Totzeck, tables (data6settings) and (data6settingsNN).
 SETTINGS = {
-    "short": _settings(ahead=0.22, beside=0.22),
-    "long": _settings(ahead=4.0, beside=0.5),
+    "short": _settings(ahead=0.22, lateral=0.22),
+    "long": _settings(ahead=4.0, lateral=0.5),
 }
 
 
@@ -63,12 +63,13 @@ def six_settings(
 ) -> tuple[Figure, pd.DataFrame]:
     """Forces on two people in the paper's six settings, drawn and as a table.
 
-    Left, the people face each other; right, they walk in the same direction. Arrows have one
-    scale in all panels, given by the keys above them; every panel has its own section of space.
+    On the left, the people face each other; on the right, they walk in the same direction. Arrows
+    have one scale in all panels, which the keys above the panels show. The panels show different
+    sections of space.
 
     Args:
-        settings: default are the paper's: 0.44 m apart for the social force, 8 m or 1 m apart
-            otherwise.
+        settings: settings; by default those of the paper, in which people are 0.44 m apart for the
+            social force, and 8 m or 1 m for other forces.
         part: see :func:`evaluate_force`.
 
     Returns:
@@ -76,7 +77,7 @@ def six_settings(
         ``v_blue``, ``v_red`` (m/s), ``force_blue``, ``force_red`` (N); each cell is (x, y).
 
     Raises:
-        ConfigError: no settings, no interaction force, or a part that does not exist.
+        ConfigError: no settings, no interaction force, or an unknown part.
 
     Source: Göttlich & Totzeck, tables (data6settings), (data6settingsNN), figures (6Helbing),
     (6NN).
@@ -85,21 +86,11 @@ def six_settings(
     chosen = SETTINGS[force_range(term)] if settings is None else tuple(settings)
     if not chosen:
         raise ConfigError("six_settings needs at least one setting, got none")
-    dx = np.array([s.x_blue for s in chosen]) - np.array([s.x_red for s in chosen])
-    dv = np.array([s.v_blue for s in chosen]) - np.array([s.v_red for s in chosen])
-    blue = evaluate_force(system, dx, dv, part)
-    red = evaluate_force(system, -dx, -dv, part)
-    table = pd.DataFrame(
-        {
-            "setting": [s.name for s in chosen],
-            **{
-                column: [getattr(s, column) for s in chosen]
-                for column in ("x_blue", "x_red", "v_blue", "v_red")
-            },
-            "force_blue": [tuple(map(float, force)) for force in blue],
-            "force_red": [tuple(map(float, force)) for force in red],
-        }
-    )
+    table = pd.DataFrame(map(vars, chosen)).rename(columns={"name": "setting"})
+    dx, dv = (np.subtract([*table[f"{k}_blue"]], [*table[f"{k}_red"]]) for k in "xv")
+    for person, sign in (("blue", 1), ("red", -1)):
+        force = evaluate_force(system, sign * dx, sign * dv, part)
+        table[f"force_{person}"] = [tuple(map(float, row)) for row in force]
     what = ", ".join(filter(None, (describe(term, part), omitted_effects(system))))
     return _quivers(table, what), table
 
@@ -145,7 +136,7 @@ def _quivers(table: pd.DataFrame, what: str) -> Figure:
 
 
 def _longest(table: pd.DataFrame, kind: str) -> float:
-    """Largest length of a vector in the table; 1 where all vanish."""
+    """Largest length of a vector in the table; 1 if all are zero."""
     norms = np.hypot(*np.array([*table[f"{kind}_blue"], *table[f"{kind}_red"]]).T)
     return float(np.max(norms[np.isfinite(norms)], initial=0.0)) or 1.0
 
@@ -153,7 +144,7 @@ def _longest(table: pd.DataFrame, kind: str) -> float:
 def _arrow(
     ax: Axes, kind: str, where: Vector, vector: Vector, scale: dict[str, float], **style: Any
 ) -> None:
-    # a length in inches reads the same in every panel, whatever space the panel shows
+    # a length in inches is the same in panels that show different sections of space
     ax.quiver(
         *where,
         *vector,
@@ -180,7 +171,7 @@ def _person(ax: Axes, person: str, where: Vector) -> None:
 
 
 def _key(ax: Axes, longest: dict[str, float], scale: dict[str, float]) -> None:
-    """One row that says what markers and arrows mean and how long they are."""
+    """Draw the legend of markers and arrows, with the lengths of the arrows."""
     width = WIDTH * 0.9  # inches, about
     ax.set(xlim=(0, 1), ylim=(0, 1))
     ax.set_axis_off()

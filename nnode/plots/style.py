@@ -1,12 +1,17 @@
-"""One restrained look for all figures: colour-blind safe, readable in grey, units on the axes."""
+"""The common style of figures: safe for colour-blind readers and in grey, with units on axes."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axes._secondary_axes import SecondaryAxis
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -49,7 +54,7 @@ DPI = 150
 
 
 class Picture(Figure):
-    """A figure that a notebook shows without Matplotlib's global state."""
+    """A figure that notebooks show without Matplotlib's global state."""
 
     def _repr_png_(self) -> bytes:
         stream = io.BytesIO()
@@ -58,12 +63,12 @@ class Picture(Figure):
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of ``width`` by ``height`` inches that no global state keeps open."""
+    """An empty figure of ``width`` by ``height`` inches, outside Matplotlib's global state."""
     return Picture(figsize=(width, height), layout="constrained")
 
 
 def curve_style(index: int) -> dict[str, Any]:
-    """Colour, line style and marker of the ``index``-th curve; they repeat after seven."""
+    """Colour, line style and marker of the ``index``-th curve, which repeat after seven."""
     i = index % len(OKABE_ITO)
     return {
         "color": list(OKABE_ITO.values())[i],
@@ -72,10 +77,46 @@ def curve_style(index: int) -> dict[str, Any]:
     }
 
 
+def set_ticks(axes: Axes | SecondaryAxis) -> None:
+    """Give the ticks of an axes their size and colour."""
+    axes.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+
+
+def colour_bar(
+    figure: Figure, drawn: ScalarMappable, axes: Iterable[Axes], label: str, **options: Any
+) -> Colorbar:
+    """Draw the scale of colours beside all panels."""
+    bar = figure.colorbar(drawn, ax=list(axes), aspect=30, pad=0.02, **options)
+    bar.set_label(label, fontsize=FONT)
+    set_ticks(bar.ax)
+    return bar
+
+
+def legend_above(figure: Figure, handles: list[Any], columns: int = 3) -> None:
+    """Draw the legend of all panels above them."""
+    figure.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=columns,
+        frameon=False,
+        fontsize=SMALL_FONT,
+    )
+
+
+def thinned(points: np.ndarray, number: int) -> np.ndarray:
+    """At most ``number`` of the points, at equal steps."""
+    return points[:: max(1, -(-len(points) // number))]
+
+
+def with_unit(name: str, unit: str) -> str:
+    """A quantity's name with its unit, if it has one."""
+    return name if unit in ("", "1") else f"{name} ({unit})"
+
+
 def dress(ax: Axes, *, x: str = "", y: str = "", title: str = "", grid: bool = True) -> None:
     """Give an axes its labels (with units), fonts and, behind the data, a pale grid."""
-    # set per axes: ticks are created late and would take the fonts of whoever draws
-    ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+    # ticks are created late and would take the fonts that are set when the figure is drawn
+    set_ticks(ax)
     for spine in ax.spines.values():
         spine.set_linewidth(0.6)
         spine.set_edgecolor(GREY)
@@ -91,13 +132,13 @@ def dress(ax: Axes, *, x: str = "", y: str = "", title: str = "", grid: bool = T
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Write ``figure`` as PNG with 150 dots per inch; a reader never sees half a file.
+    """Write a figure as PNG with 150 dots per inch.
 
     The file has a palette of 256 colours, which takes a third of the bytes. Missing folders are
-    made. An existing file is replaced.
+    created. An existing file is replaced as a whole.
 
     Returns:
-        The path written.
+        The path.
 
     Raises:
         ConfigError: the path does not end in ``.png``, or its folder cannot be written to.

@@ -1,4 +1,4 @@
-"""What a traffic model has learned: speed as a function of the gap."""
+"""Figures of traffic models: speed as a function of the gap, errors of followers, drivers."""
 
 from __future__ import annotations
 
@@ -28,18 +28,21 @@ from nnode.plots.style import (
     curve_style,
     dress,
     new_figure,
+    set_ticks,
+    thinned,
+    with_unit,
 )
 
-#: Speeds (m/s) that are shown at most; the laws have a pole at gap 0.
+#: Range of shown speeds (m/s); the laws have a pole at gap 0.
 SHOWN = (-20.0, 60.0)
-#: Gaps between these percentiles count as supported by the data.
+#: Percentiles between which gaps count as supported by the data.
 SUPPORT = (1.0, 99.0)
 KMH = 3.6
 SAMPLES = 481
 #: Gaps (m) of a figure.
 SPAN = (2.0, 50.0)
 BINS = 48
-#: Measured samples that a figure shows at most.
+#: Largest number of measured samples in a figure.
 POINTS = 3000
 
 
@@ -96,8 +99,7 @@ def measured_speeds(
             gap = gap - np.tile(ahead, len(s.x))
         speed = s.v if s.v is not None else np.gradient(s.x, s.dt, axis=0)
         parts.append(np.column_stack([gap, speed[:, :-1, 0].ravel()]))
-    found = np.concatenate(parts)
-    return found[:: max(1, -(-len(found) // number))]
+    return thinned(np.concatenate(parts), number)
 
 
 @torch.no_grad()
@@ -194,7 +196,7 @@ def speed_curves(
     _limit(ax, table, [*leaders.values(), *shown], _left_out(models))
     right = ax.secondary_yaxis("right", functions=(_to_kmh, _from_kmh))
     right.set_ylabel(f"{what} (km/h)", fontsize=ax.yaxis.label.get_fontsize())
-    right.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
+    set_ticks(right)
     right.spines["right"].set(linewidth=0.6, edgecolor=GREY)
     right_half = table.to_numpy()[SAMPLES // 2 :]
     bottom, top = ax.get_ylim()
@@ -304,7 +306,7 @@ def _curve(
 
 
 def _left_out(models: Mapping[str, System]) -> list[str]:
-    """Which effects the curves are drawn without."""
+    """Remarks on effects that the curves do not include."""
     effects = {name: omitted_effects(system) for name, system in models.items()}
     having = {name: words for name, words in effects.items() if words}
     if len(having) > 2:
@@ -313,7 +315,7 @@ def _left_out(models: Mapping[str, System]) -> list[str]:
 
 
 def _limit(ax: Axes, table: pd.DataFrame, leaders: list[float], extra: list[str]) -> None:
-    """Keep the speed axis legible, and say what it cuts and what else is not shown."""
+    """Limit the axis of speeds, and note what is cut or not shown."""
     values = np.concatenate([table.to_numpy().ravel(), leaders, [0.0]])
     values = values[np.isfinite(values)]
     bottom, top = max(values.min(), SHOWN[0]), min(values.max(), SHOWN[1])
@@ -380,9 +382,9 @@ def driver_figure(
 
     Args:
         table: a row per driver with ``NAME`` and ``NAME_error``.
-        names: the parameters, a panel each.
-        variability: by name the standard deviation between drivers, ``estimate`` in %.
-        units: by name.
+        names: the parameters, one panel each.
+        variability: table by name with the standard deviation between drivers, ``estimate``, %.
+        units: name to unit.
     """
     figure = new_figure(1.2 + 3.4 * len(names), 3.4)
     panels = figure.subplots(1, len(names), squeeze=False)[0]
@@ -400,7 +402,6 @@ def driver_figure(
         )
         ax.axvline(float(rows[name].median()), color=GREY, linewidth=0.8, linestyle="--")
         title = f"standard deviation between drivers {variability.estimate[name]:.3g} %"
-        unit = units.get(name, "")
-        label = name if unit in ("", "1") else f"{name} ({unit})"
+        label = with_unit(name, units.get(name, ""))
         dress(ax, x=label, y="driver, in order" if i == 0 else "", title=title)
     return figure

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.model.steps import METHODS
 from nnode.model.system import System, with_parameters
 from nnode.simulation.base import (
@@ -77,9 +77,8 @@ class FusedSolver:
         if threads < 1:
             raise ConfigError(f"solver.threads={threads} must be a whole number of at least 1")
         if method is not None and method not in METHODS:
-            raise ConfigError(
-                f"solver.method={method} is unknown to solver=fused, expected one of "
-                f"{', '.join(METHODS)}, or null for the law's own"
+            raise unknown_value(
+                "solver=fused solver.method", method, METHODS, ", or null for the law's own"
             )
         crowds.check_cutoff(cutoff, cutoff_error)
         self.dt, self.threads = dt, threads

@@ -12,7 +12,7 @@ from torchdiffeq._impl.odeint import SOLVERS
 from torchdiffeq._impl.solvers import FixedGridODESolver
 
 from nnode.data.sequence import Batch
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.model.steps import METHODS, STAGES
 from nnode.model.system import System
 from nnode.simulation.base import (
@@ -105,14 +105,9 @@ class TorchdiffeqSolver:
         atol: float = 1e-8,
     ) -> None:
         if method is not None and method not in {*SOLVERS, *METHODS}:
-            raise ConfigError(
-                f"solver.method={method} is unknown, expected one of "
-                f"{', '.join(sorted({*SOLVERS, *METHODS}))}"
-            )
+            raise unknown_value("solver.method", method, sorted({*SOLVERS, *METHODS}))
         if gradient not in GRADIENTS:
-            raise ConfigError(
-                f"solver.gradient={gradient} is unknown, expected {' or '.join(GRADIENTS)}"
-            )
+            raise unknown_value("solver.gradient", gradient, GRADIENTS)
         if gradient == "discrete" and method == "scipy_solver":
             raise ConfigError(
                 "solver.method=scipy_solver leaves no graph to differentiate; use "

@@ -7,7 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -67,12 +67,20 @@ def environment() -> dict[str, str]:
     return {**os.environ, "OMP_NUM_THREADS": "1", "NNODE_DATA": ""}
 
 
+def ended(
+    done: subprocess.CompletedProcess[str], status: int | None
+) -> subprocess.CompletedProcess[str]:
+    """A script's result, which ended with this exit status; None allows any."""
+    assert status in (None, done.returncode), done.stdout + done.stderr
+    return done
+
+
 def start_script(
-    name: str, *overrides: str, cwd: Path = ROOT, **env: str
+    name: str, *overrides: str, status: int | None = 0, cwd: Path = ROOT, **env: str
 ) -> subprocess.CompletedProcess[str]:
     """What :func:`started` gives; in place of a script's name may stand code, of several lines."""
     what = ["-c", name] if "\n" in name else [f"scripts/{name}.py"]
-    return subprocess.run(
+    done = subprocess.run(
         [sys.executable, *what, *overrides],
         cwd=cwd,
         env={**environment(), **env},
@@ -81,11 +89,29 @@ def start_script(
         timeout=900,
         check=False,
     )
+    return ended(done, status)
+
+
+def background(
+    *command: str, program: Sequence[str] = (sys.executable, "scripts/train.py"), **env: str
+) -> subprocess.Popen[str]:
+    """A process in the background, by default a training, whose streams can be read."""
+    return subprocess.Popen(
+        [*program, *command],
+        cwd=ROOT,
+        env={**environment(), **env},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 @pytest.fixture(scope="session")
 def started() -> Script:
-    """Run ``scripts/<name>.py`` with overrides in a new Python, as a user does."""
+    """Run ``scripts/<name>.py`` with overrides in a new Python, as a user does.
+
+    The exit status must be ``status``, 0 by default; None allows any.
+    """
     return start_script
 
 
@@ -100,4 +126,12 @@ def forks() -> Iterator[Forks]:
 @pytest.fixture(scope="session")
 def script(forks: Forks) -> Script:
     """The same as ``started`` in a process that is forked, where the system can."""
-    return forks.run if hasattr(os, "fork") else start_script
+    if not hasattr(os, "fork"):
+        return start_script
+
+    def run(
+        name: str, *overrides: str, status: int | None = 0, **env: str
+    ) -> subprocess.CompletedProcess[str]:
+        return ended(forks.run(name, *overrides, **env), status)
+
+    return run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,67 +17,42 @@ from nnode.data.sequence import Sequence
 from tests.app.following import table
 from tests.calibrate.test_gauss_newton_people import TRUTH, crowd
 
-#: The same platoons in other words: what changes, and the options that go with it.
 Form = Callable[[pd.DataFrame], pd.DataFrame]
 STAMP = pd.Timestamp("2024-05-06 07:08:09")
 
 
-def at_map_coordinates(t: pd.DataFrame) -> pd.DataFrame:
-    return t.assign(x=t.x + 5_340_000.0)
-
-
-def later(t: pd.DataFrame) -> pd.DataFrame:
-    return t.assign(time=t.time + 1e6)
-
-
-def with_dates(t: pd.DataFrame) -> pd.DataFrame:
-    return t.assign(time=STAMP + pd.to_timedelta(t.time, unit="s"))
-
-
-def with_clock_times(t: pd.DataFrame) -> pd.DataFrame:
-    return t.assign(time=[(STAMP + pd.Timedelta(s, "s")).strftime("%H:%M:%S.%f") for s in t.time])
-
-
-def in_nanoseconds(t: pd.DataFrame) -> pd.DataFrame:
-    since = STAMP.value + (t.time * 1e9).round().astype("int64")
-    return t.assign(time=since)
-
-
-def renamed(t: pd.DataFrame) -> pd.DataFrame:
+#: Name to what changes, and the options that go with it.
+FORMS: dict[str, tuple[Form, dict[str, Any]]] = {
+    "at map coordinates": (lambda t: t.assign(x=t.x + 5_340_000.0), {}),
+    "later": (lambda t: t.assign(time=t.time + 1e6), {}),
+    "with dates": (lambda t: t.assign(time=STAMP + pd.to_timedelta(t.time, unit="s")), {}),
+    "with clock times": (
+        lambda t: t.assign(
+            time=[(STAMP + pd.Timedelta(s, "s")).strftime("%H:%M:%S.%f") for s in t.time]
+        ),
+        {},
+    ),
+    "in nanoseconds": (
+        lambda t: t.assign(time=STAMP.value + (t.time * 1e9).round().astype("int64")),
+        {"time_unit": "ns"},
+    ),
     # in the order of the names before, so that clusters are drawn alike
-    return t.assign(
-        agent="car no. " + t.agent.astype(str), sequence="run " + t.sequence.astype(str)
-    )
-
-
-def shuffled(t: pd.DataFrame) -> pd.DataFrame:
-    return t.sample(frac=1.0, random_state=5)
-
-
-def in_feet(t: pd.DataFrame) -> pd.DataFrame:
-    return t.assign(x=t.x / 0.3048, length=t.length / 0.3048)
-
-
-def in_frames(t: pd.DataFrame) -> pd.DataFrame:
-    return t.assign(time=(t.time / 0.1).round().astype(int))
-
-
-OPTIONS = {
-    in_nanoseconds: {"time_unit": "ns"},
-    in_feet: {"position_unit": "ft"},
-    in_frames: {"time_unit": "frame", "frame_rate": 10.0},
+    "renamed": (
+        lambda t: t.assign(
+            agent="car no. " + t.agent.astype(str), sequence="run " + t.sequence.astype(str)
+        ),
+        {},
+    ),
+    "shuffled": (lambda t: t.sample(frac=1.0, random_state=5), {}),
+    "in feet": (
+        lambda t: t.assign(x=t.x / 0.3048, length=t.length / 0.3048),
+        {"position_unit": "ft"},
+    ),
+    "in frames": (
+        lambda t: t.assign(time=(t.time / 0.1).round().astype(int)),
+        {"time_unit": "frame", "frame_rate": 10.0},
+    ),
 }
-FORMS: list[Form] = [
-    at_map_coordinates,
-    later,
-    with_dates,
-    with_clock_times,
-    in_nanoseconds,
-    renamed,
-    shuffled,
-    in_feet,
-    in_frames,
-]
 
 
 def fitted(given: nnode.Sequences) -> pd.DataFrame:
@@ -94,11 +70,12 @@ def known(platoons: pd.DataFrame) -> pd.DataFrame:
     return fitted(nnode.sequences(platoons))
 
 
-@pytest.mark.parametrize("form", FORMS, ids=lambda form: form.__name__)
+@pytest.mark.parametrize("form", FORMS)
 def test_a_fit_does_not_depend_on_how_the_table_is_written(
-    platoons: pd.DataFrame, known: pd.DataFrame, form: Form
+    platoons: pd.DataFrame, known: pd.DataFrame, form: str
 ) -> None:
-    found = fitted(nnode.sequences(form(platoons), **OPTIONS.get(form, {})))
+    change, options = FORMS[form]
+    found = fitted(nnode.sequences(change(platoons), **options))
     # at a map's coordinates positions have lost the digits below 1e-9 m
     np.testing.assert_allclose(found.estimate, known.estimate, rtol=1e-5)
 

@@ -23,15 +23,13 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
     table["length"] /= 0.3048
     file = saved(table.rename(columns={"veh": "Vehicle ID"}), tmp_path, "my cars.csv")
     done = script("check", str(file), f"hydra.run.dir={tmp_path / 'run'}")
-    assert done.returncode == 0, done.stderr
     assert "12 vehicles, 4812 positions, sampled every 0.1 s: 0 errors and 1 warning" in done.stdout
     assert "WARN  direction: all vehicles drive towards smaller positions" in done.stdout
     page = (tmp_path / "run" / "check.html").read_text(encoding="utf-8")
     assert "Check of my cars.csv" in page
     (line,) = [line for line in done.stdout.splitlines() if "nnode prepare_data" in line]
     words = shlex.split(line)[2:]
-    read = script("prepare_data", *words, f"hydra.run.dir={tmp_path / 'data'}")
-    assert read.returncode == 0, read.stderr
+    script("prepare_data", *words, f"hydra.run.dir={tmp_path / 'data'}")
     options = Store(tmp_path / "data").manifest["options"]
     assert (options["position_unit"], options["time_unit"]) == ("ft", "ms")
     assert options["direction"] == -1
@@ -55,16 +53,21 @@ def test_what_cannot_be_looked_at_is_told_in_a_line(
 ) -> None:
     (tmp_path / "junk.csv").write_bytes(bytes(range(256)))
     given = [option.replace("$T", str(tmp_path)) for option in options]
-    done = script("check", *given, f"hydra.run.dir={tmp_path / 'run'}")
+    done = script("check", *given, f"hydra.run.dir={tmp_path / 'run'}", status=None)
     assert done.returncode in (1, 2)
     assert words in done.stderr
     assert "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_the_text_says_all(tmp_path: Path) -> None:
-    head = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
-    found = examine(text(people(), tmp_path, head, 100.0))
+@pytest.fixture
+def pedpy(tmp_path: Path) -> Path:
+    """People in the format of PedPy, in cm."""
+    return text(people(), tmp_path, "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n", 100.0)
+
+
+def test_the_text_says_all(pedpy: Path) -> None:
+    found = examine(pedpy)
     assert sentence(found).startswith("40 people, ")
     told = summary(found, ["data=pedpy", "data.path=X"])
     assert "columns: agent = column 1, frame = column 2, x = column 3, y = column 4" in told
@@ -74,12 +77,10 @@ def test_the_text_says_all(tmp_path: Path) -> None:
         assert one.text in told
 
 
-def test_in_python_it_is_an_object(tmp_path: Path) -> None:
-    head = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
-    path = text(people(), tmp_path, head, 100.0)
-    found = nnode.check(path)
+def test_in_python_it_is_an_object(pedpy: Path, tmp_path: Path) -> None:
+    found = nnode.check(pedpy)
     assert isinstance(found, nnode.Check)
-    assert repr(found).splitlines()[0] == f"{path}: {sentence(found.examination)}"
+    assert repr(found).splitlines()[0] == f"{pedpy}: {sentence(found.examination)}"
     assert found.options[0] == "data=pedpy"
     assert found.probability > 0.99
     assert "<p>40 people, " in found._repr_html_()
@@ -87,4 +88,4 @@ def test_in_python_it_is_an_object(tmp_path: Path) -> None:
         assert one.kind in found._repr_html_()
     assert found.write(tmp_path / "page").name == "check.html"
     with pytest.raises(ConfigError, match="domain=sea: expected traffic, crowd, or null"):
-        nnode.check(path, "sea")  # type: ignore[arg-type]
+        nnode.check(pedpy, "sea")  # type: ignore[arg-type]

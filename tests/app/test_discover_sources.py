@@ -49,44 +49,35 @@ def pedpy(tmp_path: Path) -> Path:
     return tmp_path / "walk.txt"
 
 
-def diagnosed(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
-    done = script("discover", *overrides, "discover.page=false", f"hydra.run.dir={folder}")
-    assert done.returncode == 0, done.stderr
+@pytest.mark.parametrize(
+    ("source", "options"),
+    [
+        # their law has no inertia
+        (
+            "highd",
+            [
+                "model=lin",
+                "model.leader=measured",
+                "data.window=null",
+                "discover.effects=[inertia]",
+            ],
+        ),
+        # nobody sways
+        ("pedpy", ["model=sf", "model.B=0.3", "data.t_seq=2", "discover.effects=[gait_sway]"]),
+    ],
+)
+def test_a_diagnosis_ends_with_a_verdict(
+    request: pytest.FixtureRequest, script: Script, tmp_path: Path, source: str, options: list[str]
+) -> None:
+    path: Path = request.getfixturevalue(source)
+    given = [*options, f"data={source}", f"data.path={path}"]
+    given += [f"data.geometry={area}" for area in path.parent.glob("area.wkt")]
+    folder = tmp_path / "run"
+    done = script("discover", *given, "discover.page=false", f"hydra.run.dir={folder}")
     report: dict[str, Any] = json.loads((folder / "report.json").read_text())
     assert f"verdict: {report['verdict']}" in done.stdout
     # six open clusters are as many as it takes to test one effect
     assert report["clusters"]["open"] == report["clusters"]["least"] == 6
-    return report
-
-
-def test_highd_ends_with_a_verdict(highd: Path, script: Script, tmp_path: Path) -> None:
-    report = diagnosed(
-        script,
-        tmp_path / "run",
-        "model=lin",
-        "model.leader=measured",
-        "data=highd",
-        f"data.path={highd}",
-        "data.window=null",
-        "discover.effects=[inertia]",
-    )
-    assert report["verdict"] in ("none", "unknown")  # their law has no inertia
-    assert report["effects"] == report["data_faults"] == []
-    assert len(report["split"]["open"]) + len(report["split"]["sealed"]) == 9
-
-
-def test_pedpy_ends_with_a_verdict(pedpy: Path, script: Script, tmp_path: Path) -> None:
-    report = diagnosed(
-        script,
-        tmp_path / "run",
-        "model=sf",
-        "model.B=0.3",
-        "data=pedpy",
-        f"data.path={pedpy}",
-        f"data.geometry={pedpy.with_name('area.wkt')}",
-        "data.t_seq=2",
-        "discover.effects=[gait_sway]",
-    )
-    assert report["verdict"] in ("none", "unknown")  # nobody sways
+    assert report["verdict"] in ("none", "unknown")
     assert report["effects"] == report["data_faults"] == []
     assert len(report["split"]["open"]) + len(report["split"]["sealed"]) == 9

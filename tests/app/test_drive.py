@@ -68,7 +68,6 @@ def test_the_script(script: Script, scene: Path, tmp_path: Path) -> None:
     run, out = run_of(tmp_path / "run", "idm"), tmp_path / "out"
     options = [f"run={run}", f"sumo={scene}", "program=traci", "lengths=true"]
     done = script("drive", *options, "vehicles=own", f"hydra.run.dir={out}")
-    assert done.returncode == 0, done.stderr
     account = json.loads((out / "drive.json").read_text())
     assert (account["driven"], account["steps"], account["collisions"]) == (7, 200, 0)
     assert "driven: 7 vehicles, mean " in done.stdout
@@ -79,8 +78,7 @@ def test_the_script(script: Script, scene: Path, tmp_path: Path) -> None:
     store = prepare(SumoOptions(path=str(out / "fcd.xml.gz")), tmp_path / "store")
     assert len(store) == 1
 
-    done = script("drive", *options, "vehicles=car", f"hydra.run.dir={out}")
-    assert done.returncode == 2
+    done = script("drive", *options, "vehicles=car", f"hydra.run.dir={out}", status=2)
     assert "error: vehicles=car is no vehicle type of the scenario, it has lead, own" in done.stderr
 
 
@@ -108,7 +106,7 @@ def test_steps_are_those_of_the_run(scene: Path, tmp_path: Path) -> None:
     assert (found.step, found.method, found.steps) == (0.05, "semi_implicit", 400)
     found = nnode.drive(run, folder=tmp_path, steps="scenario", **options)
     assert (found.step, found.method, found.steps) == (0.1, "ballistic", 200)
-    with pytest.raises(ConfigError, match="steps=any is unknown, expected match, run, scenario"):
+    with pytest.raises(ConfigError, match="steps=any is unknown, expected one of match"):
         nnode.drive(run, folder=tmp_path, steps="any", **options)
 
 

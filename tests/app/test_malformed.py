@@ -2,36 +2,32 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-Script = Callable[..., subprocess.CompletedProcess[str]]
+from tests.app.conftest import Script
 
 HEAD = "vehicle,time,x\n"
 ROWS = "".join(f"{v},{0.2 * k:.1f},{30 * v + 5 * k}\n" for v in range(4) for k in range(6))
 TABLE = "sequence,time,agent,x\n"
 
+VEHICLES = ("data=vehicles", "data.columns={vehicle: vehicle, time: time, x: x}")
+Make = Callable[[Path, Path], list[str]]
 
-def _csv(text: str) -> Callable[[Path, Path], list[str]]:
+
+def _file(text: str, *options: str) -> Make:
     def make(folder: Path, raw: Path) -> list[str]:
         path = folder / "cars.csv"
         path.write_text(text)
-        columns = "data.columns={vehicle: vehicle, time: time, x: x}"
-        return ["data=vehicles", f"data.path={path}", columns]
+        return [*(options or VEHICLES), f"data.path={path}"]
 
     return make
 
 
-def _tidy(text: str) -> Callable[[Path, Path], list[str]]:
-    def make(folder: Path, raw: Path) -> list[str]:
-        path = folder / "own.csv"
-        path.write_text(text)
-        return ["data=table", f"data.path={path}", "data.domain=traffic"]
-
-    return make
+def _demo(*options: str) -> Make:
+    return lambda folder, raw: ["data=demo_traffic", f"data.source={raw}", *options]
 
 
 def _truncated(folder: Path, raw: Path) -> list[str]:
@@ -41,23 +37,22 @@ def _truncated(folder: Path, raw: Path) -> list[str]:
     return ["data=demo_traffic", f"data.source={folder}"]
 
 
-def _unknown(folder: Path, raw: Path) -> list[str]:
-    return ["data=demo_traffic", f"data.source={raw}", "data.recording=demo2"]
-
-
-def _step(folder: Path, raw: Path) -> list[str]:
-    return ["data=demo_traffic", f"data.source={raw}", "solver.dt=0.003"]
-
-
 CASES = {
-    "wrong columns": (_csv("car,when,where\n1,0,0\n"), ["cars.csv", "vehicle"]),
-    "text in a number": (_csv(HEAD + ROWS + "3,1.2,far\n"), ["cars.csv", "26", "far"]),
-    "empty file": (_csv(""), ["cars.csv", "empty"]),
+    "wrong columns": (_file("car,when,where\n1,0,0\n"), ["cars.csv", "vehicle"]),
+    "text in a number": (_file(HEAD + ROWS + "3,1.2,far\n"), ["cars.csv", "26", "far"]),
+    "empty file": (_file(""), ["cars.csv", "empty"]),
     "truncated mat": (_truncated, ["sequence_datademo.mat"]),
-    "one vehicle": (_csv(HEAD + "".join(f"1,{0.2 * k:.1f},{k}\n" for k in range(9))), ["vehicle"]),
-    "NaN": (_tidy(TABLE + "a,0,1,0\na,0,2,9\na,1,1,nan\na,1,2,19\na,2,1,9\na,2,2,29\n"), []),
-    "unknown recording": (_unknown, ["demo2"]),
-    "dt that does not divide": (_step, ["solver.dt", "0.2 s"]),
+    "one vehicle": (_file(HEAD + "".join(f"1,{0.2 * k:.1f},{k}\n" for k in range(9))), ["vehicle"]),
+    "NaN": (
+        _file(
+            TABLE + "a,0,1,0\na,0,2,9\na,1,1,nan\na,1,2,19\na,2,1,9\na,2,2,29\n",
+            "data=table",
+            "data.domain=traffic",
+        ),
+        [],
+    ),
+    "unknown recording": (_demo("data.recording=demo2"), ["demo2"]),
+    "dt that does not divide": (_demo("solver.dt=0.003"), ["solver.dt", "0.2 s"]),
 }
 
 
@@ -65,7 +60,7 @@ CASES = {
 def test_one_clear_error(script: Script, raw: Path, tmp_path: Path, case: str) -> None:
     make, words = CASES[case]
     run = tmp_path / "run"
-    done = script("train", *make(tmp_path, raw), f"hydra.run.dir={run}")
+    done = script("train", *make(tmp_path, raw), f"hydra.run.dir={run}", status=None)
     assert done.returncode != 0
     assert "Traceback" not in done.stderr
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]

@@ -133,14 +133,12 @@ def test_commands_and_python_that_are_printed_run(
 ) -> None:
     path = form(tmp_path)
     done = script("check", str(path), f"hydra.run.dir={tmp_path / 'check'}")
-    assert done.returncode == 0, done.stderr
     assert "refuses it" not in done.stdout
     lines = python(done.stdout)
     (prepare, train, *_) = commands(done.stdout)
     assert (prepare[0], train[0]) == ("prepare_data", "train")
     for name, *words in (prepare, train):
-        ran = script(name, *words, f"hydra.run.dir={tmp_path / name}")
-        assert ran.returncode == 0, ran.stderr
+        script(name, *words, f"hydra.run.dir={tmp_path / name}")
     read = lines.splitlines()[-2]
     held: dict[str, nnode.Sequences] = {}
     exec(compile(f"import nnode\n{read}", "read", "exec"), held)
@@ -156,7 +154,6 @@ def test_the_diagnosis_that_is_printed_runs(script: Script, tmp_path: Path, form
     done = script("check", str(form(tmp_path)), f"hydra.run.dir={tmp_path / 'check'}")
     (words,) = [line for name, *line in commands(done.stdout) if name == "discover"]
     ran = script("discover", *words, f"hydra.run.dir={tmp_path / 'discover'}")
-    assert ran.returncode == 0, ran.stderr
     assert "verdict: " in ran.stdout
 
 
@@ -192,7 +189,6 @@ def test_a_command_recognises_columns_and_units(script: Script, tmp_path: Path) 
         run = tmp_path / form.__name__
         words = ["data=table", f"data.path={path}", f"hydra.run.dir={run}"]
         done = script("prepare_data", *words, "data.domain=traffic")
-        assert done.returncode == 0, done.stderr
         assert "recognised agent = car, time = t" in done.stdout
         for ours, theirs in zip(Store(run), nnode.sequences(platoons()), strict=True):
             assert ours.x == pytest.approx(theirs.x, abs=1e-9)
@@ -201,6 +197,6 @@ def test_a_command_recognises_columns_and_units(script: Script, tmp_path: Path) 
         "data=vehicles",
         f"data.path={of_platoons(tmp_path)}",
         f"hydra.run.dir={tmp_path / 'no'}",
+        status=2,
     )
-    assert done.returncode == 2
     assert "has no columns of data=vehicles; nnode check" in done.stderr

@@ -47,8 +47,7 @@ def keep_longer_times(traci: ModuleType) -> None:
 
 
 def diagnosed(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:  # noqa: F811
-    done = script("discover", *overrides, "discover.page=false", f"hydra.run.dir={folder}")
-    assert done.returncode == 0, done.stderr
+    script("discover", *overrides, "discover.page=false", f"hydra.run.dir={folder}")
     report: dict[str, Any] = json.loads((folder / "report.json").read_text())
     return report
 
@@ -64,7 +63,7 @@ def test_the_law_of_sumo_s_drivers_is_calibrated(
     script: Script,  # noqa: F811
     tmp_path: Path,
 ) -> None:
-    done = script(
+    script(
         "train",
         "model=lin",
         "model.leader=measured",
@@ -75,7 +74,6 @@ def test_the_law_of_sumo_s_drivers_is_calibrated(
         "trainer.max_epochs=30",
         f"hydra.run.dir={tmp_path}",
     )
-    assert done.returncode == 0, done.stderr
     model = load_checkpoint(tmp_path / "checkpoints" / "best.pt").build()
     assert equilibrium_gap(law(model), MEAN) == pytest.approx(GAP, rel=0.05)
 

@@ -79,7 +79,7 @@ def test_a_simulation_by_jupedsim_calibrates(
     tmp_path: Path,
     script: Script,  # noqa: F811
 ) -> None:
-    done = script(
+    script(
         "train",
         "model=sf",
         "data=jupedsim",
@@ -88,7 +88,6 @@ def test_a_simulation_by_jupedsim_calibrates(
         "trainer.max_epochs=3",
         f"hydra.run.dir={tmp_path}",
     )
-    assert done.returncode == 0, done.stderr
     history = load_checkpoint(tmp_path / "checkpoints" / "best.pt").history
     assert history[-1]["cost/train"] < history[0]["cost/train"]
 
@@ -268,7 +267,7 @@ def test_a_platoon_by_sumo_calibrates(
 ) -> None:
     path = platoon(sumo, road, tmp_path, types, 31)
     run = tmp_path / "run"
-    done = script(
+    script(
         "train",
         "model=lin",
         "data=sumo",
@@ -278,7 +277,6 @@ def test_a_platoon_by_sumo_calibrates(
         "trainer.max_epochs=5",
         f"hydra.run.dir={run}",
     )
-    assert done.returncode == 0, done.stderr
     assert len(Store(run / "data")) == 3
     history = load_checkpoint(run / "checkpoints" / "best.pt").history
     assert history[-1]["cost/train"] < history[0]["cost/train"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from nnode.app.python.inputs import model_options
 from nnode.model import build_model
 from nnode.model.build import add_effects
 from nnode.plots.crowd import force_contours
@@ -10,20 +11,7 @@ from nnode.plots.traffic import speed_curves
 from tests.discover import stand_in  # noqa: F401 - registers an effect of crowds
 
 LAW = {"name": "lin", "term": "lin", "leader": "measured", "v0": 20.0, "L": 8.0, "L_min": 2.0}
-FORCE = {
-    "name": "sf",
-    "term": "social_force",
-    "A": 1.0,
-    "k": 1.0,
-    "kappa": 1.0,
-    "r": 0.25,
-    "B": 0.1,
-    "mass": 1.0,
-    "walls": True,
-    "wall_spacing": 0.25,
-    "tau": 0.5,
-    "opposing_wall_friction": False,
-}
+FORCE = {**model_options("sf"), "A": 1.0, "k": 1.0, "kappa": 1.0, "B": 0.1, "mass": 1.0}
 
 
 def test_a_speed_curve_says_which_effects_it_leaves_out() -> None:

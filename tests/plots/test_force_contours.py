@@ -32,6 +32,10 @@ class Spring(InteractionForce):
         return -dx
 
 
+def _social() -> Crowd:
+    return Crowd([make_law("social_force", **PAPER)])
+
+
 def _network() -> Crowd:
     return Crowd(
         [
@@ -66,9 +70,7 @@ def test_lines_lie_where_the_force_has_their_value(component, part, slope, push)
 
 
 @pytest.mark.parametrize("component", [0, 1])
-@pytest.mark.parametrize(
-    "system", [Crowd([make_law("social_force", **PAPER)]), _network()], ids=["sf", "nn"]
-)
+@pytest.mark.parametrize("system", [_social(), _network()], ids=["sf", "nn"])
 def test_all_panels_share_one_symmetric_scale(system, component) -> None:
     figure = force_contours(system, component)
     levels = [tuple(_sets(ax, filled=True)[0].levels) for ax in _panels(figure)]
@@ -79,14 +81,14 @@ def test_all_panels_share_one_symmetric_scale(system, component) -> None:
 
 
 def test_extents_follow_the_paper() -> None:
-    social, network = Crowd([make_law("social_force", **PAPER)]), _network()
+    social, network = _social(), _network()
     assert _panels(force_contours(social, 0))[0].get_xlim() == (-0.5, 0.5)
     assert _panels(force_contours(network, 0))[0].get_xlim() == (-4.0, 4.0)
     assert _panels(force_contours(social, 0, extent=1.5))[3].get_ylim() == (-1.5, 1.5)
 
 
 def test_labels_units_and_velocities() -> None:
-    figure = force_contours(Crowd([make_law("social_force", **PAPER)]), 1)
+    figure = force_contours(_social(), 1)
     panels = _panels(figure)
     assert panels[2].get_xlabel() == "$x_i - x_j$ (m)"
     assert panels[0].get_ylabel() == "$y_i - y_j$ (m)"
@@ -101,7 +103,7 @@ def test_labels_units_and_velocities() -> None:
 
 
 def test_social_force_is_antisymmetric_and_obeys_its_formula() -> None:
-    system = Crowd([make_law("social_force", **PAPER)]).double()
+    system = _social().double()
     random = np.random.default_rng(0)
     dx, dv = random.uniform(-0.5, 0.5, (2, 500, 2))
     force = evaluate_force(system, dx, dv)
@@ -135,7 +137,7 @@ def test_parts_without_walls() -> None:
 
 
 def test_crowd_figures() -> None:
-    assert set(crowd_figures(Crowd([make_law("social_force", **PAPER)]))) == {
+    assert set(crowd_figures(_social())) == {
         "force_x",
         "force_y",
         "settings",
@@ -156,7 +158,7 @@ def test_crowd_figures() -> None:
 @pytest.mark.parametrize("value", [0.0, float("nan"), float("inf")])
 @pytest.mark.parametrize("kind", ["sf", "nn"])
 def test_degenerate_models_are_drawn(kind: str, value: float, tmp_path) -> None:
-    system = Crowd([make_law("social_force", **PAPER)]) if kind == "sf" else _network()
+    system = _social() if kind == "sf" else _network()
     with torch.no_grad():
         for parameter in system.parameters():
             parameter.fill_(value)
@@ -168,7 +170,7 @@ def test_degenerate_models_are_drawn(kind: str, value: float, tmp_path) -> None:
 
 
 def test_bad_options_are_named() -> None:
-    system = Crowd([make_law("social_force", **PAPER)])
+    system = _social()
     with pytest.raises(ConfigError, match=r"component must be 0 .*got 2"):
         force_contours(system, 2)
     for extent in (0.0, -1.0, float("nan")):
@@ -186,7 +188,7 @@ def test_bad_options_are_named() -> None:
     ("system", "titles"),
     [
         (Traffic([make_law("network_speed", hidden=4)]), 0),
-        (Crowd([make_law("social_force", **PAPER)]), 2),
+        (_social(), 2),
         (_network(), 2),
     ],
     ids=["traffic", "sf", "nn"],

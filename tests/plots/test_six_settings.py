@@ -10,7 +10,7 @@ from matplotlib.quiver import Quiver
 from nnode.errors import ConfigError
 from nnode.model import Crowd, make_law
 from nnode.plots import save, six_settings
-from nnode.plots.settings import SETTINGS, Setting
+from nnode.plots.settings import Setting
 
 #: Calibrated values as printed (section 6.5) and half a unit of their last digit.
 PRINTED = {"A": 0.0044, "k": 34.9539, "kappa": 9.8894}
@@ -133,10 +133,6 @@ def test_own_settings(tmp_path) -> None:
     save(figure, tmp_path / "a.png")
     with pytest.raises(ConfigError, match="at least one setting"):
         six_settings(_social(), [])
-
-
-def test_settings_are_six_of_each_kind() -> None:
-    assert {kind: len(settings) for kind, settings in SETTINGS.items()} == {"short": 6, "long": 6}
 
 
 @pytest.mark.filterwarnings("error")

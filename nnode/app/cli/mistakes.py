@@ -5,10 +5,10 @@ They replace Hydra's messages, which refer to its schemas and search path.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import is_dataclass
-from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
@@ -32,11 +32,13 @@ from omegaconf.errors import (
 )
 
 from nnode.app.cli.saved import composed
-from nnode.errors import ConfigError
+from nnode.app.cli.typed import group_defaults
+from nnode.errors import ConfigError, suggestion
 from nnode.program import configuration
 
 #: OmegaConf's name of a type to the description of the expected value.
 _KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
+_BOUNDS = {"low": "at least", "high": "at most"}
 
 
 def in_words(error: Exception, name: str, overrides: list[str], flags: list[str]) -> ConfigError:
@@ -56,10 +58,8 @@ def in_words(error: Exception, name: str, overrides: list[str], flags: list[str]
         )
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, chosen = str(error.missing_cfg_file).removesuffix(".yaml").rpartition("/")
-        names = [
-            str(choice) for choice in error.options or () if not str(choice).endswith("_schema")
-        ]
-        return unknown_choice(group, chosen, names)
+        names = (str(choice) for choice in error.options or ())
+        return unknown_choice(group, chosen, [n for n in names if not n.endswith("_schema")])
     if isinstance(error, SearchPathException):
         return ConfigError(f"{message}; name a folder that is there with --config-dir")
     if ambiguous := re.match(r"Ambiguous value for argument '(.*)'$", message):
@@ -104,7 +104,7 @@ def _first_line(error: Exception) -> str:
 def unknown_choice(group: str, chosen: str, available: Iterable[str]) -> ConfigError:
     """The error for a choice that its group does not have."""
     names = sorted(available)
-    near = _near(chosen, {name: f"{group}={name}" for name in names})
+    near = suggestion(chosen, {name: f"{group}={name}" for name in names})
     text = f"there is no {group}={chosen}{near or ';'} {group} is one of {', '.join(names)}"
     if group == "data" and (Path(chosen).suffix or Path(chosen).exists()):
         text += (
@@ -141,11 +141,11 @@ def unknown_option(
     if at == "model." and (how := _start_value(node, remainder, value)):
         return ConfigError(f"{text}: {how}")
     options = [str(option) for option in node if option != "hydra"]
-    near = _near(remainder.partition(".")[0], {option: f"{at}{option}" for option in options})
+    near = suggestion(remainder.partition(".")[0], {option: f"{at}{option}" for option in options})
     if not near:
         # suggests the same name in another section, the first one of each name
         every = {option.rpartition(".")[2]: option for option in reversed([*_keys(config)])}
-        near = _near(remainder.rpartition(".")[2], every, cutoff=0.75)
+        near = suggestion(remainder.rpartition(".")[2], every, cutoff=0.75)
     owner = at.rstrip(".") or name
     return ConfigError(f"{text}{near or ';'} {owner} has {', '.join(options)}{hint}")
 
@@ -159,31 +159,26 @@ def wrong_value(key: str, override: str, message: str, config: DictConfig | None
         config: configuration of the command's choices; None if it is unknown.
     """
     typed, _, value = override.lstrip("+").partition("=")
-    if typed != key:
-        return ConfigError(f"{override}: {key} is a value, without options of its own")
-    if match := re.search(r"could not be converted to (\w+)", message):
-        return ConfigError(f"{override}: expected {_KINDS.get(match[1], match[1].lower())}")
-    if match := re.search(r"expected one of \[(.*)\]", message):
-        valid = [item.strip() for item in match[1].split(",")]
-        near = _near(value, {item: item for item in valid})
-        return ConfigError(f"{override}: expected one of {', '.join(valid)}{near}")
-    if "not a valid bool" in message:
-        return ConfigError(f"{override}: expected {_KINDS['Boolean']}")
-    if "is not a subclass of" in message or "Invalid type assigned" in message:
+    if typed != key or "convert 'dict'" in message:
+        expected = f"{key} is a value, without options of its own"
+    elif match := re.search(r"could not be converted to (\w+)", message):
+        expected = f"expected {_KINDS.get(match[1], match[1].lower())}"
+    elif match := re.search(r"expected one of \[(.*)\]", message):
+        valid = match[1].replace(" ", "").split(",")
+        expected = f"expected one of {', '.join(valid)}{suggestion(value, valid)}"
+    elif "not a valid bool" in message:
+        expected = f"expected {_KINDS['Boolean']}"
+    elif "is not a subclass of" in message or "Invalid type assigned" in message:
         node = None if config is None else OmegaConf.select(config, key)
-        options = [str(item) for item in node] if isinstance(node, DictConfig) else []
-        has = f": {', '.join(options)}" if options else ""
-        return ConfigError(
-            f"{override}: {key} has options of its own{has}; type {key}.NAME=VALUE, --help shows "
-            "them"
-        )
-    if "None" in message or "not Optional" in message:
-        return ConfigError(f"{override}: null is no value of this option; leave it out")
-    if "is not a ListConfig" in message:
-        return ConfigError(f"{override}: expected a list, such as [{value}]")
-    if "convert 'dict'" in message:
-        return ConfigError(f"{override}: {key} is a value, without options of its own")
-    return ConfigError(f"{override}: {message}")
+        has = f": {', '.join(map(str, node))}" if isinstance(node, DictConfig) and node else ""
+        expected = f"{key} has options of its own{has}; type {key}.NAME=VALUE, --help shows them"
+    elif "None" in message or "not Optional" in message:
+        expected = "null is no value of this option; leave it out"
+    elif "is not a ListConfig" in message:
+        expected = f"expected a list, such as [{value}]"
+    else:
+        expected = message
+    return ConfigError(f"{override}: {expected}")
 
 
 def refuse_added(config: DictConfig, name: str) -> None:
@@ -194,8 +189,17 @@ def refuse_added(config: DictConfig, name: str) -> None:
     """
     settings = HydraConfig.get()
     for override in settings.overrides.task:
-        key = override.partition("=")[0]
+        key, _, value = override.partition("=")
         at, _, leaf = key.lstrip("+").rpartition(".")
+        if at == "model.law.parameters" and isinstance(
+            OmegaConf.select(config, key.lstrip("+")), int | float
+        ):
+            model = OmegaConf.create(group_defaults("model", settings.runtime.choices["model"]))
+            entry = OmegaConf.select(model, f"law.parameters.{leaf}")
+            quantity = entry.get("value") if OmegaConf.is_dict(entry) else entry
+            # a number would replace the quantity, its unit and its bounds
+            if " " in str(quantity):
+                raise ConfigError(f"{override}: {_start_value(model, leaf, value)}")
         if key.startswith("+") and key.lstrip("+") not in settings.runtime.choices:
             node = OmegaConf.select(config, at) if at else config
             kind = OmegaConf.get_type(node) if OmegaConf.is_dict(node) else None
@@ -216,50 +220,36 @@ def _start_value(model: DictConfig, path: str, value: str) -> str:
     """How to set the start value of a law's parameter; empty if the name is not a parameter."""
     leaf = path.partition(".")[0]
     parameters = OmegaConf.select(model, "law.parameters")
-    if not OmegaConf.is_dict(parameters) or not parameters:
+    if not OmegaConf.is_dict(parameters):
         return ""
-    by_folded_name = {str(parameter).casefold(): str(parameter) for parameter in parameters}
-    name = leaf if leaf in parameters else by_folded_name.get(leaf.casefold())
+    names = {str(name).casefold(): str(name) for name in parameters}
+    name = leaf if leaf in parameters else names.get(leaf.casefold())
     if name is None:
-        if near := get_close_matches(leaf, list(by_folded_name.values()), n=1):
-            return f"did you mean the parameter model.law.parameters.{near[0]}.value?"
-        return ""
-    about = parameters[name]
-    current = str(about.value if OmegaConf.is_dict(about) else about)
-    unit = current.partition(" ")[2]
-    low, high = (
-        str(about.get(e)) if OmegaConf.is_dict(about) and about.get(e) is not None else ""
-        for e in ("low", "high")
-    )
-    asked, minimum, maximum = _number(value), _number(low), _number(high)
-    within = f"between {low} and {high}" if low and high else ""
-    outside = asked is not None and (
-        (minimum is not None and asked < minimum) or (maximum is not None and asked > maximum)
-    )
-    shown = value if asked is not None and not outside else current.partition(" ")[0]
-    quantity = f"{shown} {unit}".strip()
+        options = {n: f"the parameter model.law.parameters.{n}.value" for n in names.values()}
+        return suggestion(leaf, options).lstrip("; ")
+    entry, key = parameters[name], f"model.law.parameters.{name}"
+    if OmegaConf.is_dict(entry):
+        key += ".value"
+    else:
+        entry = {"value": entry}
+    unit = str(entry["value"]).partition(" ")[2]
+    asked = _number(value, math.nan)
+    low, high = _number(entry.get("low"), -math.inf), _number(entry.get("high"), math.inf)
+    inside = low <= asked <= high
+    bounds = [f"{word} {entry[end]}" for end, word in _BOUNDS.items() if entry.get(end) is not None]
     text = f"{name} is a parameter of the law, calibrated from a start value"
-    text += f", which lies {within}" if within else ""
-    text += f"; {value} does not" if outside and within else ""
-    return f"{text}: type \"model.law.parameters.{name}.value='{quantity}'\" (now {current})"
+    text += f", which must be {' and '.join(bounds)}" if bounds else ""
+    text += f"; {value} is not" if bounds and value and not inside else ""
+    quantity = f"{asked:g} {unit}".strip() if inside else entry["value"]
+    return f"{text}: type \"{key}='{quantity}'\" (now {entry['value']})"
 
 
-def _number(text: str) -> float | None:
+def _number(quantity: Any, default: float) -> float:
+    """The number of a quantity such as ``3 s``, or else the default."""
     try:
-        return float(text.strip("'\" ").partition(" ")[0])
+        return float(str(quantity).strip("'\" ").partition(" ")[0])
     except ValueError:
-        return None
-
-
-def _near(word: str, suggestions: Mapping[str, str], cutoff: float = 0.65) -> str:
-    """The end of a message that suggests the most similar word, ignoring case.
-
-    Args:
-        suggestions: word to the text that suggests it.
-    """
-    folded = {candidate.casefold(): suggestion for candidate, suggestion in suggestions.items()}
-    matches = get_close_matches(word.casefold(), list(folded), n=1, cutoff=cutoff)
-    return f"; did you mean {folded[matches[0]]}?" if matches else ""
+        return default
 
 
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.saved import in_hydra, keys_given, plain
-from nnode.app.cli.typed import plain_options
+from nnode.app.cli.typed import changed_options, plain_options
 from nnode.data.check.recognise import NEEDED, UNIT, has_columns, recognised
 from nnode.data.sequences import say_recognised
 from nnode.errors import ConfigError, DataError
@@ -47,16 +47,11 @@ def with_recognised(config: DictConfig) -> DictConfig:
         )
     say_recognised(recognition)
     merged = config.copy()
-    for key, value in plain_options(recognition.options).items():
-        if (
-            key not in ("path", "name")
-            and value != defaults[key]
-            and key not in given.keys() - _OWN
-        ):
+    for key, value in changed_options(recognition.options).items():
+        if key not in {"path", *given} - {"columns"}:  # columns are completed
             OmegaConf.update(merged, f"data.{key}", value, merge=False)
     return merged
 
 
-#: Options that the recognition considers, and the option that it completes.
+#: Options that the recognition considers.
 _SAID = {"columns", "frame_rate", *UNIT.values()}
-_OWN = {"columns"}

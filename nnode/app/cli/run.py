@@ -93,7 +93,8 @@ def run(
     except NNodeError as error:
         end(error)
     GlobalHydra.instance().clear()  # a forked process inherits the state
-    with _out_of_sight() as places, _errors_raised():
+    os.environ[_RAISE] = "1"
+    with _out_of_sight() as places:
         sys.argv[1:] = [*given, *places, *flags]
         command = hydra.main(version_base="1.3", config_path=str(configuration()), config_name=name)
         try:
@@ -180,20 +181,6 @@ def _flag(word: str) -> str:
     flags = [flag for flag in (*_FLAGS, *_VALUED) if flag.startswith("--")]
     hint = suggestion(name, flags, cutoff=0.7) or ";"
     raise ConfigError(f"there is no flag {word}{hint} --help shows all options and flags")
-
-
-@contextmanager
-def _errors_raised() -> Iterator[None]:
-    """Let Hydra raise its errors instead of printing them."""
-    before = os.environ.get(_RAISE)
-    os.environ[_RAISE] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[_RAISE]
-        else:
-            os.environ[_RAISE] = before
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from nnode.calibrate.distributed import World
 from nnode.calibrate.interrupt import Interrupted
 from nnode.errors import ConfigError, NNodeError, WriteError, printable
-from nnode.files import PARTIAL, csv_text, disk_words, write_text
+from nnode.files import PARTIAL, disk_words, write_csv
 from nnode.lock import give, take
 
 #: File with the result of a run, or its error, in its folder.
@@ -127,6 +127,6 @@ def _table(folder: Path) -> None:
         return
     rows = [{"run": run, **result.pop("summary", result)} for run, result in results.items()]
     table = pd.DataFrame(rows)
-    write_text(folder / "sweep.csv", csv_text(table))
+    path = write_csv(folder / "sweep.csv", table)
     print(f"{len(rows)} runs", table.to_string(index=False, float_format="{:.5g}".format), sep="\n")
-    print(f"table: {folder / 'sweep.csv'}")
+    print(f"table: {path}")

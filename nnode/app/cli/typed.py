@@ -15,7 +15,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.cli.saved import in_hydra, make_absolute, plain
-from nnode.errors import ConfigError
+from nnode.errors import unknown_value
 from nnode.program import configuration
 
 
@@ -52,6 +52,13 @@ def plain_options(options: object) -> dict[str, Any]:
     return plain(OmegaConf.structured(options))
 
 
+def changed_options(options: object) -> dict[str, Any]:
+    """The options of a dataclass that differ from its defaults, without the name."""
+    defaults = plain_options(type(options)())
+    values = plain_options(options)
+    return {k: v for k, v in values.items() if v != defaults[k] and k != "name"}
+
+
 def group_defaults(section: str, group: str, command: str | None = None) -> dict[str, Any]:
     """The defaults of a configuration group; mandatory options have the value ``???``.
 
@@ -78,9 +85,7 @@ def written(section: str, group: str) -> tuple[type, DictConfig]:
     from nnode.config import SCHEMAS, choices
 
     if group not in choices(section):
-        raise ConfigError(
-            f"{section}={group} is unknown, expected one of {', '.join(choices(section))}"
-        )
+        raise unknown_value(section, group, choices(section))
     values = cast(DictConfig, OmegaConf.load(configuration() / section / f"{group}.yaml"))
     return SCHEMAS[section, str(values.pop("defaults")[0])], values
 

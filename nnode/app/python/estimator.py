@@ -16,8 +16,8 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.calibration import Calibration, calibrated
-from nnode.app.cli.saved import options_of
-from nnode.app.python.inputs import choice, data_of, model_options, sequences
+from nnode.app.cli.saved import options_of, plain
+from nnode.app.python.inputs import choice, data_of, merged, model_options, sequences
 from nnode.app.python.words import python_words
 from nnode.app.training import (
     build_solver,
@@ -27,18 +27,13 @@ from nnode.app.training import (
     threads_given_back,
     trainer_of,
 )
-from nnode.calibrate.options import Device
+from nnode.calibrate.options import Device, TrainerOptions
 from nnode.data.dataset import Source, sound_speeds
 from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError, NotFittedError, suggestion
-from nnode.exchange.trajectories import simulated
 from nnode.model import System
 from nnode.model.build import add_effects
 from nnode.model.laws import CAR_FOLLOWING_LAWS
-from nnode.simulation import Solver
-
-#: Sequences that are simulated at once.
-_TOGETHER = 32
 
 
 @dataclass(eq=False, repr=False)
@@ -100,6 +95,8 @@ class Calibrator:
     heldout: float = 0.0
     seed: int = 0
 
+    @python_words()
+    @threads_given_back()
     def fit(self, X: Any, y: object = None, groups: object = None) -> Self:
         """Calibrate.
 
@@ -112,23 +109,14 @@ class Calibrator:
         Raises:
             NNodeError: invalid table, model or options; the message says what to do.
         """
-        with python_words():
-            return self._fitted(Sequences.of(X))
-
-    def _fitted(self, given: Sequences) -> Self:
+        given = Sequences.of(X)
         config = self._config(given)
         check(config)
-        with threads_given_back():
-            model = self._built(config, given)
-            solver = build_solver(options_of(config.solver))
-            plain = OmegaConf.to_container(config, resolve=True, enum_to_str=True)
-            assert isinstance(plain, dict)
-            plain_values = {str(key): value for key, value in plain.items()}
-            trainer = trainer_of(config, model, solver, given, plain=plain_values)
-            start = time.monotonic()
-            trainer.fit()
-            self.result_: Calibration = calibrated(trainer, given, time.monotonic() - start)
-        self._solver: Solver = solver
+        model, solver = self._built(config, given), build_solver(options_of(config.solver))
+        trainer = trainer_of(config, model, solver, given, plain=plain(config))
+        start = time.monotonic()
+        trainer.fit()
+        self.result_: Calibration = calibrated(trainer, given, time.monotonic() - start)
         self.model_: System = self.result_.model
         self.parameters_: pd.DataFrame = self.result_.parameters
         self.cost_: float = self.result_.cost
@@ -136,6 +124,8 @@ class Calibrator:
         self.history_: pd.DataFrame = self.result_.history
         return self
 
+    @python_words()
+    @threads_given_back()
     def predict(self, X: Any) -> Sequences:
         """Simulate every sequence from its measured start.
 
@@ -149,26 +139,22 @@ class Calibrator:
         """
         if not hasattr(self, "result_"):
             raise _unfitted()
-        with python_words():
-            given: Source = Sequences.of(X)
-        model, solver = self.model_, self._solver
+        given: Source = Sequences.of(X)
+        model = self.model_
         if self.start_speeds == "auto":
             given = sound_speeds(given, model.domain, model.order)
-        dtype = next(model.parameters()).dtype
-        with threads_given_back():
-            set_threads(None, model.domain)
-            items = simulated(lambda b: solver(model, b), given, size=_TOGETHER, dtype=dtype)
-            led = model.leader_measured
-            return Sequences(items, {"simulated": self.result_.name, "led": led})
+        set_threads(None, model.domain)
+        manifest = {"simulated": self.result_.name, "led": model.leader_measured}
+        return Sequences(self.result_.simulated(given), manifest)
 
+    @python_words()
     def score(self, X: Any, y: object = None) -> float:
         """Minus the root mean square distance (m) of simulated from measured positions.
 
         It is over all simulated agents and samples after the first, as ``nnode evaluate`` prints
         it; higher is better. A measured leader is excluded.
         """
-        with python_words():
-            given = Sequences.of(X)
+        given = Sequences.of(X)
         return self.predict(given).score(given)
 
     # -- scikit-learn's interface of estimators ------------------------------------------------
@@ -183,12 +169,12 @@ class Calibrator:
         Raises:
             ConfigError: an unknown argument.
         """
-        names = list(self.get_params())
+        names = self.get_params()
         for name, value in params.items():
             if name not in names:
                 raise ConfigError(
                     f"a Calibrator has no parameter {name}, it has {', '.join(names)}"
-                    f"{suggestion(name, names)}"
+                    f"{suggestion(name, names.keys())}"
                 )
             setattr(self, name, value)
         return self
@@ -227,13 +213,16 @@ class Calibrator:
         )
         solver = choice("solver", self.solver or "fused", {"method": self.method, "dt": self.dt})
         optimizer = choice("optimizer", self.optimizer or ("gauss_newton" if field else "lbfgs"))
-        trainer = {"max_epochs": self.epochs, "figure_every": 0, "cost": self.cost}
         drivers = self.drivers
-        trainer["drivers"] = drivers
-        if drivers is not None and not isinstance(drivers, str):
-            trainer["drivers"] = list(drivers)
-        trainer |= {"pooling": self.pooling, "start_speeds": self.start_speeds}
-        trainer["device"] = Device.cpu.value
+        trainer = {
+            "max_epochs": self.epochs,
+            "figure_every": 0,
+            "cost": self.cost,
+            "drivers": drivers if drivers is None or isinstance(drivers, str) else list(drivers),
+            "pooling": self.pooling,
+            "start_speeds": self.start_speeds,
+            "device": Device.cpu,
+        }
         data = OmegaConf.structured(data_of(given))
         data.split.heldout = self.heldout
         if isinstance(self.model, System):
@@ -246,7 +235,7 @@ class Calibrator:
                 "data": data,
                 "solver": solver,
                 "optimizer": optimizer,
-                "trainer": choice("trainer", trainer),
+                "trainer": merged("trainer", TrainerOptions, trainer),
                 "seed": int(self.seed),
                 "groups": {
                     "model": model["name"],
@@ -274,12 +263,8 @@ class Calibrator:
 
 def _unfitted() -> NotFittedError:
     """The error before a fit, which is also scikit-learn's NotFittedError if that is loaded."""
-    sklearn_errors = sys.modules.get("sklearn.exceptions")
-    kinds = (
-        (NotFittedError,)
-        if sklearn_errors is None
-        else (NotFittedError, sklearn_errors.NotFittedError)
-    )
+    loaded = sys.modules.get("sklearn.exceptions")
+    kinds = (NotFittedError, *([loaded.NotFittedError] if loaded else []))
     error: NotFittedError = type("NotFittedError", kinds, {})(
         "this Calibrator is not fitted yet; call fit(table) first"
     )

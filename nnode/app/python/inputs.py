@@ -13,11 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException, ValidationError
 
 from nnode.app.cli.mistakes import unknown_option, wrong_value
-from nnode.app.cli.saved import options_of
-from nnode.app.cli.typed import plain_options, written
+from nnode.app.cli.saved import options_of, plain
+from nnode.app.cli.typed import changed_options, written
 from nnode.app.python.words import python_words
 from nnode.calibrate.checkpoint import Checkpoint
-from nnode.calibrate.options import TrainerOptions
 from nnode.data.check.recognise import NEEDED, has_columns, recognised
 from nnode.data.dataset import Source
 from nnode.data.options import DataOptions, with_present_names
@@ -26,9 +25,8 @@ from nnode.data.readers.columns import Table as DataTable
 from nnode.data.readers.table import TableOptions
 from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
-from nnode.errors import ConfigError, suggestion
+from nnode.errors import ConfigError, unknown_value
 from nnode.model.laws import LAW_MODELS
-from nnode.program import configuration
 
 #: Models by their names: those of ``conf/model``, and the laws of the package.
 MODELS: dict[str, dict[str, Any]] = {
@@ -68,14 +66,12 @@ def model_options(
     schema = SCHEMAS.get(("model", f"{term}_schema"))
     if schema is None:
         terms = sorted({node.term for (group, _), node in SCHEMAS.items() if group == "model"})
-        raise ConfigError(f"model.term={term} is unknown, expected one of {', '.join(terms)}")
+        raise unknown_value("model.term", term, terms)
     if hasattr(schema, "leader") and leader is not None:
         given.setdefault("leader", leader)
     if effects:
         given["effects"] = list(effects)
-    options = OmegaConf.to_container(merged("model", schema, given), enum_to_str=True)
-    assert isinstance(options, dict)
-    return {str(key): value for key, value in options.items()}
+    return plain(merged("model", schema, given))
 
 
 def merged(section: str, schema: Any, *given: Mapping[str, Any]) -> DictConfig:
@@ -92,9 +88,7 @@ def merged(section: str, schema: Any, *given: Mapping[str, Any]) -> DictConfig:
         config = OmegaConf.create({section: OmegaConf.structured(schema)})
         if not isinstance(error, ValidationError):
             raise unknown_option(f"{section}.{key}", config, "nnode", "") from error
-        every = OmegaConf.merge(*given)
-        value = OmegaConf.select(every, key)
-        full = f"{section}.{key}"
+        full, value = f"{section}.{key}", OmegaConf.select(OmegaConf.merge(*given), key)
         raise wrong_value(full, f"{full}={value}", message, config) from error
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{section}: {str(error).splitlines()[0]}") from error
@@ -114,10 +108,10 @@ def _culprit(schema: Any, given: tuple[Mapping[str, Any], ...]) -> str:
 def choice(
     group: str, chosen: str | Mapping[str, Any], further: Mapping[str, Any] | None = None
 ) -> DictConfig:
-    """Options of a solver, an optimiser or the trainer.
+    """Options of a solver or an optimiser.
 
     Args:
-        chosen: a name, or options with their ``name``; for the trainer, options without a name.
+        chosen: a name, or options with their ``name``.
         further: further options.
 
     Raises:
@@ -126,8 +120,6 @@ def choice(
     from nnode.config import SCHEMAS
 
     given = {"name": chosen} if isinstance(chosen, str) else dict(chosen)
-    if group == "trainer":
-        return merged(group, TrainerOptions, given)
     schemas = {
         key.removesuffix("_schema"): schema
         for (section, key), schema in SCHEMAS.items()
@@ -135,7 +127,7 @@ def choice(
     }
     name = str(given.get("name", ""))
     if name not in schemas:
-        raise ConfigError(f"{group}={name} is unknown, expected one of {', '.join(schemas)}")
+        raise unknown_value(group, name, schemas)
     return merged(group, schemas[name], given, further or {})
 
 
@@ -148,10 +140,11 @@ def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(model, str):
         return {"name": model.get("term", ""), **model}
     if model not in MODELS:
-        raise ConfigError(f"model={model} is unknown, expected one of {', '.join(MODELS)}")
+        raise unknown_value("model", model, MODELS)
     return {"name": model, **MODELS[model]}
 
 
+@python_words()
 def sequences(
     table: pd.DataFrame | str | Path | Sequences | None = None,
     *,
@@ -174,14 +167,12 @@ def sequences(
         NNodeError: data or options are unknown; the table is invalid, with the row; or its columns
             or units are ambiguous, with both possibilities.
     """
-    with python_words():
-        if isinstance(table, Sequences):
-            refuse_reading(data, options)
-            return table
-        if table is None and data is None:
-            raise ConfigError("there is no table: give one, or name a data set: data='esimas'")
-        source, reading = read_options(table, data, options)
-        return Sequences.of(source, reading)
+    if isinstance(table, Sequences):
+        refuse_reading(data, options)
+        return table
+    if table is None and data is None:
+        raise ConfigError("there is no table: give one, or name a data set: data='esimas'")
+    return Sequences.of(*read_options(table, data, options))
 
 
 def refuse_reading(data: str | None, options: Mapping[str, Any]) -> None:
@@ -218,16 +209,9 @@ def read_options(
     if data not in (None, recognition.group):
         return table, data_options(str(data), given, in_memory=True)
     say_recognised(recognition)
-    values, defaults = (
-        plain_options(recognition.options),
-        plain_options(type(recognition.options)()),
-    )
-    recognised_options = {k: v for k, v in values.items() if v != defaults[k] and k != "name"}
-    given_options = {k: v for k, v in given.items() if k not in ("columns", "domain")}
-    options = data_options(
-        recognition.group, {**recognised_options, **given_options}, in_memory=True
-    )
-    return recognition.table, options
+    options = changed_options(recognition.options)
+    options |= {k: v for k, v in given.items() if k not in ("columns", "domain")}
+    return recognition.table, data_options(recognition.group, options, in_memory=True)
 
 
 def data_options(data: str, given: Mapping[str, Any], *, in_memory: bool = False) -> DataOptions:
@@ -240,12 +224,6 @@ def data_options(data: str, given: Mapping[str, Any], *, in_memory: bool = False
     Raises:
         ConfigError: the data set or an option is unknown, or a mandatory option is missing.
     """
-    names = {path.stem for path in (configuration() / "data").glob("*.yaml")}
-    if data not in names:
-        raise ConfigError(
-            f"data={data} is unknown, expected one of {', '.join(sorted(names))}"
-            f"{suggestion(data, names)}"
-        )
     schema, defaults = written("data", data)
     options = merged("data", schema, defaults, given)
     if in_memory and OmegaConf.is_missing(options, "path"):

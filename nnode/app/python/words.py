@@ -12,7 +12,7 @@ from nnode.data.prepare import FORMATS
 from nnode.errors import NNodeError
 
 #: Names of all options of data.
-_NAMES = sorted({one.name for kind in FORMATS for one in fields(kind)}, key=len, reverse=True)
+_NAMES = sorted({option.name for kind in FORMATS for option in fields(kind)}, key=len, reverse=True)
 _VALUE = r"(?:=(\[[^\]]*\]|\{[^}]*\}|'[^']*'|\"[^\"]*\"|[^\s,;:)]+))?"
 _OPTION = re.compile(rf"(?<![\w./\\-])data\.({'|'.join(_NAMES)})((?:\.\w+)*){_VALUE}")
 _GROUP = re.compile(r"(?<![\w./\\-])data=([a-z_]+)\b(?!['\"(])")
@@ -53,7 +53,7 @@ def _argument(match: re.Match[str]) -> str:
     return f"{name}[{inner!r}]" if name != "split" or inner in _SPLIT else f"{name}.{inner}"
 
 
-_SPLIT = {one.name for one in fields(SplitOptions)}
+_SPLIT = {option.name for option in fields(SplitOptions)}
 
 
 def _literal(value: str) -> str:

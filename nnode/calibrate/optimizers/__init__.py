@@ -13,7 +13,7 @@ from torch.optim import Optimizer
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.optimizers.gauss_newton import GaussNewton
 from nnode.calibrate.parameters import ParameterVector
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, unknown_value
 from nnode.model.system import System
 
 
@@ -105,9 +105,7 @@ def build_optimizer(model: System, options: OptimizerOptions, seed: int = 0) -> 
     values = asdict(options)
     name = values.pop("name")
     if name not in OPTIMIZERS:
-        raise ConfigError(
-            f"optimizer.name={name} is unknown, expected one of {', '.join(OPTIMIZERS)}"
-        )
+        raise unknown_value("optimizer.name", name, OPTIMIZERS)
     try:
         return OPTIMIZERS[name](model, values, seed)
     except ValueError as error:

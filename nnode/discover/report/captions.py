@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -40,17 +40,8 @@ FAULTY, PLACES = 10, 9
 UNITS = {"traffic": "m/s", "crowd": "m/s²"}
 
 
-@dataclass
-class Figures:
-    """The figures of a page, by section."""
-
-    map: list[FigureBlock] = field(default_factory=list)
-    effects: list[FigureBlock] = field(default_factory=list)
-    gap: list[FigureBlock] = field(default_factory=list)
-    faults: list[FigureBlock] = field(default_factory=list)
-    places: list[FigureBlock] = field(default_factory=list)
-    unknown: list[FigureBlock] = field(default_factory=list)
-    paths: list[FigureBlock | ReplayBlock] = field(default_factory=list)
+#: The figures of a page, by section.
+Figures = dict[str, list[FigureBlock | ReplayBlock]]
 
 
 def unit_of(system: System) -> str:
@@ -60,35 +51,35 @@ def unit_of(system: System) -> str:
 
 def figures(inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions) -> Figures:
     """Draw all figures of a diagnosis."""
-    drawn = Figures()
-    d = outcome.diagnosis
+    d, maps = outcome.diagnosis, _map_figures(inputs, outcome, options)
+    drawn: Figures = {
+        "map": [*maps[:1]],
+        "gap": [_confirmation_errors(outcome)] if d.sealed else [],
+        "effects": [],
+        "places": [*_places(outcome), *maps[1:]],
+        "unknown": [],
+        "faults": [_faults(inputs)] if inputs.faulty else [],
+        "paths": _paths(outcome, options),
+    }
     if d.effects:
-        drawn.effects.append(
+        drawn["effects"] = [
             FigureBlock(
                 "coefficients",
                 coefficient_intervals(d.effects),
                 "Coefficients with 95 % intervals. Dotted line: value without the effect.",
                 "; ".join(f"{effect.name}: {interval(effect)}" for effect in d.effects),
             )
-        )
-    if d.sealed:
-        drawn.gap.append(_confirmation_errors(outcome))
-    if inputs.faulty:
-        drawn.faults.append(_faults(inputs))
-    drawn.places += _places(outcome)
-    maps = _map_figures(inputs, outcome, options)
-    drawn.map, drawn.places = maps[:1], [*drawn.places, *maps[1:]]
+        ]
     if d.unknown is not None and d.unknown.curve:
         variable = d.unknown.variables[0] if d.unknown.variables else "the first variable"
-        drawn.unknown.append(
+        drawn["unknown"] = [
             FigureBlock(
                 "unknown",
                 flexible_curve(d.unknown, unit_of(outcome.base)),
                 f"Nonparametric estimate of the missing term by {variable}.",
                 f"Curve of the missing term by {variable}.",
             )
-        )
-    drawn.paths += _paths(outcome, options)
+        ]
     return drawn
 
 
@@ -105,8 +96,12 @@ def figure(
         ConfigError: the diagnosis has no such figure; names those that it has.
     """
     drawn = figures(inputs, outcome, replace(options, replay=False))
-    blocks = [*drawn.map, *drawn.gap, *drawn.effects, *drawn.places, *drawn.unknown]
-    by_name = {block.name: block.figure for block in blocks}
+    by_name = {
+        block.name: block.figure
+        for section in ("map", "gap", "effects", "places", "unknown")
+        for block in drawn[section]
+        if isinstance(block, FigureBlock)
+    }
     if which not in by_name:
         raise ConfigError(f"there is no figure {which!r}; this diagnosis has {', '.join(by_name)}")
     return by_name[which]
@@ -140,26 +135,25 @@ def _faults(inputs: Inputs) -> FigureBlock:
 
 def _places(outcome: DiagnosisOutcome) -> list[FigureBlock]:
     unit = unit_of(outcome.base)
-    blocks = []
     curves = [place for place in outcome.diagnosis.places if place.curve][:PLACES]
-    if curves:
-        blocks.append(
-            FigureBlock(
-                "where",
-                place_curves(curves, unit),
-                f"Term ({unit}) that is missing from the model without effects, by variable, with "
-                "standard errors, estimated to first order together with the model's parameters. "
-                "These parameters can compensate for a part of a curve, often a constant. A curve "
-                "therefore shows the shape of the missing term, and may differ from measured minus "
-                "simulated rates in size and sign. The interval of the table is shaded.",
-                "; ".join(
-                    f"{p.variable} {amount(p.low)} to {amount(p.high)} {p.unit}: "
-                    f"{amount(p.deviation)} ± {amount(p.error, 2)} {unit}"
-                    for p in curves
-                ),
-            )
+    if not curves:
+        return []
+    return [
+        FigureBlock(
+            "where",
+            place_curves(curves, unit),
+            f"Term ({unit}) that is missing from the model without effects, by variable, with "
+            "standard errors, estimated to first order together with the model's parameters. "
+            "These parameters can compensate for a part of a curve, often a constant. A curve "
+            "therefore shows the shape of the missing term, and may differ from measured minus "
+            "simulated rates in size and sign. The interval of the table is shaded.",
+            "; ".join(
+                f"{p.variable} {amount(p.low)} to {amount(p.high)} {p.unit}: "
+                f"{amount(p.deviation)} ± {amount(p.error, 2)} {unit}"
+                for p in curves
+            ),
         )
-    return blocks
+    ]
 
 
 def _map_figures(
@@ -175,11 +169,13 @@ def _map_figures(
         for effect in individual(outcome.extended)
     )
     if inputs.domain == "traffic":
+        number = len({s.recording for s in inputs.sequences})
+        superimposed = f" The {number} recordings are superimposed." if number > 1 else ""
         space, neighbour_map = time_space_maps(maps), approach_maps(maps)
         words = (
             "Measured minus simulated speed by time and position, in all sequences. The "
             f"simulation restarts every {SPAN['traffic']:g} s. Grey: no vehicle."
-            f"{_superimposed(inputs)}{note}",
+            f"{superimposed}{note}",
             "Measured minus simulated speed by gap and relative speed of the vehicle ahead.",
         )
     else:
@@ -197,11 +193,6 @@ def _map_figures(
     ]
 
 
-def _superimposed(inputs: Inputs) -> str:
-    number = len({s.recording for s in inputs.sequences})
-    return f" The {number} recordings are superimposed." if number > 1 else ""
-
-
 def _spread(map_: Deviation) -> str:
     sizes = np.linalg.norm(map_.value, axis=1)
     return amount(float(np.sqrt(np.mean(sizes**2))), 2)
@@ -210,13 +201,12 @@ def _spread(map_: Deviation) -> str:
 def _maps(
     inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions
 ) -> dict[str, Deviation]:
-    titles = {"before": BEFORE, "after": AFTER}
-    systems = {"before": outcome.base, "after": outcome.extended}
-    if not outcome.diagnosis.effects:
-        titles.pop("after")
+    systems = {"before": (BEFORE, outcome.base)}
+    if outcome.diagnosis.effects:
+        systems["after"] = (AFTER, outcome.extended)
     return {
-        title: outcome.maps.get(key) or deviation(systems[key], inputs.sequences, options.step)
-        for key, title in titles.items()
+        title: outcome.maps.get(key) or deviation(system, inputs.sequences, options.step)
+        for key, (title, system) in systems.items()
     }
 
 
@@ -227,14 +217,13 @@ def _paths(outcome: DiagnosisOutcome, options: DiscoverOptions) -> list[FigureBl
     scene = replayed[typical(replayed)]
     s, simulated = scene.sequence, as_drawn(scene)
     errors = ", ".join(simulation.heading for simulation in simulated)
-    name = markdown(s.name)
     moving = [player(outcome, replayed)] if options.replay else []
     return [
         FigureBlock(
             "trajectories",
             trajectories(s, simulated),
-            f"Measured and simulated paths of the confirmation sequence {name}, which has the "
-            "median error.",
+            f"Measured and simulated paths of the confirmation sequence {markdown(s.name)}, "
+            "which has the median error.",
             f"Paths of the sequence {s.name}; {errors}.",
         ),
         *moving,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -41,7 +41,7 @@ class Deviation:
         time: ``(n,)`` s, on the recording's clock.
         position: ``(n, D)`` m, measured.
         value: ``(n, D)`` speed in m/s (traffic) or acceleration in m/s² (crowd).
-        own_frame: ``(n, D)`` ``value``, in a crowd along and left of the walking direction.
+        walking_frame: ``(n, D)`` ``value``, in a crowd along and left of the walking direction.
         neighbour: ``(n, 2)``. Traffic: gap in m, and the speed of the vehicle ahead minus one's own
             in m/s. Crowd: the nearest person's place in m, ahead of and left of one's own way.
             NaN where there is nobody.
@@ -50,7 +50,7 @@ class Deviation:
     time: np.ndarray
     position: np.ndarray
     value: np.ndarray
-    own_frame: np.ndarray
+    walking_frame: np.ndarray
     neighbour: np.ndarray
 
 
@@ -67,23 +67,18 @@ def simulate(
         None for a sequence whose simulation blows up.
     """
     paths: list[np.ndarray | None] = []
-    like = next(system.parameters(), torch.zeros((), dtype=torch.float64))
     for first in range(0, len(sequences), TOGETHER):
         part = sequences[first : first + TOGETHER]
         try:
-            paths += _together(system, part, step, like)
+            paths += _together(system, part, step)
         except SimulationError:
-            for sequence in part:
-                try:
-                    paths += _together(system, [sequence], step, like)
-                except SimulationError:
-                    paths.append(None)
+            single = len(part) == 1
+            paths += [None] if single else [x for s in part for x in simulate(system, [s], step)]
     return paths
 
 
-def _together(
-    system: System, sequences: list[Sequence], step: float | None, like: torch.Tensor
-) -> list[np.ndarray]:
+def _together(system: System, sequences: list[Sequence], step: float | None) -> list[np.ndarray]:
+    like = next(system.parameters(), torch.zeros((), dtype=torch.float64))
     batch = collate(sequences).to(like.device, like.dtype)
     longest = STEP[system.domain] if step is None else step
     dt = batch.dt / max(1, math.ceil(batch.dt / longest - 1e-6))
@@ -113,8 +108,8 @@ def deviation(system: System, sequences: list[Sequence], step: float | None = No
     if not parts:
         none = np.empty((0, system.dim))
         return Deviation(np.empty(0), none, none, none, np.empty((0, 2)))
-    names = [field.name for field in fields(Deviation)]
-    return Deviation(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return Deviation(*map(np.concatenate, columns))
 
 
 def _traffic(s: Sequence, x: np.ndarray, number: int) -> Deviation:
@@ -135,7 +130,7 @@ def _crowd(s: Sequence, x: np.ndarray, number: int) -> Deviation:
     value = 2 * (s.x[-1] - x[-1]) / seconds**2
     time = np.full(number, s.time.mean())
     neighbour = nearest(s.x[0], s.v[0])
-    return Deviation(time, s.x.mean(0), value, in_own_frame(value, s.v[0]), neighbour)
+    return Deviation(time, s.x.mean(0), value, in_walking_frame(value, s.v[0]), neighbour)
 
 
 def _pieces(s: Sequence, system: System) -> list[Sequence]:
@@ -173,7 +168,7 @@ def smooth_velocity(sequence: Sequence) -> np.ndarray:
     return v
 
 
-def in_own_frame(vectors: np.ndarray, v: np.ndarray) -> np.ndarray:
+def in_walking_frame(vectors: np.ndarray, v: np.ndarray) -> np.ndarray:
     """``(N, 2)`` parts of vectors ahead and left of the way of velocities ``v``, both ``(N, 2)``.
 
     NaN where somebody stands still and has no way.
@@ -198,4 +193,4 @@ def nearest(x: np.ndarray, v: np.ndarray) -> np.ndarray:
     away = x[None] - x[:, None]
     distance = np.linalg.norm(away, axis=-1)
     np.fill_diagonal(distance, np.inf)
-    return in_own_frame(away[np.arange(len(x)), distance.argmin(1)], v)
+    return in_walking_frame(away[np.arange(len(x)), distance.argmin(1)], v)

@@ -31,6 +31,8 @@ from nnode.pages.page import Block, Heading, Provenance, Text, write_page
 from nnode.pages.tables import markdown
 
 TENSORBOARD = "tensorboard"
+#: Sections that are folded.
+_FOLDED = ("Comparison of base laws", "Independent clusters")
 
 _PACKAGES = ("torch", "numpy", "scipy", "matplotlib")
 
@@ -78,45 +80,46 @@ def page_blocks(
     inputs: Inputs, outcome: DiagnosisOutcome, drawn: Figures, commands: list[str], folder: Path
 ) -> list[Block]:
     """The page in the order of the diagnosis, the verdict first."""
-    d = outcome.diagnosis
-    unit = unit_of(outcome.base)
-    return [
-        *_first(d),
-        *_map(drawn),
-        *_gap(d, drawn),
-        *_coefficients(d, drawn, outcome),
-        *_agents(d),
-        *_decided(d),
-        *_shown(drawn),
-        *_places(d, drawn, unit),
-        *_unexplained(d, drawn),
-        *_absent(d),
-        *_data(d, drawn),
-        *_usage(d, commands, folder, outcome),
-        *_laws(d),
-        *_clusters(d),
-        _provenance(d, inputs),
-    ]
-
-
-def _first(d: Diagnosis) -> list[Block]:
-    """Remarks on the verdict."""
-    words = remarks(d)
-    return [Text(" ".join(words))] if words else []
-
-
-def _map(drawn: Figures) -> list[Block]:
-    if not drawn.map:
-        return []
-    return [Heading("Where the model deviates from the data"), *drawn.map]
+    d, c = outcome.diagnosis, outcome.diagnosis.clusters
+    sections: dict[str, list[Block]] = {
+        "Where the model deviates from the data": [*drawn["map"]],
+        "Errors on confirmation sequences": _gap(d, drawn),
+        "Coefficients": _coefficients(d, drawn, outcome),
+        "Differences between agents": _agents(d),
+        "How it was decided": _decided(d),
+        "A typical confirmation sequence": [*drawn["paths"]],
+        "Deviations by variable": [
+            tables.places_table(d, unit_of(outcome.base))
+            if d.places
+            else Text("No curve over a variable is significant."),
+            *drawn["places"],
+        ],
+        "Unexplained structure": _unexplained(d, drawn),
+        "Effects that were not found": _absent(d),
+        "Faults of the measurement": _data(d, drawn),
+        "Using the extended model": _usage(commands, folder, outcome),
+        "Comparison of base laws": _laws(d),
+        "Independent clusters": [
+            Text(
+                f"A cluster consists of {c.why}; {c.simultaneous}. Clusters are the unit of every "
+                "interval, test and cross-validation. No two-sided p-value can be below "
+                f"{amount(d.screen.floor, 2)} with {c.open} exploration clusters."
+            ),
+            tables.clusters_table(d),
+        ],
+    }
+    blocks: list[Block] = [Text(" ".join(words))] if (words := remarks(d)) else []
+    for title, section in sections.items():
+        if section:
+            blocks += [Heading(title, folded=title in _FOLDED), *section]
+    return [*blocks, _provenance(d, inputs)]
 
 
 def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
     """The errors on the confirmation sequences, with the definition for the whole page."""
     n_confirmation, n_exploration = len(d.split.get("sealed", [])), len(d.split.get("open", []))
     return [
-        Heading("Errors on confirmation sequences"),
-        *drawn.gap,
+        *drawn["gap"],
         tables.gap_table(d),
         Text(
             f"{n_confirmation} of {n_confirmation + n_exploration} sequences are confirmation "
@@ -126,11 +129,11 @@ def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
 
 
 def _coefficients(d: Diagnosis, drawn: Figures, outcome: DiagnosisOutcome) -> list[Block]:
-    blocks: list[Block] = [Heading("Coefficients")]
+    blocks: list[Block] = []
     if has_network(outcome.base):
         blocks.append(Text(_NETWORK))
     if d.effects:
-        blocks += [tables.coefficients_table(d.effects), *drawn.effects]
+        blocks += [tables.coefficients_table(d.effects), *drawn["effects"]]
     else:
         blocks.append(Text("No effect of the catalogue was added to the model."))
     if d.base:
@@ -153,7 +156,7 @@ def _agents(d: Diagnosis) -> list[Block]:
         blocks = [tables.agents_table(d)]
         if any(estimate.later for estimate in d.agents):
             blocks.append(tables.later_table(d))
-    return [Heading("Differences between agents"), *blocks] if blocks else []
+    return blocks
 
 
 def _decided(d: Diagnosis) -> list[Block]:
@@ -176,29 +179,13 @@ def _decided(d: Diagnosis) -> list[Block]:
         ]
     if d.sealed:
         blocks.append(tables.confirmation_table(d))
-    return [Heading("How it was decided"), *blocks] if blocks else []
-
-
-def _shown(drawn: Figures) -> list[Block]:
-    if not drawn.paths:
-        return []
-    return [Heading("A typical confirmation sequence"), *drawn.paths]
-
-
-def _places(d: Diagnosis, drawn: Figures, unit: str) -> list[Block]:
-    found = (
-        [tables.places_table(d, unit)]
-        if d.places
-        else [Text("No curve over a variable is significant.")]
-    )
-    return [Heading("Deviations by variable"), *found, *drawn.places]
+    return blocks
 
 
 def _unexplained(d: Diagnosis, drawn: Figures) -> list[Block]:
     """Structure that no effect of the catalogue explains."""
-    heading = Heading("Unexplained structure")
     if d.unknown is None:
-        return [heading, Text("No curve is significant in the remaining residuals.")]
+        return [Text("No curve is significant in the remaining residuals.")]
     facts = {
         "Variables": ", ".join(d.unknown.variables) or "none that was tested",
         "Share of the remaining squared errors that a nonparametric fit removes": (
@@ -207,9 +194,8 @@ def _unexplained(d: Diagnosis, drawn: Figures) -> list[Block]:
         "Similar formula (a hint, not a result)": f"`{d.unknown.hint}`" if d.unknown.hint else "–",
     }
     return [
-        heading,
         Text("\n".join(f"- {name}: {fact}" for name, fact in facts.items())),
-        *drawn.unknown,
+        *drawn["unknown"],
         Text("An explanation can be tested as an effect of your own (`docs/discovery.md`)."),
     ]
 
@@ -221,19 +207,16 @@ def _absent(d: Diagnosis) -> list[Block]:
         blocks.append(tables.absent_table(d))
     if d.not_testable or any(not absence.testable for absence in d.absences):
         blocks.append(tables.not_testable_table(d))
-    none = [Text("All effects of the catalogue were found.")]
-    return [Heading("Effects that were not found"), *(blocks or none)]
+    return blocks or [Text("All effects of the catalogue were found.")]
 
 
 def _data(d: Diagnosis, drawn: Figures) -> list[Block]:
-    heading = Heading("Faults of the measurement")
     if not d.data_faults:
-        return [heading, Text("No sequence has a fault.")]
+        return [Text("No sequence has a fault.")]
     return [
-        heading,
         Text("Sequences with a fault were excluded. Check the recording at the given times."),
         tables.faults_table(d),
-        *drawn.faults,
+        *drawn["faults"],
     ]
 
 
@@ -251,29 +234,13 @@ def _laws(d: Diagnosis) -> list[Block]:
         for name, reason in d.laws.refused.items()
     ]
     return [
-        Heading("Comparison of base laws", folded=True),
         Text(words),
         *(tables.laws_table(laws, name, d.domain) for name, laws in compared.items()),
         *([Text("\n".join(refused))] if refused else []),
     ]
 
 
-def _clusters(d: Diagnosis) -> list[Block]:
-    c = d.clusters
-    return [
-        Heading("Independent clusters", folded=True),
-        Text(
-            f"A cluster consists of {c.why}; {c.simultaneous}. Clusters are the unit of every "
-            "interval, test and cross-validation. No two-sided p-value can be below "
-            f"{amount(d.screen.floor, 2)} with {c.open} exploration clusters."
-        ),
-        tables.clusters_table(d),
-    ]
-
-
-def _usage(
-    d: Diagnosis, commands: list[str], folder: Path, outcome: DiagnosisOutcome
-) -> list[Block]:
+def _usage(commands: list[str], folder: Path, outcome: DiagnosisOutcome) -> list[Block]:
     words = [
         "The extended model can be evaluated, plotted and trained like any other model. Training "
         "starts from the estimates."
@@ -290,7 +257,7 @@ def _usage(
     ]
     code = "```sh\n" + "\n".join(commands) + "\n```"
     python = f'```python\nimport nnode\n\nmodel = nnode.load("{folder / CHECKPOINT}")\n```'
-    return [Heading("Using the extended model"), Text("\n\n".join([" ".join(words), code, python]))]
+    return [Text("\n\n".join([" ".join(words), code, python]))]
 
 
 def _provenance(d: Diagnosis, inputs: Inputs) -> Provenance:
@@ -330,10 +297,10 @@ def write_events(
     for step, (cost, key) in enumerate(((d.gap.before, "before"), (d.gap.after, "after"))):
         row = {"gap/sealed": cost, "gap/noise_floor": d.gap.noise_floor}
         row |= {f"parameters/{n}": v[key] for n, v in d.base.items() if key in v}
+        for effect in d.effects if step else []:
+            values = {n: c.value for n, c in effect.coefficients.items()}
+            row |= {f"effects/{effect.name}/{n}": value for n, value in values.items()}
         book.scalars({name: value for name, value in row.items() if _number(value)}, step)
-    for effect in d.effects:
-        row = {f"effects/{effect.name}/{n}": c.value for n, c in effect.coefficients.items()}
-        book.scalars({name: value for name, value in row.items() if _number(value)}, 1)
     book.text("verdict", sentence(d))
     book.text("effects", "\n\n".join(f"{e.name}: {interval(e)}; {e.where}" for e in d.effects))
     for path in pictures:

@@ -1,22 +1,19 @@
 """Tables of a diagnosis' page.
 
-A table is given by its columns: the heading, and what a row shows there. The heading is also the
-name of the column in the CSV file; ``heads`` are other words for the page.
+A table is given by its rows, heading to what it shows there. The heading is also the name of the
+column in the CSV file; ``heads`` are other words for the page.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
-from operator import attrgetter
 from typing import Any
 
 import pandas as pd
 
 from nnode.data.quality import KINDS
 from nnode.discover.report.files import amount, estimate, in_unit
-from nnode.discover.result import Agents, Alternative, Diagnosis, Laws, NamedEffect
+from nnode.discover.result import Alternative, Diagnosis, Laws, NamedEffect
 from nnode.model.term import short_names
 from nnode.pages.page import TableBlock
 from nnode.pages.tables import NOTHING
@@ -24,34 +21,17 @@ from nnode.pages.tables import NOTHING
 #: Largest number of faults and of sequences on the page; the CSV file contains all.
 LISTED = 30
 
-#: What a row shows in a column: an attribute of it, or a function of it.
-Column = str | Callable[[Any], Any]
 
-
-def _table(
-    name: str, rows: Iterable[Any], columns: Mapping[str, Column], caption: str, **options: Any
-) -> TableBlock:
-    cells = {
-        head: attrgetter(shown) if isinstance(shown, str) else shown
-        for head, shown in columns.items()
-    }
-    full = pd.DataFrame([{head: cell(row) for head, cell in cells.items()} for row in rows])
+def _table(name: str, rows: list[dict[str, Any]], caption: str, **options: Any) -> TableBlock:
+    full = pd.DataFrame(rows)
     if len(full) > LISTED:
         caption += f" The first {LISTED} of {len(full)} rows; the CSV file contains all."
     filled = [head for head in full if not full[head].eq(NOTHING).all()]
     return TableBlock(name, full[filled].head(LISTED), caption, **{"full": full, **options})
 
 
-def _p(row: Any) -> str:
-    return amount(row.p_value, 2)
-
-
-def _p_confirmation(row: Any) -> str:
-    return amount(row.confirmed, 2)
-
-
-def _unit(row: Any) -> str:
-    return in_unit(row.unit).strip() or NOTHING
+def _unit(unit: str) -> str:
+    return in_unit(unit).strip() or NOTHING
 
 
 def _percent(share: float | None) -> str:
@@ -64,18 +44,22 @@ def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -
     """The coefficients of some effects."""
     return _table(
         name,
-        [(effect, key, c) for effect in effects for key, c in effect.coefficients.items()],
-        {
-            "effect": lambda row: row[0].name,
-            "coefficient": lambda row: row[1],
-            "value": lambda row: estimate(row[2])[0],
-            "95 % from": lambda row: estimate(row[2])[1],
-            "to": lambda row: estimate(row[2])[2],
-            "unit": lambda row: _unit(row[2]),
-            "where": lambda row: row[0].where,
-            "p combined": lambda row: amount(row[0].combined, 2),
-            "p on sealed clusters": lambda row: _p_confirmation(row[0]),
-        },
+        [
+            {
+                "effect": effect.name,
+                "coefficient": key,
+                "value": value,
+                "95 % from": low,
+                "to": high,
+                "unit": _unit(c.unit),
+                "where": effect.where,
+                "p combined": amount(effect.combined, 2),
+                "p on sealed clusters": amount(effect.confirmed, 2),
+            }
+            for effect in effects
+            for key, c in effect.coefficients.items()
+            for value, low, high in [estimate(c)]
+        ],
         "Coefficients with 95 % intervals. *p*: of exploration and confirmation clusters together, "
         "and of the confirmation clusters alone.",
         heads={"p combined": "p", "p on sealed clusters": "p, confirmation"},
@@ -94,18 +78,20 @@ def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
     effects = f", with {', '.join(laws.effects)} where applicable" if laws.effects else ""
     return _table(
         name,
-        laws.ranking,
-        {
-            "law": "name",
-            "parameters": "parameters",
-            "held-out cost above the best (%)": lambda law: amount(100 * law.behind),
-            "p": _p,
-            "error on left-out open clusters (m²)": lambda law: amount(law.error),
-            "calibrated": lambda law: ", ".join(
-                f"{key.partition('.')[2] or key} {amount(value)}{in_unit(unit)}"
-                for key, (value, unit) in law.values.items()
-            ),
-        },
+        [
+            {
+                "law": law.name,
+                "parameters": law.parameters,
+                "held-out cost above the best (%)": amount(100 * law.behind),
+                "p": amount(law.p_value, 2),
+                "error on left-out open clusters (m²)": amount(law.error),
+                "calibrated": ", ".join(
+                    f"{key.partition('.')[2] or key} {amount(value)}{in_unit(unit)}"
+                    for key, (value, unit) in law.values.items()
+                ),
+            }
+            for law in laws.ranking
+        ],
         f"Base laws on {laws.clusters} exploration clusters{effects}. *Held-out cost*: mean log "
         "error after removing autocorrelation, each cluster left out in turn; lower is better. "
         f"*p*: one-sided, for the law being as good as the first one. *Error*: {_ERRORS[domain]}",
@@ -119,15 +105,12 @@ def clusters_table(d: Diagnosis) -> TableBlock:
     return _table(
         "clusters",
         [
-            ("exploration", c.open, c.least, "name an effect"),
-            ("confirmation", c.sealed, c.least_sealed, "confirm an effect"),
+            dict(zip(("clusters", "there are", "it takes", "to"), row, strict=True))
+            for row in (
+                ("exploration", c.open, c.least, "name an effect"),
+                ("confirmation", c.sealed, c.least_sealed, "confirm an effect"),
+            )
         ],
-        {
-            "clusters": lambda row: row[0],
-            "there are": lambda row: row[1],
-            "it takes": lambda row: row[2],
-            "to": lambda row: row[3],
-        },
         "Numbers of independent clusters.",
         heads={"there are": "available", "it takes": "required", "to": "in order to"},
     )
@@ -138,15 +121,17 @@ def screen_table(d: Diagnosis) -> TableBlock:
     fixed = ("name", "share", "p_value")
     return _table(
         "screen",
-        d.screen.leads,
-        {
-            "effect": lambda row: row["name"],
-            "share of the squared residuals": lambda row: _percent(row["share"]),
-            "p": lambda row: amount(row["p_value"], 2),
-            "about": lambda row: ", ".join(
-                f"{key} {amount(value)}" for key, value in row.items() if key not in fixed
-            ),
-        },
+        [
+            {
+                "effect": row["name"],
+                "share of the squared residuals": _percent(row["share"]),
+                "p": amount(row["p_value"], 2),
+                "about": ", ".join(
+                    f"{key} {amount(value)}" for key, value in row.items() if key not in fixed
+                ),
+            }
+            for row in d.screen.leads
+        ],
         "Effects that explain most of the exploration sequences, by linear response. *Change*: "
         f"difference of the coefficient from its neutral value. No p can be below "
         f"{amount(d.screen.floor, 2)} with this number of clusters.",
@@ -154,28 +139,24 @@ def screen_table(d: Diagnosis) -> TableBlock:
     )
 
 
-def _share(part: str, agents: Agents) -> str:
-    return _percent(agents.share.get(part))
-
-
 def agents_table(d: Diagnosis) -> TableBlock:
     """Agent-specific parameters and their variance components."""
     parts = list(dict.fromkeys(part for row in d.agents for part in row.share))
     return _table(
         "agents",
-        d.agents,
-        {
-            "effect": "name",
-            "strength": lambda a: (
-                f"{amount(a.strength, 2)} [{amount(a.low, 2)}, {amount(a.high, 2)}]"
-            ),
-            "unit": _unit,
-            "p": _p,
-            **{part: partial(_share, part) for part in parts},
-            "p on sealed clusters": _p_confirmation,
-            "separable from (s)": lambda a: amount(a.lasts, 2),
-            "named": lambda a: "yes" if a.named else f"no: {a.reason}",
-        },
+        [
+            {
+                "effect": a.name,
+                "strength": f"{amount(a.strength, 2)} [{amount(a.low, 2)}, {amount(a.high, 2)}]",
+                "unit": _unit(a.unit),
+                "p": amount(a.p_value, 2),
+                **{part: _percent(a.share.get(part)) for part in parts},
+                "p on sealed clusters": amount(a.confirmed, 2),
+                "separable from (s)": amount(a.lasts, 2),
+                "named": "yes" if a.named else f"no: {a.reason}",
+            }
+            for a in d.agents
+        ],
         "Agent-specific parameters. *Strength*: standard deviation between agents, with its 95 % "
         "interval. *Recording*, *sequence*, *agent*, *transient*: shares of the variance. A "
         "deviation that lasts longer than *separable from* cannot be distinguished from a constant "
@@ -195,18 +176,18 @@ def drivers_table(d: Diagnosis) -> TableBlock:
     """Variances between drivers and over time."""
     return _table(
         "drivers",
-        d.drivers,
-        {
-            "what": lambda row: _VARIATIONS.get(row.name, f"{row.name} between drivers"),
-            "standard deviation or time": lambda row: amount(row.estimate),
-            "95 % interval": lambda row: (
-                "not estimable"
+        [
+            {
+                "what": _VARIATIONS.get(row.name, f"{row.name} between drivers"),
+                "standard deviation or time": amount(row.estimate),
+                "95 % interval": "not estimable"
                 if math.isnan(row.lower)
-                else f"[{amount(row.lower)}, {amount(row.upper)}]"
-            ),
-            "unit": _unit,
-            "left open per driver": lambda row: _percent(row.shrinkage),
-        },
+                else f"[{amount(row.lower)}, {amount(row.upper)}]",
+                "unit": _unit(row.unit),
+                "left open per driver": _percent(row.shrinkage),
+            }
+            for row in d.drivers
+        ],
         "Standard deviations between drivers and over time, estimated together with the law. "
         "Parameters that are not listed do not differ significantly between drivers. The process "
         "noise acts on speeds (laws of first order) or accelerations (second order). "
@@ -224,12 +205,15 @@ def later_table(d: Diagnosis) -> TableBlock:
     """Errors in the last part of the confirmation sequences, by model."""
     return _table(
         "later",
-        [(row.name, who, error) for row in d.agents for who, error in row.later.items()],
-        {
-            "effect": lambda row: row[0],
-            "who predicts": lambda row: "without effects" if row[1] == "base" else row[1],
-            "mean square error (m²)": lambda row: amount(row[2]),
-        },
+        [
+            {
+                "effect": row.name,
+                "who predicts": "without effects" if who == "base" else who,
+                "mean square error (m²)": amount(error),
+            }
+            for row in d.agents
+            for who, error in row.later.items()
+        ],
         "Errors in the last 40 % of each confirmation sequence, simulated from the state at its "
         "start. Agent-specific parameters and mean velocities come from the first 40 %.",
         heads={"who predicts": "model"},
@@ -240,14 +224,16 @@ def effects_table(d: Diagnosis) -> TableBlock:
     """The effects that were added, in their order."""
     return _table(
         "effects",
-        d.effects,
-        {
-            "effect": "name",
-            "formula": "formula",
-            "p": _p,
-            "held-out gain": lambda effect: _percent(effect.gain),
-            "source": "source",
-        },
+        [
+            {
+                "effect": effect.name,
+                "formula": effect.formula,
+                "p": amount(effect.p_value, 2),
+                "held-out gain": _percent(effect.gain),
+                "source": effect.source,
+            }
+            for effect in d.effects
+        ],
         "Effects in the order in which they were added. *p*: of the score test, corrected for all "
         "candidate effects. *Held-out gain*: share of the squared residuals, without their "
         "autocorrelation, that the effect removes in exploration clusters that were left out of "
@@ -259,17 +245,18 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
     """The alternatives to the named effects."""
     return _table(
         "alternatives",
-        [(effect.name, other) for effect in d.effects for other in effect.alternatives],
-        {
-            "chosen": lambda row: row[0],
-            "as good": lambda row: row[1].name,
-            "loss relative to the chosen": lambda row: amount(row[1].loss, 4),
-            "p": lambda row: _p(row[1]),
-            "what would tell them apart": lambda row: _apart(row[1]),
-            "or so many open clusters": lambda row: (
-                NOTHING if row[1].clusters is None else row[1].clusters
-            ),
-        },
+        [
+            {
+                "chosen": effect.name,
+                "as good": other.name,
+                "loss relative to the chosen": amount(other.loss, 4),
+                "p": amount(other.p_value, 2),
+                "what would tell them apart": _distinguishing_data(other),
+                "or so many open clusters": NOTHING if other.clusters is None else other.clusters,
+            }
+            for effect in d.effects
+            for other in effect.alternatives
+        ],
         "Effects that the data cannot distinguish from the chosen one. *p*: for the alternative "
         "being the true effect. *Clusters*: exploration clusters that distinguish both with a "
         f"power of 90 %, at the observed difference; {d.clusters.open} are available. A *leader* "
@@ -282,7 +269,7 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
     )
 
 
-def _apart(alternative: Alternative) -> str:
+def _distinguishing_data(alternative: Alternative) -> str:
     p = alternative.profile
     leader = (
         f"{p.platoons} platoons of {p.lasts:g} s behind a leader between {p.mean - p.swing:.0f} "
@@ -290,43 +277,42 @@ def _apart(alternative: Alternative) -> str:
         if p
         else ""
     )
-    return "; ".join(part for part in (alternative.separated_by, leader) if part) or NOTHING
+    return "; ".join(filter(None, (alternative.separated_by, leader))) or NOTHING
 
 
 def gap_table(d: Diagnosis) -> TableBlock:
     """The error on the confirmation sequences."""
-    gap, extended = d.gap, bool(d.effects)
-    rows = [
-        (d.model, gap.before),
-        (f"{d.model} with effects", gap.after if extended else math.nan),
-        (f"{d.model}, least squares on whole paths", gap.plain),
-        (
-            f"{d.model} with effects, least squares on whole paths",
-            gap.plain_after if extended else math.nan,
-        ),
-        ("measurement noise", gap.noise_floor),
-    ]
+    gap, errors = d.gap, {}
+    for method, before, after in (
+        ("", gap.before, gap.after),
+        (", least squares on whole paths", gap.plain, gap.plain_after),
+    ):
+        errors[f"{d.model}{method}"] = before
+        errors[f"{d.model} with effects{method}"] = after if d.effects else math.nan
+    errors["measurement noise"] = gap.noise_floor
     return _table(
         "gap",
-        [row for row in rows if not math.isnan(row[1])],
-        {"": lambda row: row[0], "mean square error (m²)": lambda row: amount(row[1])},
+        [
+            {"": name, "mean square error (m²)": amount(error)}
+            for name, error in errors.items()
+            if not math.isnan(error)
+        ],
         "Mean square error of positions on the confirmation sequences.",
     )
 
 
 def confirmation_table(d: Diagnosis) -> TableBlock:
     """The errors of the individual confirmation sequences."""
-    columns: dict[str, Column] = {
-        "sequence": lambda row: row["name"],
-        "without effects (m²)": lambda row: amount(row["before"]),
-        "with effects (m²)": lambda row: amount(row["after"]),
-    }
-    if not d.effects:
-        columns.pop("with effects (m²)")
     return _table(
         "sealed",
-        d.sealed,
-        columns,
+        [
+            {
+                "sequence": row["name"],
+                "without effects (m²)": amount(row["before"]),
+                **({"with effects (m²)": amount(row["after"])} if d.effects else {}),
+            }
+            for row in d.sealed
+        ],
         "Mean square error of each confirmation sequence.",
         full=pd.DataFrame(d.sealed).rename(columns={"name": "sequence"}),
     )
@@ -335,18 +321,17 @@ def confirmation_table(d: Diagnosis) -> TableBlock:
 def base_table(d: Diagnosis) -> TableBlock:
     """The change of the model's parameters when effects are added."""
     short = short_names(d.base)
-    columns: dict[str, Column] = {
-        "parameter": lambda row: short[row[0]],
-        "alone": lambda row: amount(row[1].get("before"), 4),
-        "with effects": lambda row: amount(row[1].get("after"), 4),
-        "unit": lambda row: in_unit(row[1].get("unit", "")).strip() or NOTHING,
-    }
-    if not d.effects:
-        columns.pop("with effects")
     return _table(
         "parameters",
-        d.base.items(),
-        columns,
+        [
+            {
+                "parameter": short[name],
+                "alone": amount(entry.get("before"), 4),
+                **({"with effects": amount(entry.get("after"), 4)} if d.effects else {}),
+                "unit": _unit(entry.get("unit", "")),
+            }
+            for name, entry in d.base.items()
+        ],
         f"Calibrated parameters of {d.model}. If effects are added, a parameter changes that "
         "compensated for their absence.",
         heads={"alone": "without effects"},
@@ -357,14 +342,16 @@ def faults_table(d: Diagnosis) -> TableBlock:
     """Faults of the measurement."""
     return _table(
         "data_faults",
-        d.data_faults,
-        {
-            "kind": "kind",
-            "sequence": "sequence",
-            "agents": lambda fault: ", ".join(fault.agents) or NOTHING,
-            "clock time (s)": lambda fault: NOTHING if fault.time is None else f"{fault.time:.2f}",
-            "what": lambda fault: fault.detail or KINDS.get(fault.kind, ""),
-        },
+        [
+            {
+                "kind": fault.kind,
+                "sequence": fault.sequence,
+                "agents": ", ".join(fault.agents) or NOTHING,
+                "clock time (s)": NOTHING if fault.time is None else f"{fault.time:.2f}",
+                "what": fault.detail or KINDS.get(fault.kind, ""),
+            }
+            for fault in d.data_faults
+        ],
         "Faults of the measurement. Agents without a name in the data are numbered within their "
         "sequence from 0, in a lane from the last vehicle.",
         heads={"what": "description"},
@@ -375,18 +362,18 @@ def places_table(d: Diagnosis, unit: str) -> TableBlock:
     """Where the model deviates from the data."""
     return _table(
         "places",
-        d.places,
-        {
-            "variable": "variable",
-            "from": lambda place: amount(place.low),
-            "to": lambda place: amount(place.high),
-            "unit": _unit,
-            f"deviation ({unit})": lambda place: (
-                f"{amount(place.deviation)} ± {amount(place.error, 2)}"
-            ),
-            "share of the excess": lambda place: _percent(place.share),
-            "p": _p,
-        },
+        [
+            {
+                "variable": place.variable,
+                "from": amount(place.low),
+                "to": amount(place.high),
+                "unit": _unit(place.unit),
+                f"deviation ({unit})": f"{amount(place.deviation)} ± {amount(place.error, 2)}",
+                "share of the excess": _percent(place.share),
+                "p": amount(place.p_value, 2),
+            }
+            for place in d.places
+        ],
         "Intervals in which a term is missing from the model without effects. *Missing term*: "
         "weighted mean and standard error. *Share*: of the squared error above the measurement "
         "noise that the curve removes. *p*: corrected for all variables and intervals. One cause "
@@ -399,15 +386,18 @@ def absent_table(d: Diagnosis) -> TableBlock:
     """Effects that are absent, with bounds."""
     return _table(
         "absent",
-        [absence for absence in d.absences if absence.testable],
-        {
-            "effect": "name",
-            "coefficient": "coefficient",
-            "absent to within": lambda absence: amount(absence.bound),
-            "would be found from": lambda absence: amount(absence.detectable),
-            "unit": _unit,
-            "remark": lambda absence: absence.reason or NOTHING,
-        },
+        [
+            {
+                "effect": absence.name,
+                "coefficient": absence.coefficient,
+                "absent to within": amount(absence.bound),
+                "would be found from": amount(absence.detectable),
+                "unit": _unit(absence.unit),
+                "remark": absence.reason or NOTHING,
+            }
+            for absence in d.absences
+            if absence.testable
+        ],
         "Effects that were tested and not found. *Upper bound*: a larger deviation from no effect "
         "is excluded with 95 % confidence. *Detectable*: smallest deviation that is named and "
         "confirmed with a power of 80 %.",
@@ -418,19 +408,20 @@ def absent_table(d: Diagnosis) -> TableBlock:
 def not_testable_table(d: Diagnosis) -> TableBlock:
     """Effects that are not testable with these data."""
     by_name = {absence.name: absence for absence in d.absences if not absence.testable}
-    names = dict.fromkeys([*by_name, *d.not_testable])
     return _table(
         "not_testable",
-        [(name, by_name.get(name)) for name in names],
-        {
-            "effect": lambda row: row[0],
-            "coefficient": lambda row: row[1].coefficient if row[1] else NOTHING,
-            "would be found from": lambda row: amount(row[1].detectable) if row[1] else NOTHING,
-            "unit": lambda row: _unit(row[1]) if row[1] else NOTHING,
-            "why": lambda row: (
-                (row[1] and row[1].reason) or "the data contain no variation that would show it"
-            ),
-        },
+        [
+            {
+                "effect": name,
+                "coefficient": absence.coefficient if absence else NOTHING,
+                "would be found from": amount(absence.detectable if absence else None),
+                "unit": _unit(absence.unit if absence else ""),
+                "why": (absence.reason if absence else "")
+                or "the data contain no variation that would show it",
+            }
+            for name in dict.fromkeys([*by_name, *d.not_testable])
+            for absence in [by_name.get(name)]
+        ],
         "Effects that these data cannot test: at the smallest usual strength, the power is below "
         "80 %. The diagnosis makes no statement about them.",
         heads={"would be found from": "detectable", "why": "reason"},

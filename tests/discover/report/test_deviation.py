@@ -11,7 +11,7 @@ from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence
 from nnode.discover.report.deviation import (
     deviation,
-    in_own_frame,
+    in_walking_frame,
     nearest,
     simulate,
     smooth_velocity,
@@ -92,9 +92,9 @@ def test_the_nearest_person_is_seen_in_one_s_own_way() -> None:
 def test_own_frame_keeps_lengths() -> None:
     rng = np.random.default_rng(0)
     vectors, v = rng.standard_normal((2, 20, 2))
-    turned = in_own_frame(vectors, v)
+    turned = in_walking_frame(vectors, v)
     assert np.linalg.norm(turned, axis=1) == pytest.approx(np.linalg.norm(vectors, axis=1))
-    assert in_own_frame(v, v)[:, 1] == pytest.approx(0.0, abs=1e-12)
+    assert in_walking_frame(v, v)[:, 1] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_simulation_that_blows_up_spoils_no_other() -> None:

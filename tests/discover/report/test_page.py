@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,6 @@ from nnode.data.quality import Fault
 from nnode.data.sequence import Sequence
 from nnode.discover.inputs import Inputs
 from nnode.discover.judge.confirmation import defined
-from nnode.discover.report.captions import Figures
 from nnode.discover.report.files import verdict
 from nnode.discover.report.page import draw, page_blocks
 from nnode.discover.report.replay import scenes, zones
@@ -139,7 +139,7 @@ def plain(case: Case, **changes: object) -> list[str]:
     """The words of a page without figures."""
     found = deepcopy(case.found)
     found.diagnosis = replace(found.diagnosis, **changes)
-    blocks = page_blocks(case.inputs, found, Figures(), [], Path("run"))
+    blocks = page_blocks(case.inputs, found, defaultdict(list), [], Path("run"))
     return [
         b.text if isinstance(b, Heading) else b.markdown if isinstance(b, Text) else b.name
         for b in blocks

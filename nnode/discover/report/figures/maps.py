@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from nnode.discover.report.deviation import Deviation
-from nnode.plots.style import DIVERGING, FONT, GREY, SEQUENTIAL, SMALL_FONT, dress, new_figure
+from nnode.plots.style import DIVERGING, SEQUENTIAL, colour_bar, dress, new_figure
 
 #: Smallest and largest number of cells along a side of a coloured map, with about PER_CELL values
 #: in each.
@@ -18,7 +18,7 @@ CELLS, PER_CELL = (12, 48), 3
 #: Largest height of a map of a plane, inches.
 TALL = 6.5
 #: A mean of fewer values is not shown in maps of arrows.
-LEAST = 3
+MIN_VALUES = 3
 #: The scale of colours and arrows ends at this percentile of the map before.
 PERCENTILE = 97.0
 #: Shade of cells without data, darker than the neutral colour of the scale.
@@ -72,7 +72,9 @@ def plane_maps(maps: Mapping[str, Deviation], walls: np.ndarray | None) -> Figur
 def neighbour_maps(maps: Mapping[str, Deviation]) -> Figure:
     """Mean deviation of acceleration by where the nearest person is, seen in one's own way."""
     near = {name: np.abs(d.neighbour).max(1, initial=0) <= 3 for name, d in maps.items()}
-    panels = {name: (d.neighbour[near[name]], d.own_frame[near[name]]) for name, d in maps.items()}
+    panels = {
+        name: (d.neighbour[near[name]], d.walking_frame[near[name]]) for name, d in maps.items()
+    }
     places = next(iter(panels.values()))[0]
     labels = ("nearest person ahead (m)", "nearest person on the left (m)")
     return _arrows(panels, places, labels, person=True)
@@ -120,7 +122,7 @@ def _coloured(
     axes = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
     means = [_cells(*columns, edges)[0] for columns in panels.values()]
     limit = _limit(means)
-    mesh = None
+    mesh: Any = None
     for ax, (name, (_, _, value)), mean in zip(axes, panels.items(), means, strict=True):
         ax.set_facecolor(EMPTY)
         mesh = ax.pcolormesh(
@@ -134,8 +136,7 @@ def _coloured(
         title = f"{name}: {_rms(value):.2g} m/s rms"
         dress(ax, x=labels[0], y=labels[1], title=title, grid=False)
         ax.label_outer()
-    assert mesh is not None
-    _bar(figure, mesh, axes, "both", "measured − simulated speed (m/s)")
+    colour_bar(figure, mesh, axes, "measured − simulated speed (m/s)", extend="both")
     return figure
 
 
@@ -167,11 +168,11 @@ def _arrows(
         (u, number), (v, _) = (
             _cells(place[:, 0], place[:, 1], value[:, i], (edges[0], edges[1])) for i in (0, 1)
         )
-        many = number >= LEAST
+        many = number >= MIN_VALUES
         fields.append((np.where(many, u, np.nan), np.where(many, v, np.nan)))
     limit = _limit([np.hypot(u, v) for u, v in fields])
     middle = np.meshgrid(*((e[1:] + e[:-1]) / 2 for e in edges), indexing="ij")
-    drawn = None
+    drawn: Any = None
     for ax, (name, (_, value)), (u, v) in zip(axes, panels.items(), fields, strict=True):
         draw_walls(ax, walls)
         length = np.hypot(u, v)
@@ -196,18 +197,9 @@ def _arrows(
         rms = _rms(np.linalg.norm(value, axis=1))
         dress(ax, x=labels[0], y=labels[1], title=f"{name}: {rms:.2g} m/s² rms")
         ax.label_outer()
-    assert drawn is not None
-    _bar(figure, drawn, axes, "max", "mean of measured − simulated\nacceleration (m/s²)")
+    label = "mean of measured − simulated\nacceleration (m/s²)"
+    colour_bar(figure, drawn, axes, label, extend="max")
     return figure
-
-
-def _bar(
-    figure: Figure, drawn: ScalarMappable, axes: Iterable[Axes], extend: str, label: str
-) -> None:
-    """The scale of colours beside all panels."""
-    bar = figure.colorbar(drawn, ax=list(axes), extend=extend, aspect=30, pad=0.02)
-    bar.set_label(label, fontsize=FONT)
-    bar.ax.tick_params(labelsize=SMALL_FONT, length=3, width=0.6, color=GREY)
 
 
 def _rms(values: np.ndarray) -> float:

@@ -12,7 +12,15 @@ from matplotlib.lines import Line2D
 
 from nnode.discover.result import NamedEffect, Place, Structure
 from nnode.model.effects import CATALOGUE
-from nnode.plots.style import GREY, OKABE_ITO, SMALL_FONT, dress, new_figure
+from nnode.plots.style import (
+    GREY,
+    OKABE_ITO,
+    SMALL_FONT,
+    dress,
+    legend_above,
+    new_figure,
+    with_unit,
+)
 
 COLUMNS = 3
 #: Largest number of sequences with labels.
@@ -53,7 +61,7 @@ def place_curves(places: Sequence[Place], unit: str) -> Figure:
         share = f"{100 * place.share:.0f} % of the error" if np.isfinite(place.share) else ""
         dress(
             ax,
-            x=_with_unit(place.variable, place.unit),
+            x=with_unit(place.variable, place.unit),
             y=f"missing term ({unit})" if n % columns == 0 else "",
             title=share.replace("-", "−"),
         )
@@ -72,13 +80,9 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
     axes = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
     for ax, (effect, name, c) in zip(axes, rows, strict=True):
         catalogued = CATALOGUE.effects.get(effect.name)
-        neutral = (
-            catalogued.strengths[name].neutral
-            if catalogued and name in catalogued.strengths
-            else None
-        )
-        if neutral is not None:
-            ax.axvline(neutral, color=GREY, linestyle=":", linewidth=1.4)
+        strength = catalogued.strengths.get(name) if catalogued else None
+        if strength is not None and strength.neutral is not None:
+            ax.axvline(strength.neutral, color=GREY, linestyle=":", linewidth=1.4)
         ends = np.array([[c.value - c.low], [c.high - c.value]])
         ax.errorbar(
             [c.value],
@@ -90,9 +94,7 @@ def coefficient_intervals(effects: Sequence[NamedEffect]) -> Figure:
             markersize=6,
         )
         ax.set_ylim(-1, 1)
-        ax.set_yticks(
-            [0], [f"{effect.name}\n{name}{f' ({c.unit})' if c.unit not in ('', '1') else ''}"]
-        )
+        ax.set_yticks([0], [f"{effect.name}\n{with_unit(name, c.unit)}"])
         dress(ax, grid=False)
         ax.ticklabel_format(axis="x", useOffset=False)
         ax.tick_params(axis="y", length=0)
@@ -140,9 +142,7 @@ def confirmation_costs(
         ax.set_xticks([])
     of = f" of {shared.rstrip('/')}" if shared else ""
     dress(ax, x=f"confirmation sequence{of}", y="mean square error (m²)")
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=3, frameon=False, fontsize=SMALL_FONT
-    )
+    legend_above(figure, handles)
     return figure
 
 
@@ -153,9 +153,5 @@ def flexible_curve(structure: Structure, unit: str) -> Figure:
     ax.axhline(0, color=GREY, linewidth=0.8)
     ax.plot(structure.curve["at"], structure.curve["deviation"], color=OKABE_ITO["blue"])
     variable = structure.variables[0] if structure.variables else "variable"
-    dress(ax, x=_with_unit(variable, structure.unit), y=f"missing term ({unit})")
+    dress(ax, x=with_unit(variable, structure.unit), y=f"missing term ({unit})")
     return figure
-
-
-def _with_unit(name: str, unit: str) -> str:
-    return name if unit in ("", "1") else f"{name} ({unit})"

@@ -15,7 +15,7 @@ from nnode.data.sequence import Sequence
 from nnode.discover.report.figures.maps import TALL, draw_walls
 from nnode.discover.report.figures.marks import AFTER, BEFORE
 from nnode.pages.replay import Scene
-from nnode.plots.style import GREY, SMALL_FONT, dress, new_figure
+from nnode.plots.style import GREY, dress, legend_above, new_figure
 
 _MEASURED: dict[str, Any] = {"color": GREY, "marker": "o"}
 
@@ -77,7 +77,7 @@ def _lines(s: Sequence, simulated: list[Simulated]) -> Figure:
         dress(lower, x="clock time (s)", y="simulated −\nmeasured (m)")
         for ax in (top, lower):
             ax.label_outer()
-    figure.legend(handles=_handles(simulated), **_LEGEND)
+    _legend(figure, simulated)
     return figure
 
 
@@ -88,9 +88,9 @@ def _paths(s: Sequence, simulated: list[Simulated]) -> Figure:
         colour = simulation.style["color"]
         draw_walls(ax, s.walls)
         ax.plot(s.x[..., 0], s.x[..., 1], color=GREY, linewidth=2.2, alpha=0.55)
-        starts = range(0, s.n_samples, simulation.restart or s.n_samples)
-        for start in starts:
-            part = slice(start, start + (simulation.restart or s.n_samples))
+        number = simulation.restart or s.n_samples
+        for start in range(0, s.n_samples, number):
+            part = slice(start, start + number)
             ax.plot(*simulation.x[part].transpose(2, 0, 1), color=colour, linewidth=0.9)
             ends = np.stack([s.x[part][-1], simulation.x[part][-1]], 1)
             ax.add_collection(LineCollection(list(ends), colors="black", linewidths=0.7))
@@ -99,26 +99,14 @@ def _paths(s: Sequence, simulated: list[Simulated]) -> Figure:
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         dress(ax, x="x (m)", y="y (m)", title=simulation.heading)
         ax.label_outer()
-    figure.legend(handles=_handles(simulated), **_LEGEND)
+    _legend(figure, simulated)
     return figure
 
 
-_LEGEND: dict[str, Any] = {
-    "loc": "outside upper center",
-    "ncols": 3,
-    "frameon": False,
-    "fontsize": SMALL_FONT,
-}
-
-
-def _handles(simulated: list[Simulated]) -> list[Line2D]:
-    return [
-        Line2D([], [], label="measured", color=GREY, linewidth=2.2, alpha=0.55),
-        *(
-            Line2D([], [], label=simulation.title, color=simulation.style["color"])
-            for simulation in simulated
-        ),
-    ]
+def _legend(figure: Figure, simulated: list[Simulated]) -> None:
+    lines = [Line2D([], [], label="measured", color=GREY, linewidth=2.2, alpha=0.55)]
+    lines += [Line2D([], [], label=s.title, color=s.style["color"]) for s in simulated]
+    legend_above(figure, lines)
 
 
 def _view(s: Sequence) -> tuple[np.ndarray, np.ndarray]:
@@ -140,15 +128,15 @@ def _view(s: Sequence) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _planes(
-    low: np.ndarray, high: np.ndarray, number: int, *, side: float = 7.4
+    low: np.ndarray, high: np.ndarray, number: int, side: float = 7.4
 ) -> tuple[Figure, list[Axes]]:
     """Panels of one plane: above each other where it is wide, else beside each other."""
     ratio = float(np.clip((high - low)[1] / (high - low)[0], 0.15, 2.0))
     if ratio < 0.7:
-        figure = new_figure(side, (0.9 * side * ratio + 0.45) * number + 0.6)
-        grid = figure.subplots(number, 1, sharex=True, sharey=True, squeeze=False)
+        shape, size = (number, 1), (side, (0.9 * side * ratio + 0.45) * number + 0.6)
     else:
         width = min(side / number, TALL / ratio)
-        figure = new_figure(width * number + 0.6, 0.9 * width * ratio + 1.1)
-        grid = figure.subplots(1, number, sharex=True, sharey=True, squeeze=False)
-    return figure, list(grid.ravel())
+        shape, size = (1, number), (width * number + 0.6, 0.9 * width * ratio + 1.1)
+    figure = new_figure(*size)
+    panels = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
+    return figure, list(panels.ravel())
