@@ -10,13 +10,17 @@ import pandas as pd
 import pytest
 
 import nnode
+from nnode.data.options import DataOptions
 from nnode.data.readers.columns import Table, floats
 from nnode.data.readers.ngsim import NgsimOptions, read_ngsim
 from nnode.data.readers.openacc import OpenAccOptions, read_openacc
+from nnode.data.readers.pairs import PairOptions
 from nnode.data.readers.recordings import reading
 from nnode.data.readers.sumo import SumoOptions, read_sumo
+from nnode.data.readers.table import TableOptions
 from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.errors import ConfigError, DataError
+from tests.data.tables import read, saved, tidy
 
 
 def lane() -> pd.DataFrame:
@@ -85,6 +89,25 @@ def test_what_nobody_thought_of_names_the_file() -> None:
         raise KeyError("q")
     with pytest.raises(ConfigError, match=r"^own$"), reading("a.csv"):
         raise ConfigError("own")
+
+
+@pytest.mark.parametrize("length", [0.0, -4.5])
+@pytest.mark.parametrize(
+    ("kind", "column"),
+    [
+        (TableOptions, "length"),
+        (VehicleTableOptions, "length"),
+        (PairOptions, "leader_length"),
+        (PairOptions, "follower_length"),
+    ],
+)
+def test_lengths_are_positive(
+    tmp_path: Path, kind: type[DataOptions], column: str, length: float
+) -> None:
+    table = tidy(4, 2).assign(vehicle=0, x_follower=0.0, x_leader=30.0).assign(**{column: length})
+    path = saved(tmp_path / "t.csv", table)
+    with pytest.raises(DataError, match=f"line 2: column '{column}' holds .*expected a positive"):
+        read(kind, path, domain="traffic")
 
 
 def platoon(folder: Path, row: str) -> Path:
