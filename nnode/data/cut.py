@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator
 from collections.abc import Sequence as ListLike
 from dataclasses import dataclass, field, replace
-from itertools import chain, pairwise
+from itertools import chain, compress, pairwise
 from typing import Any
 
 import numpy as np
@@ -49,11 +49,10 @@ class Reading(list[Sequence]):
     def __init__(
         self,
         sequences: Iterable[Sequence] = (),
-        left_out: Iterable[dict[str, str]] = (),
         notes: Iterable[str] = (),
     ) -> None:
         super().__init__(sequences)
-        self.left_out = list(left_out)
+        self.left_out: list[dict[str, str]] = []
         self.notes = list(notes)
 
     def add(self, other: Reading) -> None:
@@ -397,11 +396,10 @@ def by_presence(
         last = first + steps
         present = [every[i] for i in np.flatnonzero((begin <= first) & (end >= last))]
         if view is not None:
-            paths = [record.x[first - record.first : last - record.first + 1] for record in present]
-            inside = [
-                (x[:, axis] >= view[0]).all() and (x[:, axis] <= view[1]).all() for x in paths
-            ]
-            present = [record for record, good in zip(present, inside, strict=True) if good]
+            low, high = view
+            paths = [r.x[first - r.first : last - r.first + 1, axis] for r in present]
+            inside = [low <= path.min() and path.max() <= high for path in paths]
+            present = list(compress(present, inside))
         if len(present) >= min_agents:
             yield present, first, last
 

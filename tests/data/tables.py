@@ -1,9 +1,10 @@
-"""Tables that tests make up, as files, and what the readers make of them."""
+"""Tables that tests make up, as files, what the readers make of them, and entries of an index."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,17 @@ import pandas as pd
 from nnode.data.cut import Reading
 from nnode.data.options import DataOptions
 from nnode.data.prepare import FORMATS
+
+
+def entry(start: float, end: float, *agents: str, recording: str = "r") -> dict[str, Any]:
+    """What clusters and splits know of a sequence."""
+    return {
+        "name": f"{recording}/{start:g}",
+        "recording": recording,
+        "start": start,
+        "end": end,
+        "agents": list(agents),
+    }
 
 
 def tidy(
@@ -43,7 +55,7 @@ def saved(path: Path, *tables: pd.DataFrame) -> Path:
     return path
 
 
-def read(kind: type[DataOptions], path: Path, **options: object) -> Reading:
+def read(kind: type[DataOptions], path: Path, /, **options: object) -> Reading:
     """The sequences that the reader of some options makes of a file."""
     made = kind(path=str(path), **options)  # type: ignore[call-arg, arg-type]
     return FORMATS[kind].sequences(FORMATS[kind].files(made), made)

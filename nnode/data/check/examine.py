@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -109,36 +111,23 @@ def _rows_of(raw: Raw, sequences: list[Sequence]) -> Trajectories:
     An agent without an identifier is one of its own, and so is everyone in sequences whose
     positions begin anew.
     """
-    parts: list[tuple[np.ndarray, ...]] = []
+    parts: dict[str, list[np.ndarray]] = defaultdict(list)
     for s in sequences:
         n, k = s.n_agents, s.n_samples
         whose = s.name if raw.native in _CUT or not s.agents else s.recording
         names = [f"{whose} {name}" for name in s.agents or range(n)]
         v = np.full((k, n), np.nan) if s.v is None else np.linalg.norm(s.v, axis=2)
         length = np.full(n, np.nan) if s.length is None else s.length
-        parts.append(
-            (
-                np.tile(np.array(names, dtype=object), k),
-                np.repeat(s.time, n),
-                s.x.reshape(k * n, -1),
-                v.reshape(-1, 1),
-                np.tile(length, k),
-                np.full(k * n, s.recording, dtype=object),
-            )
-        )
-    agent, time, x, v, length, recording = (np.concatenate(p) for p in zip(*parts, strict=True))
-    return Trajectories(
-        path=raw.path,
-        name=raw.path.stem,
-        where=str,
-        agent=agent,
-        time=time,
-        x=x,
-        v=None if np.isnan(v).all() else v,
-        recording=recording,
-        lane=recording,
-        length=None if np.isnan(length).all() else length,
-    ).in_order()
+        parts["agent"].append(np.tile(np.array(names, dtype=object), k))
+        parts["time"].append(np.repeat(s.time, n))
+        parts["x"].append(s.x.reshape(k * n, -1))
+        parts["v"].append(v.reshape(-1, 1))
+        parts["length"].append(np.tile(length, k))
+        parts["recording"].append(np.full(k * n, s.recording, dtype=object))
+    columns: dict[str, Any] = {name: np.concatenate(part) for name, part in parts.items()}
+    columns |= {name: None for name in ("v", "length") if np.isnan(columns[name]).all()}
+    rows = Trajectories(path=raw.path, name=raw.path.stem, where=str, **columns)
+    return replace(rows, lane=rows.recording).in_order()
 
 
 def _table(

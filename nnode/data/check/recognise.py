@@ -19,6 +19,7 @@ from nnode.data.check.columns import (
     are_pairs,
     clock_of,
     in_seconds,
+    is_spaced,
     meanings,
     plain,
     rivals,
@@ -192,7 +193,7 @@ def _fits(group: str, names: set[str]) -> bool:
 def _exact(raw: Raw, given: Mapping[str, Any]) -> str | None:
     """The format whose columns a table has under their own names, or under those given."""
     names = _names(raw, given)
-    if names >= SPACED and not names & {"x", "x_follower", "x_leader"}:
+    if "time" in names and is_spaced(names):
         return "pairs"
     if "vehicle" in names and "sequence" not in names and "x_follower" not in names:
         return "vehicles" if names >= NEEDED["vehicles"][1] else None

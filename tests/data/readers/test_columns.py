@@ -24,10 +24,7 @@ from tests.data.tables import read, saved, tidy
 
 
 def lane() -> pd.DataFrame:
-    k, n = (m.ravel() for m in np.meshgrid(np.arange(20), np.arange(3), indexing="ij"))
-    agent = [f"c{i}" for i in n]
-    x = 25.0 * n + 3.0 * k
-    return pd.DataFrame({"sequence": "s", "time": 0.2 * k, "agent": agent, "x": x, "note": "-"})
+    return tidy(20, 3).assign(note="-", agent=lambda t: "c" + t.agent.astype(str))
 
 
 def cells(value: Any) -> pd.Series:
@@ -139,17 +136,6 @@ def test_an_encoding_of_xml_that_is_not_read(tmp_path: Path, encoding: str) -> N
     )
     with pytest.raises(DataError):
         read_sumo(path, SumoOptions(path=str(path)))
-
-
-def test_a_time_that_steps_cannot_count(tmp_path: Path) -> None:
-    path = tmp_path / "a.xml"
-    moments = [
-        f'<timestep time="{t}"><vehicle id="a" lane="e_0" pos="{i}" speed="1"/></timestep>'
-        for i, t in enumerate(("0", "0.5", "1", "1.5", "4e38"))
-    ]
-    path.write_text(f"<fcd-export>{''.join(moments)}</fcd-export>")
-    with pytest.raises(DataError, match=r"line 1: the time is 4e\+38 s, which steps"):
-        read_sumo(path, SumoOptions(path=str(path), dt=0.5))
 
 
 def test_clocks_of_ngsim_out_of_range(tmp_path: Path) -> None:

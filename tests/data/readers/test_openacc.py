@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,9 @@ import pytest
 from nnode.data import download
 from nnode.data.options import Agents
 from nnode.data.prepare import prepare
-from nnode.data.readers.openacc import OpenAccOptions, find_laps, openacc_files, read_openacc
-from nnode.data.sequence import Sequence
+from nnode.data.readers.openacc import OpenAccOptions, find_laps
 from nnode.errors import ConfigError, DataError
+from tests.data import tables
 
 MAKES = ("SMART", "TESLA", "BMW", "TESLA")
 #: m/s and m of the run below.
@@ -49,9 +50,7 @@ def save(path: Path, table: pd.DataFrame, acc: str = "1", setting: str = "S", n:
     return path
 
 
-def read(path: Path, **options: object) -> list[Sequence]:
-    own = OpenAccOptions(path=str(path), **options)  # type: ignore[arg-type]
-    return read_openacc(openacc_files(own), own)
+read = partial(tables.read, OpenAccOptions)
 
 
 def test_positions_are_the_leaders_path_and_the_gaps(tmp_path: Path) -> None:

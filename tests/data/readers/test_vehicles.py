@@ -77,14 +77,6 @@ def test_units_map_and_attributes(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(s.v, 10.0)
 
 
-def test_milliseconds(tmp_path: Path) -> None:
-    parts = [
-        drive(n, 0, 2, x0).assign(time=lambda d: d.time * 1e3) for n, x0 in (("a", 0), ("b", 9))
-    ]
-    (s,) = read(saved(tmp_path / "t.csv", *parts), time_unit="ms", min_vehicles=2)
-    assert s.time[-1] == pytest.approx(2.0)
-
-
 def test_interpolates_and_never_extrapolates(tmp_path: Path) -> None:
     parts = [drive(n, 0.13, 1.93, x0) for n, x0 in (("a", 0), ("b", 20))]
     (s,) = read(saved(tmp_path / "t.csv", *parts), min_vehicles=2)
