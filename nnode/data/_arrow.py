@@ -113,23 +113,21 @@ def to_sequence(table: pa.Table, entry: dict[str, Any], walls: np.ndarray | None
         values = table[name].slice(0, n).to_pylist()
         return None if None in values else tuple(values)
 
-    time, x = numbers("time"), vectors("")
-    if time is None or x is None:
+    time, of_agents = numbers("time"), {"length": numbers("length")}
+    values = {field: vectors(prefix) for prefix, (field, _) in _VECTORS.items()}
+    if time is None or values["x"] is None:
         raise ValueError("the columns of times or positions are empty")
-    length, destination, preferred = numbers("length"), vectors("dest_"), vectors("preferred_")
+    of_agents |= {field: values.pop(field) for field in ("destination", "preferred")}
+    fields = values | {k: None if v is None else v[0].copy() for k, v in of_agents.items()}
     return Sequence(
         name=entry["name"],
         recording=entry["recording"],
         site=entry.get("site", ""),
         split=entry.get("split", ""),
         time=time[:, 0].copy(),
-        x=x,
-        v=vectors("v"),
         agents=(names("agent") or ()) if entry["agents"] else (),
-        length=None if length is None else length[0].copy(),
         kind=names("kind"),
         group=names("group"),
-        destination=None if destination is None else destination[0].copy(),
-        preferred=None if preferred is None else preferred[0].copy(),
         walls=walls,
+        **fields,
     )

@@ -34,6 +34,8 @@ Index = ListLike[Mapping[str, Any]]
 
 #: s; sequences without identifiers that are closer in time may share an agent.
 GAP = 5.0
+#: Sign flips that :func:`better` compares.
+FLIPS = 2**14
 
 
 def index_of(sequences: Iterable[Sequence]) -> list[dict[str, Any]]:
@@ -68,8 +70,17 @@ def clusters(index: Index, gap: float = GAP, *, together: bool = False) -> np.nd
             edges += [(first.setdefault(a, i), i) for i in members for a in index[i]["agents"]]
         if together or not named:
             edges += _near(index, members, 0.0 if named else gap, together)
-    row, column = np.array(edges, dtype=int).reshape(-1, 2).T
-    graph = coo_array((np.ones(len(row)), (row, column)), shape=(len(index), len(index)))
+    return components(len(index), edges)
+
+
+def components(number: int, pairs: Any) -> np.ndarray:
+    """``(number,)`` label of the connected component of each item, counted from 0.
+
+    Args:
+        pairs: ``(M, 2)`` numbers of items that are joined.
+    """
+    row, column = np.array(pairs, dtype=int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(row)), (row, column)), shape=(number, number))
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
@@ -159,7 +170,7 @@ def signs(number: int, flips: int, rng: np.random.Generator) -> np.ndarray:
     otherwise so many drawn ones: for statistics that do not mind the sign of everything.
     """
     if 2 ** (number - 1) <= flips + 1:
-        return np.concatenate([np.ones((2 ** (number - 1), 1)), every_sign(number - 1)], 1)
+        return every_sign(number)[::2]
     drawn = rng.choice([-1.0, 1.0], (flips, number))
     return np.concatenate([np.ones((1, number)), drawn])
 
@@ -170,19 +181,19 @@ def every_sign(number: int) -> np.ndarray:
     return 1.0 - 2.0 * (bits & 1)
 
 
-def better(gains: np.ndarray, flips: int = 2**14, seed: int = 0) -> float:
+def better(gains: np.ndarray) -> float:
     """One-sided p-value by sign flips that gains ``(G,)`` of G clusters are positive in the mean;
-    all signs where there are few clusters. 1 without any.
+    all signs where there are at most :data:`FLIPS`, else so many. 1 without clusters.
 
     Source: Fisher 1935; Canay, Romano & Shaikh 2017.
     """
     number = len(gains)
     if not number or not np.isfinite(gains).all():
         return 1.0
-    if 2**number <= flips:
+    if 2**number <= FLIPS:
         tried = every_sign(number)
     else:
-        drawn = np.random.default_rng(seed).choice([-1.0, 1.0], (flips - 1, number))
+        drawn = np.random.default_rng(0).choice([-1.0, 1.0], (FLIPS - 1, number))
         tried = np.concatenate([np.ones((1, number)), drawn])
     total = tried @ gains
     return float((total >= total[0] - 1e-12 * np.abs(gains).sum()).mean())

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
-from itertools import chain, pairwise
+from collections.abc import Sequence as ListLike
+from dataclasses import dataclass, field, replace
+from itertools import chain, compress, pairwise
 from typing import Any
 
 import numpy as np
 from omegaconf import MISSING
 
-from nnode.data.options import Agents, DataOptions, check_known, positive, wanted
+from nnode.data.options import Agents, DataOptions, chosen, positive
 from nnode.data.sequence import Sequence
 from nnode.data.trajectories import (
     Grid,
@@ -48,11 +49,10 @@ class Reading(list[Sequence]):
     def __init__(
         self,
         sequences: Iterable[Sequence] = (),
-        left_out: Iterable[dict[str, str]] = (),
         notes: Iterable[str] = (),
     ) -> None:
         super().__init__(sequences)
-        self.left_out = list(left_out)
+        self.left_out: list[dict[str, str]] = []
         self.notes = list(notes)
 
     def add(self, other: Reading) -> None:
@@ -94,7 +94,7 @@ class Member:
 def members(table: Trajectories, agent_records: Iterable[Record]) -> list[Member]:
     """Every agent that the rows name, in order of names as text, with its records."""
     names, rows = np.unique(table.agent.astype(str), return_index=True)
-    by_name = {name: Member(name, int(row)) for name, row in zip(names, rows, strict=True)}
+    by_name = {n: Member(n, row) for n, row in zip(names.tolist(), rows.tolist(), strict=True)}
     for record in agent_records:
         by_name[record.agent].records.append(record)
     return list(by_name.values())
@@ -103,7 +103,7 @@ def members(table: Trajectories, agent_records: Iterable[Record]) -> list[Member
 def sequence_of(
     name: str,
     table: Trajectories,
-    of: list[Member],
+    of: ListLike[Member | Record],
     first: int,
     last: int,
     grid: Grid,
@@ -144,6 +144,12 @@ def sequence_of(
         "time": grid.origin + grid.dt * np.arange(first, last + 1),
     }
     return Sequence(name=name, x=x, **(fields | further))
+
+
+def kinds_of(codes: np.ndarray, names: Any) -> np.ndarray:
+    """Names of classes by their codes; a code without a name is its own."""
+    name_of = {str(code): str(name) for code, name in dict(names).items()}
+    return np.array([name_of.get(str(code), str(code)) for code in codes], dtype=object)
 
 
 def uneven_text(agent_records: Iterable[Record], dt: float) -> list[str]:
@@ -197,8 +203,9 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
         ConfigError: an unknown lane or recording.
         DataError: one vehicle twice at one time, or no sequence at all.
     """
-    chosen, grid = _lanes(options, table), Grid(options.dt)
-    names_of_kinds = {str(code): str(name) for code, name in dict(options.kinds).items()}
+    lane_names, grid = _lanes(options, table), Grid(options.dt)
+    if table.kind is not None:
+        table = replace(table, kind=kinds_of(table.kind, options.kinds))
     lanes: dict[str, tuple[str, Trajectories, list[Record]]] = {}
     notes: list[str] = []
     for (recording,), rows in table.parts("recording"):
@@ -207,38 +214,19 @@ def by_lane(table: Trajectories, options: LaneOptions, lane_word: str = "lane") 
         every = records(rows, grid, fill=options.fill, smoothing=options.smooth, reused=reused)
         notes += [f"{stem}: {text}" for text in uneven_text(every, grid.dt)]
         present = {""} if rows.lane is None else set(rows.lane)
-        for lane in (name for name in chosen if name in present):
+        for lane in (name for name in lane_names if name in present):
             lane_records = [r for r in every if rows.lane is None or rows.lane[r.row] == lane]
             lanes[f"{stem}_{lane_word}{lane}" if lane else stem] = stem, rows, lane_records
-    asked = wanted(options.recording)
-    if asked is not None:
-        check_known(asked, lanes)
-        lanes = {name: lanes[name] for name in asked}
+    lanes = {name: lanes[name] for name in chosen(options.recording, lanes)}
     sequences = []
     for name, (stem, rows, lane_records) in lanes.items():
         for number, (platoon, first, last) in enumerate(_platoons(lane_records, options)):
-            of = [Member(record.agent, record.row, [record]) for record in platoon]
-            kinds = None
-            if rows.kind is not None:
-                codes = (str(rows.kind[record.row]) for record in platoon)
-                kinds = tuple(names_of_kinds.get(code, code) for code in codes)
+            full_name = f"{name}/{number:03d}"
             sequences.append(
-                sequence_of(
-                    f"{name}/{number:03d}",
-                    rows,
-                    of,
-                    first,
-                    last,
-                    grid,
-                    recording=name,
-                    site=stem,
-                    kind=kinds,
-                )
+                sequence_of(full_name, rows, platoon, first, last, grid, recording=name, site=stem)
             )
     if not sequences:
-        vehicles = {
-            record.agent for _, _, lane_records in lanes.values() for record in lane_records
-        }
+        vehicles = {r.agent for _, _, lane_records in lanes.values() for r in lane_records}
         raise DataError(
             f"{table.path}: no sequence; at no time are {options.min_vehicles} vehicles in one "
             f"lane for {options.min_samples} samples of {options.dt:g} s"
@@ -408,11 +396,10 @@ def by_presence(
         last = first + steps
         present = [every[i] for i in np.flatnonzero((begin <= first) & (end >= last))]
         if view is not None:
-            paths = [record.x[first - record.first : last - record.first + 1] for record in present]
-            inside = [
-                (x[:, axis] >= view[0]).all() and (x[:, axis] <= view[1]).all() for x in paths
-            ]
-            present = [record for record, good in zip(present, inside, strict=True) if good]
+            low, high = view
+            paths = [r.x[first - r.first : last - r.first + 1, axis] for r in present]
+            inside = [low <= path.min() and path.max() <= high for path in paths]
+            present = list(compress(present, inside))
         if len(present) >= min_agents:
             yield present, first, last
 
@@ -466,8 +453,8 @@ def chosen_lanes(lane: Any, present: set[str], who: str) -> list[str]:
     every_lane = sorted(present, key=lambda name: (len(name), name))
     if lane is None:
         return every_lane
-    chosen = [lane] if isinstance(lane, str | int | float) else lane
-    names = [f"{x:g}" if isinstance(x, int | float) else str(x) for x in chosen]
+    asked = [lane] if isinstance(lane, str | int | float) else lane
+    names = [f"{x:g}" if isinstance(x, int | float) else str(x) for x in asked]
     for name in names:
         if name not in present:
             raise ConfigError(f"data.lane={name}: {who} the lanes {', '.join(every_lane[:20])}")

@@ -323,7 +323,12 @@ def _find(dataset: str, name: str, source: Path) -> Path:
         raise DataError(f"data.source: there is no folder {source}; expected one that holds {name}")
     files = held(source, dataset)
     if name in files and files[name].is_file():
-        _note_edits(files[name], _origin(dataset, name))
+        origin = _origin(dataset, name)
+        expected = origin.files.get(name) if origin else None
+        if expected and sha256(files[name]) != expected:  # edited data is welcome
+            log.warning(
+                "%s differs from the published file of that name; taken as it is", files[name]
+            )
         return files[name]
     listing = ", ".join([*files][:20]) + (f", ... ({len(files)} in all)" if len(files) > 20 else "")
     raise DataError(
@@ -331,13 +336,6 @@ def _find(dataset: str, name: str, source: Path) -> Path:
         f"{_nearest(name, [*files])}; it holds: {listing or 'nothing'}; name one of these files "
         "or set data.source to another folder"
     )
-
-
-def _note_edits(path: Path, origin: Origin | None) -> None:
-    """Say so where a local file differs from the published one: edited data is welcome."""
-    expected = origin.files.get(path.name) if origin else None
-    if expected and sha256(path) != expected:
-        log.warning("%s differs from the published file of that name; taken as it is", path)
 
 
 def _nearest(name: str, names: list[str]) -> str:

@@ -7,13 +7,14 @@ at the start of the sequence; with a heading in place of a line it is far ahead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as ListLike
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
 #: m; so far ahead lies the destination of who walks in a direction.
@@ -119,8 +120,8 @@ def exits_of(
     exits: list[Exit],
     first: np.ndarray,
     last: np.ndarray,
-    names: ListLike[str],
-    groups: ListLike[str] | None = None,
+    names: Iterable[str],
+    groups: ListLike[str] | np.ndarray | None = None,
 ) -> list[Exit]:
     """Everybody's exit.
 
@@ -155,13 +156,33 @@ def exits_of(
     return chosen
 
 
+def goals_of(
+    exits: list[Exit], rows: Trajectories, people: Iterable[np.ndarray]
+) -> Iterator[tuple[int, Exit]]:
+    """Everybody's first row with a position, and his exit by his first and last one.
+
+    Args:
+        rows: of people.
+        people: rows of everyone, in order of time.
+
+    Raises:
+        DataError: somebody whom no exit is for.
+    """
+    ends = []
+    for of_person in people:
+        located = of_person[np.isfinite(rows.x[of_person]).all(axis=1)]
+        ends.append((located if located.size else of_person)[[0, -1]])
+    first, last = np.array(ends).T
+    groups = None if rows.group is None else rows.group[first]
+    try:
+        chosen = exits_of(exits, rows.x[first], rows.x[last], rows.agent[first], groups)
+    except DataError as error:
+        raise DataError(f"{rows.path}: {error}") from error
+    return zip(first.tolist(), chosen, strict=True)
+
+
 def _distance(exit_: Exit, last: np.ndarray, way: np.ndarray) -> float:
     """m from where somebody was last seen; of a heading, the part of the way aside or back."""
     if exit_.heading is None:
         return float(np.linalg.norm(exit_.point(last) - last))
     return float(np.linalg.norm(way - max(way @ exit_.heading, 0.0) * exit_.heading))
-
-
-def destinations(exits: ListLike[Exit], x: np.ndarray) -> np.ndarray:
-    """``(N, 2)`` m, the destinations of people with their exits who are at ``x`` (N, 2)."""
-    return np.stack([exit_.point(place) for exit_, place in zip(exits, x, strict=True)])

@@ -23,9 +23,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from nnode.data.clusters import components
 from nnode.data.limits import LIMITS
 from nnode.data.options import Agents
 from nnode.data.sequence import Domain, Sequence
@@ -59,30 +58,24 @@ def identify(
     """
     named = [s.agents for s in sequences]
     notes: list[str] = []
-    if mode is Agents["global"]:
-        return named, notes
     recordings: dict[str, list[int]] = defaultdict(list)
     for i, s in enumerate(sequences):
-        if s.agents:
+        if s.agents and mode is not Agents["global"]:
             recordings[s.recording].append(i)
     for recording, places in recordings.items():
         members = [sequences[i] for i in places]
-        numbering: _Numbers | None
         if mode is Agents.sequence:
-            numbering = (
-                _counted(members, range(len(members))),
-                "identifiers belong to their sequence",
-            )
+            every = _counted(members, range(len(members)))
+            numbering: _Numbers | None = every, "identifiers belong to their sequence"
         else:
             numbering = _judged(members, domain)
         if numbering is None:
             continue
         notes.append(f"{recording}: {numbering[1]}")
         taken = {name for s in members for name in s.agents}
-        for i, s, numbers in zip(places, members, numbering[0], strict=True):
-            named[i] = tuple(
-                numbered(name, n, taken) for name, n in zip(s.agents, numbers, strict=True)
-            )
+        for i, numbers in zip(places, numbering[0], strict=True):
+            names = zip(named[i], numbers, strict=True)
+            named[i] = tuple(numbered(name, n, taken) for name, n in names)
     return named, notes
 
 
@@ -101,7 +94,8 @@ def _counted(sequences: list[Sequence], worlds: Iterable[int]) -> list[list[int]
 
 def _judged(sequences: list[Sequence], domain: Domain) -> _Numbers | None:
     error = LIMITS[domain].noise
-    tracks = _tracks(sequences)
+    usual = float(np.median([s.dt for s in sequences if s.n_samples > 1] or [np.nan]))
+    tracks = [_track(s, usual) for s in sequences]
     near, far = _neighbours(tracks, error)
 
     def one_world(pair: tuple[int, int]) -> bool:
@@ -111,14 +105,12 @@ def _judged(sequences: list[Sequence], domain: Domain) -> _Numbers | None:
     apart = next((pair for pair in far if not one_world(pair)), None)
     if apart is None:
         return _used_again(sequences, domain)
-    same = [pair for pair in near if one_world(pair)]
-    row, column = np.array(same, dtype=int).reshape(-1, 2).T
-    n = len(sequences)
-    graph = coo_array((np.ones(len(row)), (row, column)), shape=(n, n))
-    count, worlds = connected_components(graph, directed=False)
+    worlds = components(len(sequences), [pair for pair in near if one_world(pair)])
     i, j = apart
     name = min(name for name, met in _met(tracks, apart, error).items() if not met)
-    whose = "their sequence" if count == n else f"one of {count} runs of sequences that carry on"
+    whose, count = "their sequence", worlds.max() + 1
+    if count < len(sequences):
+        whose = f"one of {count} runs of sequences that carry on"
     return (
         _counted(sequences, worlds),
         f"identifiers belong to {whose}, because {sequences[i].name} and {sequences[j].name} "
@@ -142,14 +134,8 @@ class _Track:
     place: dict[str, int]
 
 
-def _tracks(sequences: list[Sequence]) -> list[_Track | None]:
-    """None for sequences whose times cannot be compared with the others'."""
-    steps = [s.dt for s in sequences if s.n_samples > 1]
-    usual = float(np.median(steps)) if steps else float("nan")
-    return [_track(s, usual) for s in sequences]
-
-
 def _track(s: Sequence, step: float) -> _Track | None:
+    """None for a sequence whose times cannot be compared with the others'."""
     if s.n_samples < 2 or not (step > 0 and np.isclose(s.dt, step, rtol=1e-2)):
         return None
     if not abs(s.time).max() < LATEST * step:

@@ -122,37 +122,36 @@ def one_of(option: str, value: str | None, valid: Mapping[str, float]) -> float:
     return valid[value]
 
 
-def wanted(option: object) -> list[str] | None:
-    """Names that ``data.recording`` asks for; None for all.
+def chosen(
+    option: object, available: Iterable[str], default: Iterable[str] | None = None
+) -> list[str]:
+    """Names that ``data.recording`` asks for.
+
+    Args:
+        available: names that it may ask for.
+        default: names where it asks for all; None: those that are available.
 
     Raises:
-        ConfigError: neither a name nor a list of names, or an empty list.
+        ConfigError: neither a name nor a list of names, an empty list, or an unknown recording;
+            names the nearest first.
     """
+    valid = list(dict.fromkeys(available))
     if option is None or option == "all":
-        return None
+        return valid if default is None else list(default)
     items = [option] if isinstance(option, str | int) else option
     if not isinstance(items, Iterable) or isinstance(items, Mapping):
         raise ConfigError(f"data.recording={option}: expected 'all', a name or a list of names")
     names = list(dict.fromkeys(str(item) for item in items))
     if not names:
         raise ConfigError("data.recording=[]: expected 'all', a name or a list of names")
-    return names
-
-
-def check_known(asked: Iterable[str], known: Iterable[str]) -> None:
-    """Refuse names that are not known, naming the nearest first.
-
-    Raises:
-        ConfigError: an unknown recording.
-    """
-    valid = list(dict.fromkeys(known))
-    for name in asked:
+    for name in names:
         if name not in valid:
             near = difflib.get_close_matches(name, valid, n=len(valid) or 1, cutoff=0.0)
             raise ConfigError(
                 f"data.recording={name}: unknown recording; nearest first, the valid ones are: "
                 f"{', '.join(near) or 'none'}"
             )
+    return names
 
 
 #: Options by their names in prepared folders and checkpoints of earlier versions.

@@ -14,18 +14,18 @@ so a limit would condemn noise.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from nnode.data.clusters import components
 from nnode.data.limits import (
     AGREE,
     BEARABLE,
@@ -47,7 +47,7 @@ from nnode.data.options import Faults
 from nnode.data.readers.columns import Table, floats, quoted
 from nnode.data.sequence import Sequence
 from nnode.data.smooth import Noise, suggested_window
-from nnode.data.trajectories import Trajectories
+from nnode.data.trajectories import Trajectories, grouped_rows
 from nnode.data.units import RATES, Medians, Scale, displacements
 from nnode.errors import DataError, FaultError
 
@@ -156,13 +156,10 @@ class _View:
         # A vehicle that merely starts at the origin has a single zero there.
         zero = (x == 0).all(axis=2)
         repeated = np.zeros_like(zero)
-        if len(x) > 1:
-            repeated[1:] |= zero[1:] & zero[:-1]
-            repeated[:-1] |= zero[1:] & zero[:-1]
+        repeated[1:] |= zero[1:] & zero[:-1]
+        repeated[:-1] |= zero[1:] & zero[:-1]
         self.zero = repeated
-        self.x = np.where(
-            repeated[:, :, None] | ~np.isfinite(x).all(axis=2, keepdims=True), np.nan, x
-        )
+        self.x = np.where((repeated | ~np.isfinite(x).all(axis=2))[:, :, None], np.nan, x)
         steps = np.diff(sequence.time)
         self.dt = float(np.median(steps)) if steps.size else float("nan")
 
@@ -171,6 +168,19 @@ class _View:
         if time is not None and not np.isfinite(time):
             time = None
         return Fault(kind, self.sequence.name, agents, time, detail)
+
+    def each(
+        self, kind: str, mask: np.ndarray, text: Callable[[int, np.ndarray], str], agents: int = 1
+    ) -> Iterator[Fault]:
+        """A fault of every column of ``(K, N)`` in which something holds at any sample.
+
+        Args:
+            text: by the number of the column and the numbers of these samples.
+            agents: 2 where a column stands for an agent and its leader.
+        """
+        for i in map(int, np.flatnonzero(mask.any(axis=0))):
+            k = np.flatnonzero(mask[:, i])
+            yield self.fault(kind, tuple(range(i, i + agents)), int(k[0]), text(i, k))
 
     def who(self, i: int) -> str:
         """An agent in words."""
@@ -184,20 +194,15 @@ class _View:
         return ", ".join(f"{value:.1f}" for value in self.sequence.x[k, i])
 
 
-def _samples(mask: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Columns of ``(K, N)`` in which something holds, each with the samples at which it does."""
-    for i in map(int, np.flatnonzero(mask.any(axis=0))):
-        yield i, np.flatnonzero(mask[:, i])
-
-
 def _short(view: _View) -> Iterator[Fault]:
     limits, s = view.limits, view.sequence
-    if s.n_samples < limits.min_samples:
-        text = f"{s.n_samples} samples, at least {limits.min_samples} are needed"
-        yield view.fault("too_short", (), None, text)
-    if s.n_agents < limits.min_agents:
-        text = f"{s.n_agents} agents, at least {limits.min_agents} are needed"
-        yield view.fault("too_short", (), None, text)
+    for number, needed, what in (
+        (s.n_samples, limits.min_samples, "samples"),
+        (s.n_agents, limits.min_agents, "agents"),
+    ):
+        if number < needed:
+            text = f"{number} {what}, at least {needed} are needed"
+            yield view.fault("too_short", (), None, text)
 
 
 def _times(view: _View) -> Iterator[Fault]:
@@ -216,39 +221,37 @@ def _values(view: _View) -> Iterator[Fault]:
     x = view.sequence.x
     absent = np.isnan(x).all(axis=2)
     broken = ~np.isfinite(x).all(axis=2) & ~absent
-    for mask, kind, what in (
-        (absent, "gap_in_time", "has no position"),
-        (broken, "non_finite", "has a position that is no number"),
-    ):
-        for i, k in _samples(mask):
-            span = f"{view.time[k[0]]:g}-{view.time[k[-1]]:g} s"
-            text = f"{view.who(i)} {what} at {len(k)} of {len(x)} samples ({span})"
-            yield view.fault(kind, (i,), int(k[0]), text)
+
+    def text(what: str, i: int, k: np.ndarray) -> str:
+        span = f"{view.time[k[0]]:g}-{view.time[k[-1]]:g} s"
+        return f"{view.who(i)} {what} at {len(k)} of {len(x)} samples ({span})"
+
+    yield from view.each("gap_in_time", absent, partial(text, "has no position"))
+    yield from view.each("non_finite", broken, partial(text, "has a position that is no number"))
 
 
 def _duplicates(view: _View) -> Iterator[Fault]:
     s = view.sequence
-    bearers: dict[str, list[int]] = {}
+    same: dict[str | bytes, list[int]] = {}
     for i, name in enumerate(s.agents):
-        bearers.setdefault(name, []).append(i)
-    for name, agents in bearers.items():
-        if len(agents) > 1:
-            text = f"identifier {name} is given to {len(agents)} agents"
-            yield view.fault("duplicate", tuple(agents), None, text)
-    same: dict[bytes, list[int]] = {}
+        same.setdefault(name, []).append(i)
     for i in range(s.n_agents):
         if not np.isnan(s.x[:, i]).any():
             same.setdefault(s.x[:, i].tobytes(), []).append(i)
-    for agents in same.values():
+    for key, agents in same.items():
         if len(agents) > 1:
             text = f"{len(agents)} agents have the same positions at all {s.n_samples} samples"
+            if isinstance(key, str):
+                text = f"identifier {key} is given to {len(agents)} agents"
             yield view.fault("duplicate", tuple(agents), None, text)
 
 
 def _zero_rows(view: _View) -> Iterator[Fault]:
-    for i, k in _samples(view.zero):
-        text = f"{view.who(i)} is at exactly zero at {len(k)} of {len(view.x)} samples"
-        yield view.fault("zero_row", (i,), int(k[0]), text)
+    return view.each(
+        "zero_row",
+        view.zero,
+        lambda i, k: f"{view.who(i)} is at exactly zero at {len(k)} of {len(view.x)} samples",
+    )
 
 
 def _displacements(view: _View) -> Iterator[Fault]:
@@ -311,16 +314,10 @@ def _groups(a: np.ndarray, b: np.ndarray, reach: float) -> Iterator[tuple[np.nda
     Points of different groups are farther apart, so that each group is a problem of its own. Groups
     of more than :data:`CROWDED` points are left out: paths cannot be told apart there.
     """
-    placed = [np.flatnonzero(_placed(x)) for x in (a, b)]
-    i, j = (
-        numbers[k]
-        for numbers, k in zip(placed, _near(a[placed[0]], b[placed[1]], reach), strict=True)
-    )
+    before, after = np.flatnonzero(_placed(a)), np.flatnonzero(_placed(b))
+    i, j = _near(a[before], b[after], reach)
     n = len(a)
-    graph = coo_array((np.ones(len(i)), (i, n + j)), shape=(2 * n, 2 * n))
-    label = connected_components(graph, directed=False)[1]
-    members = np.argsort(label, kind="stable")
-    for group in np.split(members, np.flatnonzero(np.diff(label[members])) + 1):
+    for group in grouped_rows(components(2 * n, np.stack([before[i], n + after[j]], axis=1))):
         if 1 < len(group) <= CROWDED:
             yield group[group < n], group[group >= n] - n
 
@@ -354,32 +351,35 @@ def _order(view: _View, faults: list[Fault]) -> Iterator[Fault]:
     """Neighbours in the lane that are not in the order of their positions."""
     gap = np.diff(view.x[:, :, 0], axis=1)
     swapped = [set(f.agents) for f in faults if f.kind == "identity_swap"]
-    for i, k in _samples(gap < 0):
-        # After a swap the wrong order is its consequence, not another fault.
-        if any({i, i + 1} <= agents for agents in swapped):
-            continue
-        text = (
-            f"{view.who(i)} is up to {-np.nanmin(gap[:, i]):.1f} m ahead of {view.who(i + 1)}, "
-            f"its leader, at {len(k)} of {len(view.x)} samples"
-        )
-        yield view.fault("overtaking", (i, i + 1), int(k[0]), text)
+    # After a swap the wrong order is its consequence, not another fault.
+    sound = [not any({i, i + 1} <= agents for agents in swapped) for i in range(gap.shape[1])]
+    return view.each(
+        "overtaking",
+        (gap < 0) & np.array(sound, dtype=bool),
+        lambda i, k: (
+            f"{view.who(i)} is up to {-np.nanmin(gap[:, i]):.1f} m ahead of "
+            f"{view.who(i + 1)}, its leader, at {len(k)} of {len(view.x)} samples"
+        ),
+        agents=2,
+    )
 
 
 def _bumpers(view: _View) -> Iterator[Fault]:
     """Vehicles whose front is in the vehicle ahead, by more than the error of one position."""
     if view.sequence.length is None:
-        return
-    limits = view.limits
+        return iter(())
     gap, length = np.diff(view.x[:, :, 0], axis=1), view.sequence.length[1:]
     # fronts that are nearer, or in the wrong order, are another fault
-    inside = (gap >= limits.spacing) & (length - gap > limits.noise)
-    for i, k in _samples(inside):
-        text = (
+    return view.each(
+        "overlap",
+        (gap >= view.limits.spacing) & (length - gap > view.limits.noise),
+        lambda i, k: (
             f"the front of {view.who(i)} is {gap[k, i].min():.2f} m behind that of "
             f"{view.who(i + 1)}, which is {length[i]:.2f} m long, at {len(k)} of {len(view.x)} "
             "samples"
-        )
-        yield view.fault("overlap", (i, i + 1), int(k[0]), text)
+        ),
+        agents=2,
+    )
 
 
 def _overlaps(view: _View) -> Iterator[Fault]:

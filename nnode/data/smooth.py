@@ -130,12 +130,7 @@ def smooth_speeds(sequence: Sequence, window: float) -> Sequence:
     Args:
         window: s, of the cubics, such as that of :func:`suggested_window`.
     """
-    v = sequence.velocity().copy()
-    for n in range(sequence.n_agents):
-        for d in range(v.shape[2]):
-            v[:, n, d] = smooth(sequence.time, sequence.x[:, n, d], window)[1]
-    if v.shape[2] == 1:
-        v = np.maximum(v, 0.0)
+    v = smooth_columns(sequence.time, sequence.x, window)[1]
     return start_smoothed(replace(sequence, v=v))
 
 
@@ -197,6 +192,14 @@ def smooth(time: np.ndarray, x: np.ndarray, window: float) -> tuple[np.ndarray, 
     smoothed = savgol_filter(even, samples, DEGREE)
     speed = savgol_filter(even, samples, DEGREE, deriv=1, delta=step)
     return np.interp(time, grid, smoothed), np.interp(time, grid, speed)
+
+
+def smooth_columns(time: np.ndarray, x: np.ndarray, window: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and speeds by :func:`smooth` of every column of ``(K, ..., D)``; with D = 1, of
+    vehicles, speeds are at least 0, as one that stands shall not roll back."""
+    columns = [smooth(time, column, window) for column in x.reshape(len(x), -1).T]
+    smoothed, v = (np.stack(part, -1).reshape(x.shape) for part in zip(*columns, strict=True))
+    return smoothed, np.maximum(v, 0.0) if x.shape[-1] == 1 else v
 
 
 def start_smoothed(sequence: Sequence) -> Sequence:

@@ -114,11 +114,10 @@ def _or_block(
 
 def _published(index: Index, gap: float) -> Split:
     """The source's own division, agents on both sides included: they are told."""
-    sides = {
-        side: [i for i, entry in enumerate(index) if entry.get("split", "") == side]
+    train, held = (
+        [i for i, entry in enumerate(index) if entry.get("split", "") == side]
         for side in (TRAIN, TEST)
-    }
-    train, held = sides[TRAIN], sides[TEST]
+    )
     if not train or not held:
         raise DataError(
             f"data.split.mode=published: {len(train)} sequences are marked {TRAIN!r} and "
@@ -142,10 +141,10 @@ def _by_component(index: Index, share: float, gap: float, rng: np.random.Generat
     target = share * len(index)
     held: list[int] = []
     got = 0
-    for component in rng.permutation(len(size)):
+    for component in rng.permutation(len(size)).tolist():
         if abs(got + size[component] - target) < abs(got - target):
-            held.append(int(component))
-            got += int(size[component])
+            held.append(component)
+            got += size[component]
     out = np.isin(label, held)
     note = (
         f"{got} of {len(index)} sequences held out ({len(held)} of {len(size)} groups of "
@@ -208,16 +207,10 @@ def _related(index: Index, others: list[int], block: list[int], gap: float) -> l
     if identified(index, others + block):
         agents = {a for i in block for a in index[i]["agents"]}
         return [i for i in others if not agents.isdisjoint(index[i]["agents"])]
-    spans = [(index[i]["start"], index[i]["end"]) for i in block]
-    return [
-        i
-        for i in others
-        if any(
-            max(_apart(end, index[i]["start"]), _apart(index[i]["end"], start)) < gap
-            for start, end in spans
-        )
-    ]
 
+    def between(i: int, j: int) -> float:
+        """Seconds from the end of the earlier one to the start of the later one."""
+        a, b = index[i], index[j]
+        return max(0.0, b["start"] - a["end"], a["start"] - b["end"])
 
-def _apart(end: float, start: float) -> float:
-    return max(0.0, start - end)
+    return [i for i in others if any(between(i, j) < gap for j in block)]

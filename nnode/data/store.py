@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from nnode.data._arrow import open_writer, to_sequence, to_table
+from nnode.data.clusters import index_of
 from nnode.data.sequence import Sequence
 from nnode.errors import DataError
 from nnode.files import interpolation
@@ -187,22 +188,18 @@ def _write_table(path: Path, sequences: Iterable[Sequence]) -> dict[str, Any]:
     walls: list[np.ndarray] = []
     names: set[str] = set()
     dims = 0
-    writer: pq.ParquetWriter | None = None
-    try:
+    with ExitStack() as stack:
         for item in sequences:
             _check(item, dims, names)
-            dims = item.x.shape[2]
+            if not index:
+                dims = item.x.shape[2]
+                writer = stack.enter_context(open_writer(path, dims))
             names.add(item.name)
-            if writer is None:
-                writer = open_writer(path, dims)
             table = to_table(item)
             writer.write_table(table, row_group_size=table.num_rows)
             index.append(_entry(item, walls))
-        if writer is None:
-            writer = open_writer(path, dims)
-    finally:
-        if writer is not None:
-            writer.close()
+        if not index:
+            stack.enter_context(open_writer(path, dims))
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -222,18 +219,8 @@ def _entry(item: Sequence, walls: list[np.ndarray]) -> dict[str, Any]:
         )
         if number == len(walls):
             walls.append(segments)
-    return {
-        "name": item.name,
-        "recording": item.recording,
-        "site": item.site,
-        "split": item.split,
-        "n_samples": item.n_samples,
-        "n_agents": item.n_agents,
-        "start": float(item.time[0]),
-        "end": float(item.time[-1]),
-        "agents": list(item.agents),
-        "walls": number,
-    }
+    (entry,) = index_of([item])
+    return entry | {"n_samples": item.n_samples, "n_agents": item.n_agents, "walls": number}
 
 
 def _check(item: Sequence, dims: int, names: set[str]) -> None:

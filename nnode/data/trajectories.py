@@ -21,10 +21,28 @@ import pandas as pd
 from nnode.data.identity import LATEST, given_anew, numbered
 from nnode.data.limits import HOLE, UNEVEN
 from nnode.data.options import positive
-from nnode.data.smooth import across, smooth
+from nnode.data.smooth import across, smooth_columns
 from nnode.errors import DataError
 
 log = logging.getLogger(__name__)
+
+
+def group_numbers(*columns: np.ndarray | None) -> np.ndarray:
+    """``(R,)`` number of the combination of cells in each row, in order of first appearance; None
+    is no column."""
+    frame = pd.DataFrame({i: column for i, column in enumerate(columns) if column is not None})
+    return np.asarray(frame.groupby(list(frame), sort=False).ngroup())
+
+
+def grouped_rows(*columns: np.ndarray | None, time: np.ndarray | None = None) -> list[np.ndarray]:
+    """Rows of each combination of cells, in order of first appearance.
+
+    Args:
+        time: ``(R,)`` the order of the rows of a combination; None: as they stand.
+    """
+    number = group_numbers(*columns)
+    order = np.argsort(number, kind="stable") if time is None else np.lexsort((time, number))
+    return np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,11 +103,8 @@ class Trajectories:
     @cached_property
     def steps(self) -> np.ndarray:
         """``(S,)`` s from each row of an agent to its next one in time."""
-        names = [n for n in ("recording", "sequence", "agent") if getattr(self, n) is not None]
-        columns = pd.DataFrame({n: getattr(self, n) for n in names})
-        code = columns.groupby(names, sort=False).ngroup().to_numpy()
-        order = np.lexsort((self.time, code))
-        return np.asarray(np.diff(self.time[order])[np.diff(code[order]) == 0])
+        agents = grouped_rows(self.recording, self.sequence, self.agent, time=self.time)
+        return np.concatenate([np.diff(self.time[rows]) for rows in agents])
 
     @cached_property
     def dt(self) -> float:
@@ -130,15 +145,13 @@ class Trajectories:
 
     def parts(self, *names: str) -> Iterator[tuple[tuple[str, ...], Trajectories]]:
         """The rows of every combination of names, such as ``recording``, in order of first rows."""
-        given = [column for name in names if (column := getattr(self, name)) is not None]
-        if not given:
+        columns = [getattr(self, name) for name in names]
+        if all(column is None for column in columns):
             yield tuple("" for _ in names), self
             return
-        groups = pd.DataFrame(dict(enumerate(given))).groupby(list(range(len(given))), sort=False)
-        for rows in sorted(groups.indices.values(), key=min):
-            part = self.at(np.sort(rows))
-            columns = (getattr(part, name) for name in names)
-            yield tuple("" if column is None else str(column[0]) for column in columns), part
+        for rows in grouped_rows(*columns):
+            row = rows[0]
+            yield tuple("" if c is None else str(c[row]) for c in columns), self.at(rows)
 
 
 @dataclass(frozen=True)
@@ -175,6 +188,11 @@ class Record:
     def last(self) -> int:
         """Number of the last time."""
         return self.first + len(self.x) - 1
+
+    @property
+    def records(self) -> list[Record]:
+        """The record alone, as those of a :class:`nnode.data.cut.Member`."""
+        return [self]
 
 
 def driven(time: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -336,7 +354,5 @@ def _smoothed(
     """Positions and speeds of local cubics, every record without a long hole by itself."""
     x, v = x.copy(), np.empty_like(x)
     for rows in np.split(np.arange(len(time)), np.flatnonzero(ends) + 1):
-        for d in range(x.shape[1]):
-            x[rows, d], v[rows, d] = smooth(time[rows], x[rows, d], window)
-    # a vehicle that stands shall not roll back
-    return x, np.maximum(v, 0.0) if x.shape[1] == 1 else v
+        x[rows], v[rows] = smooth_columns(time[rows], x[rows], window)
+    return x, v

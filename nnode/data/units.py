@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -65,6 +65,8 @@ GAIT_STRAIGHT = 0.95
 GAIT_CLEAR = 6.0
 #: Samples over which displacements are taken: the noise of single positions is small in them.
 LAG = 10
+#: Times at which distances between agents are taken.
+MOMENTS = 100
 
 
 @dataclass(frozen=True)
@@ -251,12 +253,13 @@ def _ratio(rows: Trajectories, moves: Displacements, moving: np.ndarray) -> floa
     return float(np.median(moves.size[moving][moved] / said[moved])) if moved.any() else np.nan
 
 
-def _nearest(rows: Trajectories, domain: Domain, moments: int = 100) -> float:
-    """Median distance to the nearest agent at the same time, or to the next one in its lane."""
+def _nearest(rows: Trajectories, domain: Domain) -> float:
+    """Median distance to the nearest agent at the same time, or to the next one in its lane; at
+    :data:`MOMENTS` times."""
     every, at = np.unique(rows.time, return_inverse=True)
     lanes = np.zeros(len(rows)) if rows.lane is None else pd.factorize(rows.lane)[0]
     distances = []
-    for k in np.unique(np.linspace(0, len(every) - 1, moments).astype(int)):
+    for k in np.unique(np.linspace(0, len(every) - 1, MOMENTS).astype(int)):
         present = np.flatnonzero(at == k)
         if domain == "traffic":
             lane = lanes[present]
@@ -303,10 +306,8 @@ def scales(
     top = max(score for score, _ in scored)
     weights = np.array([math.exp(score - top) for score, _ in scored])
     weights /= weights.sum()
-    order = np.argsort(-weights, kind="stable")
-    return [
-        Scale(**{**vars(scored[i][1]), "probability": float(weights[i])}) for i in order.tolist()
-    ]
+    order = np.argsort(-weights, kind="stable").tolist()
+    return [replace(scored[i][1], probability=float(weights[i])) for i in order]
 
 
 def share(every: list[Scale]) -> float:

@@ -21,16 +21,7 @@ from nnode.data.clusters import (
     signs,
 )
 from nnode.data.sequence import Sequence
-
-
-def entry(start: float, end: float, *agents: str, recording: str = "r") -> dict[str, Any]:
-    return {
-        "name": f"{recording}/{start:g}",
-        "recording": recording,
-        "start": start,
-        "end": end,
-        "agents": list(agents),
-    }
+from tests.data.tables import entry
 
 
 def sequence(recording: str, number: int, **covariates: Any) -> Sequence:
@@ -60,6 +51,8 @@ def test_without_identifiers_a_gap_in_time_parts_them() -> None:
     assert clusters(index, 5.2).tolist() == [0, 0, 0]
     assert clusters(index, 0.0).tolist() == [0, 1, 2]
     assert relation(index) == "are closer than 5 s in time"
+    # a long sequence reaches over a short one that ends before it
+    assert clusters([entry(0, 30), entry(1, 2), entry(32, 33)]).tolist() == [0, 0, 0]
 
 
 def test_one_sequence_without_identifiers_leaves_its_recording_to_time() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.data.exits import FAR, destinations, exits_of, read_exits
+from nnode.data.exits import FAR, exits_of, read_exits
 from nnode.data.prepare import prepare
 from nnode.data.readers.juelich import JuelichOptions, read_juelich
 from nnode.data.readers.table import TableOptions, read_table
@@ -25,7 +25,7 @@ def test_nearest_points_of_a_line() -> None:
     (one,) = read_exits({"door": {"line": [2, 0, 4, 2]}})
     x = np.array([[0.0, 0.0], [3.0, 0.0], [9.0, 5.0], [2.0, 4.0]])
     expected = [[2, 0], [2.5, 0.5], [4, 2], [4, 2]]
-    np.testing.assert_allclose(destinations([one] * 4, x), expected)
+    np.testing.assert_allclose([one.point(place) for place in x], expected)
     # no point of the line is nearer
     points = np.linspace([2, 0], [4, 2], 1001)
     for place, own in zip(x, expected, strict=True):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.data.clusters import clusters
+from nnode.data.clusters import clusters, index_of
 from nnode.data.identity import given_anew, identify
 from nnode.data.limits import LIMITS
 from nnode.data.options import Agents, Faults, SplitOptions
@@ -17,6 +18,7 @@ from nnode.data.prepare import prepare
 from nnode.data.readers.table import TableOptions
 from nnode.data.sequence import Sequence
 from nnode.data.split import split
+from tests.builders import people
 
 DT = 0.1
 
@@ -38,23 +40,15 @@ def cut(
 ) -> Sequence:
     """Samples ``first`` and on of a world whose clock starts at ``clock``, agents 0, 1, 2, ..."""
     part = x[first:] if samples is None else x[first : first + samples]
-    return Sequence(
-        name=f"run/{name}",
-        recording="run",
-        time=clock + DT * (first + np.arange(len(part))),
-        x=part,
-        agents=tuple(map(str, range(x.shape[1]))),
-    )
+    agents = tuple(map(str, range(x.shape[1])))
+    return people(part, DT, start=clock + DT * first, name=f"run/{name}", agents=agents)
 
 
 def groups(sequences: list[Sequence], domain: str, mode: str = "auto") -> int:
     """Number of groups of sequences that share an agent."""
     named, _ = identify(sequences, domain, Agents[mode])  # type: ignore[arg-type]
-    index = [
-        {"name": s.name, "recording": "run", "start": s.time[0], "end": s.time[-1], "agents": own}
-        for s, own in zip(sequences, named, strict=True)
-    ]
-    return len(set(clusters(index, 0.0).tolist()))
+    unique = (replace(s, agents=own) for s, own in zip(sequences, named, strict=True))
+    return int(clusters(index_of(unique), 0.0).max()) + 1
 
 
 both = pytest.mark.parametrize("domain", ["traffic", "crowd"])

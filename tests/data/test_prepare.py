@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 from scipy.io import savemat
@@ -23,6 +22,7 @@ from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError, FaultError
 from nnode.plots.quality import plot_faults
+from tests.data.tables import saved, tidy
 
 TIME = 0.2 * np.arange(6)
 CLEAN = np.array([[0.0], [30.0], [60.0]]) + 25 * TIME
@@ -30,11 +30,13 @@ JUMP = CLEAN + np.where(TIME > 0.5, [[0], [0], [40]], 0)
 INFINITE = np.where(CLEAN[1, 2] == CLEAN, np.inf, CLEAN)
 
 
-def raw(folder: Path, *positions: np.ndarray, recording: str = "demo") -> EsimasOptions:
+def raw(
+    folder: Path, *positions: np.ndarray, recording: str = "demo", time: np.ndarray = TIME
+) -> EsimasOptions:
     folder.mkdir(exist_ok=True)
     cells = np.empty((len(positions), 1), dtype=object)
     for i, x in enumerate(positions):
-        cells[i, 0] = {"Xarr": x, "Tarr": TIME[: x.shape[1]]}
+        cells[i, 0] = {"Xarr": x, "Tarr": time[: x.shape[1]]}
     savemat(folder / f"sequence_data{recording}.mat", {"sequences": cells})
     return EsimasOptions(source=str(folder))
 
@@ -189,11 +191,8 @@ def test_open_prepares_on_the_fly(tmp_path: Path, options: EsimasOptions) -> Non
 
 
 def test_a_moved_table_is_the_same_table(tmp_path: Path) -> None:
-    table = "sequence,time,agent,x\n" + "".join(
-        f"s,{0.1 * k},{a},{30 * a + k}\n" for k in range(4) for a in range(2)
-    )
-    (tmp_path / "t.csv").write_text(table)
-    options = TableOptions(domain="traffic", path=str(tmp_path / "t.csv"))
+    path = saved(tmp_path / "t.csv", tidy(4, 2))
+    options = TableOptions(domain="traffic", path=str(path))
     prepare(options, tmp_path / "out")
     options.path, options.prepared = "far/away/t.csv", str(tmp_path / "out")
     assert len(open_data(options, tmp_path / "unused")) == 1
@@ -203,14 +202,9 @@ def test_a_moved_table_is_the_same_table(tmp_path: Path) -> None:
 
 
 def test_people_absent_for_a_while_are_left_out(tmp_path: Path) -> None:
-    rows = [
-        f"s,{0.1 * k},{a},{0.1 * k},{a}"
-        for k in range(5)
-        for a in range(3)
-        if not (a == 1 and k == 0)
-    ]
-    (tmp_path / "t.csv").write_text("sequence,time,agent,x,y\n" + "\n".join(rows))
-    options = TableOptions(domain="crowd", path=str(tmp_path / "t.csv"))
+    table = tidy(5, 3, step=0.1).assign(y=0.0)
+    path = saved(tmp_path / "t.csv", table[(table.agent != 1) | (table.time > 0)])
+    options = TableOptions(domain="crowd", path=str(path))
     store = prepare(options, tmp_path / "out")
     assert store[0].agents == ("0", "2")
     (absent,) = store.manifest["dropped_agents"]
@@ -218,17 +212,10 @@ def test_people_absent_for_a_while_are_left_out(tmp_path: Path) -> None:
 
 
 def test_absent_vehicle_makes_the_sequence_faulty(tmp_path: Path) -> None:
-    rows = [
-        f"{s},{0.1 * k},{a},{30 * a + k}"
-        for s in "ab"
-        for k in range(5)
-        for a in range(3)
-        if not (s == "b" and a == 1 and k > 1)
-    ]
-    (tmp_path / "t.csv").write_text("sequence,time,agent,x\n" + "\n".join(rows))
-    options = TableOptions(
-        domain="traffic", path=str(tmp_path / "t.csv"), faults=Faults.keep, fill=0.1
-    )
+    table = tidy(5, 3, "ab")
+    absent = (table.sequence == "b") & (table.agent == 1) & (table.time > 0.15)
+    path = saved(tmp_path / "t.csv", table[~absent])
+    options = TableOptions(domain="traffic", path=str(path), faults=Faults.keep, fill=0.1)
     store = prepare(options, tmp_path / "out")
     assert [s.name for s in store] == ["t/a"]
     assert store.manifest["recordings"]["t"]["faulty"] == {"gap_in_time": 1}
@@ -236,18 +223,9 @@ def test_absent_vehicle_makes_the_sequence_faulty(tmp_path: Path) -> None:
 
 def test_two_percent_of_missing_samples_cost_no_platoon(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
-    time = 0.1 * np.arange(100)
-    rows = pd.DataFrame(
-        [
-            (f"s{s}", t, a, 30 * a + 15 * t + 6 * np.sin(0.5 * t + s))
-            for s in range(8)
-            for a in range(4)
-            for t in time
-        ],
-        columns=["sequence", "time", "agent", "x"],
-    )
-    path = tmp_path / "t.csv"
-    rows[rng.random(len(rows)) > 0.02].to_csv(path, index=False)
+    rows = tidy(100, 4, "01234567", step=1.5)
+    rows["x"] += 6 * np.sin(0.5 * rows.time + rows.sequence.astype(int))
+    path = saved(tmp_path / "t.csv", rows[rng.random(len(rows)) > 0.02])
     store = prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
     assert len(store) == 8
     told = store.manifest["filled"]
@@ -264,18 +242,15 @@ def test_two_percent_of_missing_samples_cost_no_platoon(tmp_path: Path) -> None:
 
 
 def test_vehicles_that_never_meet_are_refused_with_what_to_do(tmp_path: Path) -> None:
-    rows = [f"s,{0.1 * k},{a},{30 * a + k}" for a in range(3) for k in range(30 * a, 30 * a + 30)]
-    path = tmp_path / "t.csv"
-    path.write_text("sequence,time,agent,x\n" + "\n".join(rows))
+    table = tidy(30, 3)
+    path = saved(tmp_path / "t.csv", table.assign(time=table.time + 3 * table.agent))
     with pytest.raises(DataError, match=r"data\.fill=SECONDS") as error:
         prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
     assert "faults=keep" not in str(error.value)
 
 
 def test_a_folder_of_an_earlier_version_opens_under_its_names_of_options(tmp_path: Path) -> None:
-    rows = [f"s,{0.1 * k},{a},{30 * a + k}" for a in range(3) for k in range(30)]
-    path = tmp_path / "t.csv"
-    path.write_text("sequence,time,agent,x\n" + "\n".join(rows))
+    path = saved(tmp_path / "t.csv", tidy(30, 3))
     options = TableOptions(domain="traffic", path=str(path), fill=0.3)
     store = prepare(options, tmp_path / "out")
     manifest = tmp_path / "out" / "manifest.json"
@@ -289,18 +264,9 @@ def test_a_folder_of_an_earlier_version_opens_under_its_names_of_options(tmp_pat
 
 def test_noise_stands_in_the_manifest_and_is_no_fault(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
-    time = 0.1 * np.arange(200)
-    rows = pd.DataFrame(
-        [
-            (f"s{s}", t, a, 30 * a + 4 * t + 0.3 * rng.normal())
-            for s in range(5)
-            for a in range(3)
-            for t in time
-        ],
-        columns=["sequence", "time", "agent", "x"],
-    )
-    path = tmp_path / "t.csv"
-    rows.to_csv(path, index=False)
+    rows = tidy(200, 3, "abcde", step=0.4)
+    rows["x"] += 0.3 * rng.normal(size=len(rows))
+    path = saved(tmp_path / "t.csv", rows)
     options = TableOptions(domain="traffic", path=str(path))
     store = prepare(options, tmp_path / "out")
     # steps of -0.5 m are common where cars drive slowly: none of them is a fault
@@ -310,15 +276,13 @@ def test_noise_stands_in_the_manifest_and_is_no_fault(tmp_path: Path) -> None:
     options.smooth = 2.0
     smooth = prepare(options, tmp_path / "smooth")
     assert smooth.manifest["noise"]["start_speed"] < 0.2
-    assert np.std(smooth[0].x[:, 0, 0] - 4 * time) < 0.15
+    assert np.std(smooth[0].x[:, 0, 0] - 4 * smooth[0].time) < 0.15
 
 
 def test_one_data_set_has_one_sampling_interval(tmp_path: Path) -> None:
     folder = tmp_path / "raw"
-    options = raw(folder, CLEAN, recording="a")
-    cells = np.empty((1, 1), dtype=object)
-    cells[0, 0] = {"Xarr": CLEAN, "Tarr": 2 * TIME}
-    savemat(folder / "sequence_datab.mat", {"sequences": cells})
+    raw(folder, CLEAN, recording="a")
+    options = raw(folder, CLEAN, recording="b", time=2 * TIME)
     with pytest.raises(DataError, match=r"a/000 is sampled every 0.2 s, b/000 every 0.4 s"):
         prepare(options, tmp_path / "out")
 

@@ -20,22 +20,21 @@ from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
 from nnode.plots.quality import MAX_PANELS, STYLES, plot_faults
+from tests.builders import lane, straight
+from tests.builders import people as walkers
 
 
 def platoon(n: int = 3, k: int = 8, dt: float = 0.2, speed: float = 25.0) -> Sequence:
-    time = 10.0 + dt * np.arange(k)
-    x = 5.0 + speed * (time[:, None] - time[0]) + 30.0 * np.arange(n)
-    return Sequence(name="r/0", recording="r", time=time, x=x[:, :, None])
+    x = 5.0 + speed * dt * np.arange(k)[:, None] + 30.0 * np.arange(n)
+    return lane(x, dt, start=10.0)
 
 
 def people(n: int = 4, k: int = 26, dt: float = 0.04) -> Sequence:
-    time = dt * np.arange(k)
-    x = np.empty((k, n, 2))
-    x[:, :, 0] = 1.3 * time[:, None] * (-1.0) ** np.arange(n)
-    x[:, :, 1] = 0.8 * np.arange(n) + 0.5
-    return Sequence(
-        name="r/0", recording="r", time=time, x=x, agents=tuple(f"p{i}" for i in range(n))
-    )
+    place, way = np.arange(n), np.zeros((n, 2))
+    way[:, 0] = 1.3 * (-1.0) ** place
+    start = np.stack([np.zeros(n), 0.8 * place + 0.5], axis=1)
+    walked = straight(start, way, k, dt, agents=tuple(f"p{i}" for i in place))
+    return replace(walked, v=None)
 
 
 def changed(sequence: Sequence, at: tuple, value: object) -> Sequence:
@@ -76,10 +75,55 @@ def test_people_measured_badly_do_not_jump(dt: float) -> None:
         assert kinds(replace(s, x=noisy), "crowd", noise) == ["jump"]
 
 
-def test_zero_row() -> None:
-    s = changed(platoon(), (slice(None), 1), 0.0)
-    (fault,) = find_faults(s, "traffic")
-    assert (fault.kind, fault.agents, fault.time) == ("zero_row", (1,), 10.0)
+PLATOON = platoon().x
+TWO = platoon(n=2).x
+
+
+@pytest.mark.parametrize(
+    ("sequence", "at", "value", "kind", "agents", "sample"),
+    [
+        (platoon(), np.s_[:, 1], 0.0, "zero_row", (1,), 0),
+        # two cars exchange their numbers
+        (platoon(), np.s_[4:, [0, 1]], PLATOON[4:, [1, 0]], "identity_swap", (0, 1), 4),
+        # the leader leaves, a car enters behind: every row goes on with the car ahead
+        (
+            platoon(),
+            np.s_[5:],
+            np.concatenate([PLATOON[5:, :1] - 20.0, PLATOON[5:, :-1]], axis=1),
+            "identity_swap",
+            (0, 1, 2),
+            5,
+        ),
+        # a step that no other path explains
+        (platoon(), np.s_[4:, 2], PLATOON[4:, 2] + 20.0, "jump", (2,), 4),
+        # passes between two samples, never within 2 m
+        (
+            platoon(n=2),
+            np.s_[:, 0, 0],
+            TWO[:, 0, 0] + 6.5 * np.arange(8) - 0.2,
+            "overtaking",
+            (0, 1),
+            5,
+        ),
+        (platoon(), np.s_[2:4, 1], np.nan, "gap_in_time", (1,), 2),
+        (people(), np.s_[10:, [0, 2]], people().x[10:, [2, 0]], "identity_swap", (0, 2), 10),
+        (people(), np.s_[10:, 1, 1], 30.0, "jump", (1,), 10),
+    ],
+)
+def test_a_fault_is_told_where_it_is(
+    sequence: Sequence,
+    at: tuple,
+    value: object,
+    kind: str,
+    agents: tuple[int, ...],
+    sample: int,
+) -> None:
+    domain: Domain = "traffic" if sequence.x.shape[2] == 1 else "crowd"
+    (fault,) = find_faults(changed(sequence, at, value), domain)
+    assert (fault.kind, fault.agents) == (kind, agents)
+    assert fault.time == pytest.approx(sequence.time[sample])
+    if sequence.agents and agents[0] == 0:
+        assert "p0" in fault.detail
 
 
 def test_a_car_may_start_at_the_origin() -> None:
@@ -87,55 +131,16 @@ def test_a_car_may_start_at_the_origin() -> None:
     assert kinds(replace(s, x=s.x - s.x[0, 0])) == []
 
 
-def test_exchange_of_two_cars_is_a_swap() -> None:
-    s = platoon()
-    x = s.x.copy()
-    x[4:, [0, 1]] = x[4:, [1, 0]]
-    (fault,) = find_faults(replace(s, x=x), "traffic")
-    assert (fault.kind, fault.agents) == ("identity_swap", (0, 1))
-    assert fault.time == pytest.approx(s.time[4])
-
-
-def test_shift_of_all_cars_is_a_swap() -> None:
-    # The leader leaves, a new car enters behind: every row goes on with the car ahead.
-    s = platoon()
-    x = s.x.copy()
-    x[5:, 1:] = x[5:, :-1].copy()
-    x[5:, 0] -= 20.0
-    (fault,) = find_faults(replace(s, x=x), "traffic")
-    assert (fault.kind, fault.agents) == ("identity_swap", (0, 1, 2))
-
-
-def test_a_step_no_other_path_explains_is_a_jump() -> None:
-    s = changed(platoon(), (slice(4, None), 2), platoon().x[4:, 2] + 20.0)
-    (fault,) = find_faults(s, "traffic")
-    assert (fault.kind, fault.agents) == ("jump", (2,))
-    assert fault.time == pytest.approx(s.time[4])
-
-
 def test_limit_of_displacement_grows_with_the_interval() -> None:
     for dt, step, expected in ((0.2, 13.0, ["jump"]), (0.4, 13.0, []), (0.4, 25.0, ["jump"])):
         s = platoon(n=2, dt=dt)
-        x = s.x.copy()
-        x[5:, 1] += step - 25.0 * dt
-        assert kinds(replace(s, x=x)) == expected
+        assert kinds(changed(s, np.s_[5:, 1], s.x[5:, 1] + step - 25.0 * dt)) == expected
 
 
 @pytest.mark.parametrize(("step", "expected"), [(-0.4, []), (-1.5, ["backward"]), (-3.0, ["jump"])])
 def test_backward(step: float, expected: list[str]) -> None:
     s = platoon(n=2, speed=5.0)
-    x = s.x.copy()
-    x[4:, 0] += step - 1.0
-    assert kinds(replace(s, x=x)) == expected
-
-
-def test_overtaking() -> None:
-    s = platoon(n=2)
-    x = s.x.copy()
-    x[:, 0, 0] += 6.5 * np.arange(8) - 0.2  # passes between two samples, never within 2 m
-    (fault,) = find_faults(replace(s, x=x), "traffic")
-    assert (fault.kind, fault.agents) == ("overtaking", (0, 1))
-    assert fault.time == pytest.approx(s.time[5])
+    assert kinds(changed(s, np.s_[4:, 0], s.x[4:, 0] + step - 1.0)) == expected
 
 
 @pytest.mark.parametrize(
@@ -164,18 +169,9 @@ def test_overlap_of_cars() -> None:
     assert kinds(follow) == []
 
 
-def test_people() -> None:
+def test_people_beside_each_other() -> None:
     s = people()
-    swap = s.x.copy()
-    swap[10:, [0, 2]] = swap[10:, [2, 0]]
-    (fault,) = find_faults(replace(s, x=swap), "crowd")
-    assert (fault.kind, fault.agents) == ("identity_swap", (0, 2))
-    assert "p0" in fault.detail
-    jump = changed(s, (slice(10, None), 1, 1), 30.0)
-    assert kinds(jump, "crowd") == ["jump"]
-    beside = s.x.copy()
-    beside[:, 2] = beside[:, 0] + [0.0, 0.05]
-    assert kinds(replace(s, x=beside), "crowd") == ["overlap"]
+    assert kinds(changed(s, np.s_[:, 2], s.x[:, 0] + [0.0, 0.05]), "crowd") == ["overlap"]
 
 
 def test_duplicates() -> None:
@@ -191,9 +187,8 @@ def test_duplicates() -> None:
 
 def test_gaps_and_numbers() -> None:
     s = platoon()
-    absent = changed(s, (slice(2, 4), 1), np.nan)
+    absent = changed(s, np.s_[2:4, 1], np.nan)
     (fault,) = find_faults(absent, "traffic")
-    assert (fault.kind, fault.agents) == ("gap_in_time", (1,))
     assert "10.4-10.6 s" in fault.detail
     assert not usable(absent, [fault])
     assert kinds(changed(s, (3, 1), np.inf)) == ["non_finite"]
@@ -273,9 +268,7 @@ def test_memory_grows_with_the_number_of_vehicles() -> None:
     x = 20.0 * np.arange(n)[None, :, None] + 2.0 * np.arange(4)[:, None, None]
     x[2:, [5, 6]] = x[2:, [6, 5]]
     x[:, 9] = x[:, 8] + 0.5
-    s = Sequence(
-        name="a", recording="a", time=0.2 * np.arange(4), x=x, agents=tuple(map(str, range(n)))
-    )
+    s = lane(x[..., 0], agents=tuple(map(str, range(n))))
     tracemalloc.start()
     try:
         found = {(f.kind, f.agents) for f in find_faults(s, "traffic")}
@@ -292,7 +285,7 @@ def test_pairs_too_many_to_list_are_told_by_the_nearest(
 ) -> None:
     dims = 1 if domain == "traffic" else 2
     x = np.ones((3, 40, dims)) * np.arange(3)[:, None, None]
-    s = Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)
+    s = walkers(x, 0.2)
     every = [f for f in find_faults(s, domain) if f.kind == "overlap"]
     assert len(every) == 40 * 39 / 2
     monkeypatch.setattr(quality, "PAIRS", 1000)
@@ -302,7 +295,6 @@ def test_pairs_too_many_to_list_are_told_by_the_nearest(
 
 
 def test_positions_whose_squares_are_no_numbers() -> None:
-    x = np.array([[[0.0], [10.0], [1e300]], [[1.0], [1e308], [-1e308]], [[2.0], [12.0], [1e300]]])
-    s = Sequence(name="a", recording="a", time=0.2 * np.arange(3), x=x)
+    s = lane([[0.0, 10.0, 1e300], [1.0, 1e308, -1e308], [2.0, 12.0, 1e300]])
     with np.errstate(all="ignore"):
         assert "jump" in {f.kind for f in find_faults(s, "traffic")}

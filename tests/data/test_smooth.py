@@ -27,6 +27,7 @@ from nnode.data.sequence import Sequence
 from nnode.data.smooth import measured_noise, smooth
 from nnode.data.trajectories import Grid, Record, Trajectories, records
 from nnode.errors import ConfigError
+from tests.data.tables import saved
 
 DOCS = Path(__file__).parents[2] / "docs" / "data.md"
 STEP = 0.1
@@ -74,9 +75,8 @@ def figures(folder: Path, kind: str, window: float | None) -> tuple[float, float
     """RMS errors (m, m/s, m/s²) of what the reader gives."""
     time, speed, force = truth()
     x = position(time)
-    path = folder / f"{kind}-{window}.csv"
-    x_measured = x + errors(kind, len(time))
-    pd.DataFrame({"vehicle": 1, "time": time, "x": x_measured}).to_csv(path, index=False)
+    table = pd.DataFrame({"vehicle": 1, "time": time, "x": x + errors(kind, len(time))})
+    path = saved(folder / f"{kind}-{window}.csv", table)
     (s,) = read_vehicles(path, VehicleTableOptions(min_vehicles=1, smooth=window))
     at = np.round(s.time / STEP).astype(int)[1:-1]  # the last speed of a measured one is repeated
     middle = 0.5 * (force[at[:-1]] + force[at[1:]])
@@ -118,10 +118,8 @@ def test_records_are_smoothed_apart_and_nobody_rolls_back(tmp_path: Path) -> Non
     time = np.arange(0, 10, STEP)
     noise = np.random.default_rng(0).normal(0, 0.3, (2, len(time)))
     parts = [pd.DataFrame({"vehicle": i, "time": time, "x": 50.0 * i + noise[i]}) for i in range(2)]
-    path = tmp_path / "t.csv"
-    pd.concat(parts).to_csv(path, index=False)
     options = VehicleTableOptions(min_vehicles=2, smooth=2.0)
-    (s,) = read_vehicles(path, options)
+    (s,) = read_vehicles(saved(tmp_path / "t.csv", *parts), options)
     assert s.v is not None
     assert (s.v >= 0).all()
     assert np.abs(s.x[:, :, 0] - [0, 50]).max() < 1
@@ -223,19 +221,17 @@ def as_esimas(path: Path) -> DataOptions:
 
 
 def as_vehicles(path: Path) -> DataOptions:
-    rows_of().to_csv(path / "t.csv", index=False)
-    return VehicleTableOptions(path=str(path / "t.csv"), dt=0.1)
+    return VehicleTableOptions(path=str(saved(path / "t.csv", rows_of())), dt=0.1)
 
 
 def as_table(path: Path) -> DataOptions:
-    rows_of().rename(columns={"vehicle": "agent"}).assign(sequence=1).to_csv(path / "t.csv")
-    return TableOptions(domain="traffic", path=str(path / "t.csv"))
+    table = rows_of().rename(columns={"vehicle": "agent"}).assign(sequence=1)
+    return TableOptions(domain="traffic", path=str(saved(path / "t.csv", table)))
 
 
 def as_pairs(path: Path) -> DataOptions:
     pair = {"time": 0.1 * np.arange(120), "x_follower": CARS[0], "x_leader": CARS[1]}
-    pd.DataFrame(pair).to_csv(path / "t.csv", index=False)
-    return PairOptions(path=str(path / "t.csv"))
+    return PairOptions(path=str(saved(path / "t.csv", pd.DataFrame(pair))))
 
 
 def as_openacc(path: Path) -> DataOptions:

@@ -12,37 +12,23 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnode.data.clusters import clusters
 from nnode.data.options import SplitMode, SplitOptions
 from nnode.data.sequence import Sequence
 from nnode.data.split import Split, split
 from nnode.data.store import write_store
 from nnode.errors import ConfigError, DataError
-
-
-def entry(
-    start: float, end: float, agents: list[str] | None = None, recording: str = "r"
-) -> dict[str, Any]:
-    return {
-        "name": f"{recording}/{start:g}",
-        "recording": recording,
-        "start": start,
-        "end": end,
-        "agents": agents or [],
-    }
+from tests.data.tables import entry
 
 
 def apart(n: int) -> list[dict[str, Any]]:
     """Platoons that share no vehicle."""
-    return [entry(20.0 * i, 20.0 * i + 3, [f"a{i}", f"b{i}"]) for i in range(n)]
+    return [entry(20.0 * i, 20.0 * i + 3, f"a{i}", f"b{i}") for i in range(n)]
 
 
 def chain(n: int, stay: int, recording: str = "r") -> list[dict[str, Any]]:
     """A corridor: one person enters per second and is seen in ``stay`` one-second sequences."""
-    return [
-        entry(float(i), i + 0.96, [f"p{j}" for j in range(i, i + stay)], recording)
-        for i in range(n)
-    ]
+    people = [[f"p{j}" for j in range(i, i + stay)] for i in range(n)]
+    return [entry(float(i), i + 0.96, *people[i], recording=recording) for i in range(n)]
 
 
 def assert_sound(index: list[dict[str, Any]], result: Split) -> None:
@@ -75,17 +61,12 @@ def test_independent_sequences_are_drawn_at_random_and_meet_the_share() -> None:
 
 
 def test_sequences_that_share_an_agent_stay_together() -> None:
-    index = [entry(20.0 * i, 20.0 * i + 3, [f"car{i // 3}", f"only{i}"]) for i in range(60)]
+    index = [entry(20.0 * i, 20.0 * i + 3, f"car{i // 3}", f"only{i}") for i in range(60)]
     result = split(index, SplitOptions(heldout=0.25, seed=0))
     assert_sound(index, result)
     assert len(result.heldout) == 15
     for i in range(0, 60, 3):
         assert len({i in result.heldout, i + 1 in result.heldout, i + 2 in result.heldout}) == 1
-
-
-def test_the_same_identifier_in_two_recordings_is_two_agents() -> None:
-    index = [entry(0.0, 1.0, ["1"], f"rec{i}") for i in range(4)]
-    assert len(set(clusters(index, 5.0).tolist())) == 4
 
 
 def test_a_chain_is_cut_by_a_block_of_time() -> None:
@@ -113,16 +94,6 @@ def test_every_recording_gives_its_block() -> None:
     assert_sound(index, result)
     assert sum(i < 30 for i in result.heldout) == 6
     assert sum(i >= 30 for i in result.heldout) == 10
-
-
-def test_without_identifiers_time_decides() -> None:
-    starts = [0.0, 4.0, 20.0, 23.0, 26.0, 60.0]
-    index = [entry(t, t + 2) for t in starts]
-    assert clusters(index, 5.0).tolist() == [0, 0, 1, 1, 1, 2]
-    assert len(set(clusters(index, 0.0).tolist())) == 6
-    # a long sequence reaches over a short one that ends before it
-    index = [entry(0.0, 30.0), entry(1.0, 2.0), entry(32.0, 33.0)]
-    assert clusters(index, 5.0).tolist() == [0, 0, 0]
 
 
 def test_without_identifiers_a_block_drops_its_neighbours_in_time() -> None:
@@ -153,7 +124,7 @@ def test_without_identifiers_a_block_drops_its_neighbours_in_time() -> None:
 def test_no_agent_is_ever_on_both_sides(
     data: list[tuple[str, float, float, set[str]]], heldout: float, seed: int, mode: SplitMode
 ) -> None:
-    index = [entry(t, t + d, sorted(agents), rec) for rec, t, d, agents in data]
+    index = [entry(t, t + d, *sorted(agents), recording=rec) for rec, t, d, agents in data]
     options = SplitOptions(heldout=heldout, seed=seed, mode=mode)
     try:
         result = split(index, options)
@@ -181,7 +152,7 @@ def test_splits_that_leave_a_side_empty_are_refused() -> None:
         split([], SplitOptions())
     with pytest.raises(DataError, match="leaves no sequence for the held-out part"):
         split(apart(1), SplitOptions(heldout=0.2))
-    everyone = [entry(float(i), i + 0.9, ["a", "b"]) for i in range(10)]  # a ring road
+    everyone = [entry(float(i), i + 0.9, "a", "b") for i in range(10)]  # a ring road
     with pytest.raises(DataError, match="leaves no sequence for training"):
         split(everyone, SplitOptions(heldout=0.2))
     with pytest.raises(DataError, match=r"data\.split\.mode=block holds out"):
@@ -213,7 +184,7 @@ def test_real_platoons_are_held_out_in_groups_close_in_time(real_data: Path, fam
             cell = scipy.io.loadmat(real_data / "esimas" / f"{family}{name}.mat")["sequences"]
             for item in cell.ravel():
                 time = item["Tarr"][0, 0].ravel()
-                index.append(entry(float(time[0]), float(time[-1]), None, name))
+                index.append(entry(float(time[0]), float(time[-1]), recording=name))
     result = split(index, SplitOptions(heldout=0.2))
     assert result.mode == "random"
     assert len(result.heldout) == pytest.approx(0.2 * len(index), abs=2)
@@ -233,7 +204,7 @@ def test_real_corridor_is_held_out_as_a_block(real_data: Path) -> None:
         who, seen = np.unique(window[:, 0], return_counts=True)
         whole = [f"{int(i)}" for i in who[seen == 26]]
         if whole:
-            index.append(entry(float(second), second + 1.0, whole))
+            index.append(entry(float(second), second + 1.0, *whole))
     result = split(index, SplitOptions(heldout=0.2))
     assert_sound(index, result)
     assert result.mode == "block"
@@ -244,7 +215,9 @@ def test_real_corridor_is_held_out_as_a_block(real_data: Path) -> None:
 def test_runs_that_everybody_drives_through_are_held_out_whole() -> None:
     # three windows of each of four runs: no block of a run is left without dropping the rest
     index = [
-        entry(10.0 * k, 10.0 * k + 10, ["a", "b"], f"run{r}") for r in range(4) for k in range(3)
+        entry(10.0 * k, 10.0 * k + 10, "a", "b", recording=f"run{r}")
+        for r in range(4)
+        for k in range(3)
     ]
     for seed in range(5):
         result = split(index, SplitOptions(heldout=0.4, seed=seed))

@@ -201,7 +201,11 @@ def plain(name: str) -> tuple[str, str]:
     match = _ENDING.search(name)
     if match and match.start() > 0:
         unit, name = UNITS[match[1].lower()], name[: match.start()]
-    return re.sub(r"[^a-z0-9]", "", name.lower()), unit
+    return _letters(name), unit
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def in_seconds(raw: Raw) -> Raw:
@@ -211,18 +215,16 @@ def in_seconds(raw: Raw) -> Raw:
     Raises:
         DataError: a cell of them that is none; names the row.
     """
-    table = raw.table
-    if table is None or not raw.named:
+    if raw.table is None or not raw.named:
         return raw
     held = {}
-    for column in map(str, table.frame.columns):
-        cells = table.frame[column]
-        if plain(column)[0] not in NAMES["time"] or pd.api.types.is_numeric_dtype(cells):
+    for column, cells in raw.frame.items():
+        if plain(str(column))[0] not in NAMES["time"] or pd.api.types.is_numeric_dtype(cells):
             continue
         if cells.dtype.kind in "mM" or cells.astype("string").str.contains(r"\d[-:]\d").any():
-            held[column] = table.times(column)[1]
+            held[str(column)] = raw.table.times(str(column))[1]
     if held:
-        table.frame = table.frame.assign(**held)
+        raw.table.frame = raw.frame.assign(**held)
     return replace(raw, dated=tuple(held))
 
 
@@ -234,35 +236,30 @@ def numbers(frame: pd.DataFrame, column: str) -> np.ndarray:
 
 def meanings(raw: Raw) -> dict[str, Meaning]:
     """What the columns mean, as far as that can be told."""
-    assert raw.table is not None
-    frame = raw.table.frame
+    frame = raw.frame
     if not raw.named:
         return {m: Meaning(c, raw.unit or "", "holds") for m, c in _by_content(frame).items()}
     recognised: dict[str, Meaning] = {}
-    parsed = {str(name): plain(str(name)) for name in frame.columns}
-    whole = {name: re.sub(r"[^a-z0-9]", "", name.lower()) for name in parsed}
-    taken: set[str] = set()
+    # a name as a whole, and without the unit that it ends in
+    parsed = {name: (_letters(name), *plain(name)) for name in map(str, frame.columns)}
     for meaning, usual in NAMES.items():
-        candidates = {column: usual.index(w) for column, w in whole.items() if w in usual}
-        candidates |= {
-            column: usual.index(word)
-            for column, (word, _) in parsed.items()
-            if column not in candidates and word in usual
-        }
+        candidates: dict[str, int] = {}
+        for place in (0, 1):
+            for column, words in parsed.items():
+                if words[place] in usual:
+                    candidates.setdefault(column, usual.index(words[place]))
         fit = [
             column
             for column in sorted(candidates, key=lambda c: candidates[c])
-            if column not in taken
-            and (meaning not in _NUMERIC or np.isfinite(numbers(frame, column)).mean() > MOSTLY)
+            if meaning not in _NUMERIC or np.isfinite(numbers(frame, column)).mean() > MOSTLY
         ]
         if fit:
             column = fit[0]
+            whole, _, unit = parsed.pop(column)
             sure = "named" if column == meaning else "like"
-            unit = "" if whole[column] in usual else parsed[column][1]
             # the own name of a meaning leaves no doubt
-            others = () if whole[column] == usual[0] else _others(frame, column, fit[1:])
-            recognised[meaning] = Meaning(column, unit, sure, others)
-            taken.add(column)
+            others = () if whole == usual[0] else _others(frame, column, fit[1:])
+            recognised[meaning] = Meaning(column, "" if whole in usual else unit, sure, others)
     return recognised
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from nnode.data.check.columns import (
 )
 from nnode.data.check.raw import Raw, read_raw
 from nnode.data.check.recognise import Recognised, native_source, source_of, source_of_native
-from nnode.data.check.rows import scaled
+from nnode.data.check.rows import Scaled, scaled
 from nnode.data.cut import Reading
 from nnode.data.prepare import FORMATS
 from nnode.data.quality import (
@@ -36,7 +37,7 @@ from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
 from nnode.data.trajectories import Trajectories
-from nnode.data.units import Medians, Scale, medians
+from nnode.data.units import Scale, medians
 from nnode.errors import NNodeError
 
 #: Sequences in which faults are looked for.
@@ -45,41 +46,29 @@ MOST = 400
 _CUT = ("esimas", "openacc", "astazero")
 
 _LEVELS = ("error", "warning", "note")
-_SI = Scale("traffic", "m", "s", "m/s", None)
 
 
 @dataclass
-class Examination:
+class Examination(Scaled):
     """What a file holds.
+
+    Where the format fixes columns and units, ``meanings`` is empty and ``scales`` has one entry.
 
     Attributes:
         path: of the file.
         raw: as it was read.
-        meanings: column by meaning; empty where the format fixes them.
-        scales: combinations of units, the most probable first; one where the format fixes them.
-        known: medians in the file's own units.
-        rows: in order and in SI units, by the most probable units.
-        findings: errors first.
         source: what reads it, with its options.
+        findings: errors first.
         sequences: that the reader makes, at most :data:`MOST`.
         faults: in them, by name.
     """
 
     path: Path
     raw: Raw
-    meanings: dict[str, Meaning]
-    scales: list[Scale]
-    known: Medians
-    rows: Trajectories
-    findings: list[Finding]
     source: Recognised
+    findings: list[Finding] = field(default_factory=list)
     sequences: list[Sequence] = field(default_factory=list)
     faults: dict[str, list[Fault]] = field(default_factory=dict)
-
-    @property
-    def scale(self) -> Scale:
-        """The units that are taken."""
-        return self.scales[0]
 
 
 def examine(path: Path, domain: Domain | None = None, rate: float | None = None) -> Examination:
@@ -111,8 +100,8 @@ def _native(raw: Raw) -> Examination:
     sequences = _read(source)
     rows = _rows_of(raw, sequences)
     domain: Domain = "crowd" if rows.x.shape[1] == 2 else "traffic"
-    scale = replace(_SI, domain=domain)
-    examined = Examination(raw.path, raw, {}, [scale], medians(rows, domain), rows, [], source)
+    scale = Scale(domain, "m", "s", "m/s", None)
+    examined = Examination({}, [scale], medians(rows, domain), rows, rows, raw.path, raw, source)
     return _judged(examined, sequences, None)
 
 
@@ -122,65 +111,43 @@ def _rows_of(raw: Raw, sequences: list[Sequence]) -> Trajectories:
     An agent without an identifier is one of its own, and so is everyone in sequences whose
     positions begin anew.
     """
-    parts: list[tuple[np.ndarray, ...]] = []
+    parts: dict[str, list[np.ndarray]] = defaultdict(list)
     for s in sequences:
         n, k = s.n_agents, s.n_samples
         whose = s.name if raw.native in _CUT or not s.agents else s.recording
         names = [f"{whose} {name}" for name in s.agents or range(n)]
         v = np.full((k, n), np.nan) if s.v is None else np.linalg.norm(s.v, axis=2)
         length = np.full(n, np.nan) if s.length is None else s.length
-        parts.append(
-            (
-                np.tile(np.array(names, dtype=object), k),
-                np.repeat(s.time, n),
-                s.x.reshape(k * n, -1),
-                v.reshape(-1, 1),
-                np.tile(length, k),
-                np.full(k * n, s.recording, dtype=object),
-            )
-        )
-    agent, time, x, v, length, recording = (np.concatenate(p) for p in zip(*parts, strict=True))
-    return Trajectories(
-        path=raw.path,
-        name=raw.path.stem,
-        where=str,
-        agent=agent,
-        time=time,
-        x=x,
-        v=None if np.isnan(v).all() else v,
-        recording=recording,
-        lane=recording,
-        length=None if np.isnan(length).all() else length,
-    ).in_order()
+        parts["agent"].append(np.tile(np.array(names, dtype=object), k))
+        parts["time"].append(np.repeat(s.time, n))
+        parts["x"].append(s.x.reshape(k * n, -1))
+        parts["v"].append(v.reshape(-1, 1))
+        parts["length"].append(np.tile(length, k))
+        parts["recording"].append(np.full(k * n, s.recording, dtype=object))
+    columns: dict[str, Any] = {name: np.concatenate(part) for name, part in parts.items()}
+    columns |= {name: None for name in ("v", "length") if np.isnan(columns[name]).all()}
+    rows = Trajectories(path=raw.path, name=raw.path.stem, where=str, **columns)
+    return replace(rows, lane=rows.recording).in_order()
 
 
 def _table(
     raw: Raw, columns: dict[str, Meaning], domain: Domain | None, rate: float | None
 ) -> Examination:
-    table = raw.table
-    assert table is not None
     measured = scaled(raw, columns, domain, rate)
-    columns = measured.meanings
     rate = rate or raw.rate
-    source = source_of(raw, measured)
     examined = Examination(
-        raw.path, raw, columns, measured.scales, measured.known, measured.rows, [], source
+        **vars(measured), path=raw.path, raw=raw, source=source_of(raw, measured)
     )
-    needed: dict[str, str] = {
-        m: columns[m].column
-        for m in ("agent", clock_of(columns), "x", "y", "x_follower", "x_leader")
-        if m in columns
-    }
-    if is_spaced(columns):
-        needed |= {m: columns[m].column for m in ("spacing", "v_follower", "v_leader")}
-    examined.findings += cell_findings(table, needed)
-    stand = measured.table.at(np.arange(len(table)))
-    examined.findings += order_findings(stand, int(table.frame.duplicated().sum()))
-    doubts = [("units", text) for text in measured.doubts(rate).values()]
-    doubts += [("columns", text) for text in rivals(columns).values()]
-    examined.findings += [Finding(kind, "warning", text) for kind, text in doubts]
-    sequences = _tried(source, examined.findings)
-    return _judged(examined, sequences, rate)
+    columns, findings = examined.meanings, examined.findings
+    needed = ["agent", clock_of(columns), "x", "y", "x_follower", "x_leader"]
+    needed += ["spacing", "v_follower", "v_leader"] if is_spaced(columns) else []
+    findings += cell_findings(raw.cells, {m: columns[m].column for m in needed if m in columns})
+    followers = measured.table.at(np.arange(len(raw.frame)))
+    findings += order_findings(followers, int(raw.frame.duplicated().sum()))
+    doubts = {"units": measured.doubts(rate), "columns": rivals(columns)}
+    for kind, texts in doubts.items():
+        findings += [Finding(kind, "warning", text) for text in texts.values()]
+    return _judged(examined, _tried(examined.source, findings), rate)
 
 
 def _read(source: Recognised) -> Reading:
@@ -193,9 +160,8 @@ def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
     try:
         made = _read(source)
         texts = {"left_out": left_out_texts(len(made), [], made.left_out), "resampled": made.notes}
-        findings += [
-            Finding(kind, "warning", text) for kind, of_kind in texts.items() for text in of_kind
-        ]
+        for kind, of_kind in texts.items():
+            findings += [Finding(kind, "warning", text) for text in of_kind]
         return made
     except NNodeError as error:
         findings.append(Finding("reader", "error", f"data={source.group} refuses it: {error}"))
@@ -216,18 +182,10 @@ def _judged(examined: Examination, sequences: list[Sequence], rate: float | None
         if (faults := find_faults(s, domain, position_noise))
     }
     examined.findings += sequence_findings(examined.sequences, examined.faults, noise, domain)
-    examined.findings += _made(examined, len(sequences))
+    if sequences:
+        looked, number = len(examined.sequences), len(sequences)
+        part = f"; {looked} of them were examined for faults" if looked < number else ""
+        text = f"data={examined.source.group} yields {number} sequences{part}"
+        examined.findings.append(Finding("sequences", "note", text))
     examined.findings.sort(key=lambda finding: _LEVELS.index(finding.level))
     return examined
-
-
-def _made(examined: Examination, number: int) -> Iterator[Finding]:
-    if number:
-        looked = f"; {len(examined.sequences)} of them were examined for faults" * (
-            len(examined.sequences) < number
-        )
-        yield Finding(
-            "sequences",
-            "note",
-            f"data={examined.source.group} yields {number} sequences{looked}",
-        )

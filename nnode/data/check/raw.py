@@ -6,7 +6,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from nnode.data.readers.columns import LOOKED_AT, Table, layout
+import pandas as pd
+
+from nnode.data.readers.columns import Table, beginning, is_parquet, layout
 from nnode.data.readers.jupedsim import MAGIC
 from nnode.data.readers.openacc import HEAD
 from nnode.errors import ConfigError, DataError
@@ -47,6 +49,17 @@ class Raw:
     unit: str | None = None
     dated: tuple[str, ...] = ()
 
+    @property
+    def cells(self) -> Table:
+        """The table of a file that is one."""
+        assert self.table is not None
+        return self.table
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """Its cells."""
+        return self.cells.frame
+
 
 def read_raw(path: Path) -> Raw:
     """Look at a file.
@@ -59,16 +72,14 @@ def read_raw(path: Path) -> Raw:
         raise ConfigError(f"{path} is a folder; name one of its files")
     if not path.is_file():
         raise ConfigError(f"there is no file {path}; give the path of a table of trajectories")
-    try:
-        with path.open("rb") as file:
-            start = file.read(LOOKED_AT)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    start = beginning(path)
     if not start.strip():
         raise DataError(f"{path} is empty; expected rows of trajectories")
     native = next((name for magic, name in _MAGICS.items() if start.startswith(magic)), "")
-    if native == "parquet" or path.suffix.lower() in (".parquet", ".pq"):
-        return Raw(path, table=_parquet(path), separator="")
+    if is_parquet(path):
+        return Raw(path, table=Table(path), separator="")
+    if native == "parquet":
+        raise DataError(f"{path} is a Parquet table; give it a name that ends in .parquet")
     if native:
         return Raw(path, native)
     if b"\0" in start:
@@ -81,23 +92,18 @@ def read_raw(path: Path) -> Raw:
         return Raw(path, "sumo")
     if text.startswith(HEAD[0] + ","):
         return Raw(path, "openacc")
-    return _text(path, text, whole=len(start) < LOOKED_AT)
+    return _text(path, start)
 
 
-def _parquet(path: Path) -> Table:
-    if path.suffix.lower() in (".parquet", ".pq"):
-        return Table(path)
-    raise DataError(f"{path} is a Parquet table; give it a name that ends in .parquet")
-
-
-def _text(path: Path, text: str, whole: bool) -> Raw:
-    form = layout(text, whole)
+def _text(path: Path, start: bytes) -> Raw:
+    form = layout(start)
     if form is None:
         raise DataError(f"{path} has no rows below its comments; expected rows of trajectories")
-    if form.cells < 3:
+    number = len(form.cells)
+    if number < 3:
         raise DataError(
             f"{path} is no table of trajectories: its first line {form.first[:60]!r} has "
-            f"{form.cells} cell{'s' * (form.cells > 1)}; expected at least an agent, a time and "
+            f"{number} cell{'s' * (number > 1)}; expected at least an agent, a time and "
             "a position, separated by commas, semicolons, tabs or spaces"
         )
     rate, unit = _RATE.search(form.comments), _UNIT.search(form.comments)

@@ -19,6 +19,7 @@ from nnode.data.check.columns import (
     are_pairs,
     clock_of,
     in_seconds,
+    is_spaced,
     meanings,
     plain,
     rivals,
@@ -50,16 +51,16 @@ _RUNS = {"run", "position", "t", "v", "gap"}
 CALLED = {"vehicle": "agent", "run": "recording"}
 #: Options and readers of tables by the group.
 _TABLES: dict[str, tuple[type[DataOptions], Any]] = {
-    "vehicles": (VehicleTableOptions, vehicles),
-    "table": (TableOptions, table),
-    "pedpy": (WalkwayOptions, jupedsim),
     "pairs": (PairOptions, pairs),
+    "table": (TableOptions, table),
+    "vehicles": (VehicleTableOptions, vehicles),
+    "pedpy": (WalkwayOptions, jupedsim),
 }
 #: Formats of tables, by the group of their options, each with columns that it cannot do without.
-NEEDED: dict[str, tuple[type[DataOptions], set[str]]] = {
-    "pairs": (PairOptions, set(pairs.REQUIRED)),
-    "table": (TableOptions, set(table.REQUIRED)),
-    "vehicles": (VehicleTableOptions, set(vehicles.REQUIRED)),
+NEEDED = {
+    group: (kind, set(reader.REQUIRED))
+    for group, (kind, reader) in _TABLES.items()
+    if group != "pedpy"
 }
 #: Columns of pairs whose positions are integrated.
 SPACED = {"time", *pairs.INTEGRATED}
@@ -182,8 +183,7 @@ def has_columns(source: pd.DataFrame | str | Path, group: str, given: Mapping[st
 
 def _names(raw: Raw, given: Mapping[str, Any]) -> set[str]:
     """Columns under their own names, and the meanings of those that are given."""
-    assert raw.table is not None
-    return set(map(str, raw.table.frame.columns)) | set(given.get("columns") or {})
+    return set(map(str, raw.frame.columns)) | set(given.get("columns") or {})
 
 
 def _fits(group: str, names: set[str]) -> bool:
@@ -193,7 +193,7 @@ def _fits(group: str, names: set[str]) -> bool:
 def _exact(raw: Raw, given: Mapping[str, Any]) -> str | None:
     """The format whose columns a table has under their own names, or under those given."""
     names = _names(raw, given)
-    if names >= SPACED and not names & {"x", "x_follower", "x_leader"}:
+    if "time" in names and is_spaced(names):
         return "pairs"
     if "vehicle" in names and "sequence" not in names and "x_follower" not in names:
         return "vehicles" if names >= NEEDED["vehicles"][1] else None
@@ -223,18 +223,14 @@ def _with_given(
     raw: Raw, recognised_columns: dict[str, Meaning], given: Mapping[str, Any]
 ) -> dict[str, Meaning]:
     """Meanings as the user says, and the others as they were recognised."""
-    assert raw.table is not None
-    names = list(map(str, raw.table.frame.columns))
+    names = list(map(str, raw.frame.columns))
     columns: Mapping[str, str | None] = given.get("columns") or {}
     given_columns: dict[str, Meaning] = {}
+    left_out = set()
     for key, column in columns.items():
         meaning = CALLED.get(str(key), str(key))
         if column is None:
-            recognised_columns = {
-                m: column_meaning
-                for m, column_meaning in recognised_columns.items()
-                if m != meaning
-            }
+            left_out.add(meaning)
             continue
         if column not in names:
             raise ConfigError(
@@ -244,17 +240,13 @@ def _with_given(
         if meaning == "time" and given.get("time_unit") == "frame":
             meaning = "frame"
         given_columns[meaning] = Meaning(column, plain(column)[1], "given")
-    taken = {column_meaning.column for column_meaning in given_columns.values()}
-    if {"time", "frame"} & given_columns.keys():
-        recognised_columns = {
-            m: column_meaning
-            for m, column_meaning in recognised_columns.items()
-            if m not in ("time", "frame")
-        }
+    clocks = {"time", "frame"}
+    left_out |= clocks if clocks & given_columns.keys() else set()
+    taken = {meaning.column for meaning in given_columns.values()}
     return {
-        m: column_meaning
-        for m, column_meaning in recognised_columns.items()
-        if column_meaning.column not in taken
+        name: meaning
+        for name, meaning in recognised_columns.items()
+        if name not in left_out and meaning.column not in taken
     } | given_columns
 
 
@@ -285,8 +277,7 @@ def _line(raw: Raw, columns: Mapping[str, Meaning], measured: Scaled, group: str
 
 def native_source(raw: Raw, meanings: Mapping[str, Meaning]) -> str | None:
     """The source with a reader for exactly these columns."""
-    assert raw.table is not None
-    names = {str(name) for name in raw.table.frame.columns}
+    names = set(map(str, raw.frame.columns))
     if names >= _NGSIM:
         return "ngsim"
     if raw.path.name.endswith(TRACKS):
@@ -328,10 +319,10 @@ def source_of(raw: Raw, scaled_table: Scaled) -> Recognised:
     cut = "sequence" in columns
     if are_pairs(columns):
         return _recognised_table("pairs", raw, scaled_table)
-    if scale.domain == "crowd":
-        if cut and "frame" not in columns:
-            return _recognised_table("table", raw, scaled_table, domain=scale.domain)
+    if scale.domain == "crowd" and not (cut and "frame" not in columns):
         return _people(raw, scaled_table)
+    if scale.domain == "crowd":
+        return _recognised_table("table", raw, scaled_table, domain=scale.domain)
     start, end = rows.ends()
     back = bool(np.median(rows.x[end, 0] - rows.x[start, 0]) < 0)
     exact = all(name in columns and columns[name].column == name for name in table.REQUIRED)
@@ -353,12 +344,11 @@ def source_of(raw: Raw, scaled_table: Scaled) -> Recognised:
 
 def _recognised_table(group: str, raw: Raw, scaled_table: Scaled, **options: Any) -> Recognised:
     """A table's reader, its columns where they have other names than it gives them, and units."""
-    assert raw.table is not None
     kind, reader = _TABLES[group]
-    columns = {m: recognised.column for m, recognised in scaled_table.meanings.items()}
-    if scaled_table.scale.domain == "traffic":
+    columns, scale = scaled_table.columns, scaled_table.scale
+    if scale.domain == "traffic":
         columns.pop("y", None)
-    held = set(map(str, raw.table.frame.columns))
+    held = set(map(str, raw.frame.columns))
     named: dict[str, str | None] = {}
     for name in (*reader.REQUIRED, *reader.OPTIONAL):
         meaning = clock_of(columns) if name == "time" else CALLED.get(name, name)
@@ -366,16 +356,15 @@ def _recognised_table(group: str, raw: Raw, scaled_table: Scaled, **options: Any
         other = name in held and meaning in NAMES
         if columns.get(meaning) != name and (meaning in columns or other):
             named[name] = columns.get(meaning)
-    options |= {"columns": named, "position_unit": scaled_table.scale.position}
-    options |= {"time_unit": scaled_table.scale.time, "frame_rate": scaled_table.scale.rate}
+    options |= {"columns": named, "position_unit": scale.position}
+    options |= {"time_unit": scale.time, "frame_rate": scale.rate}
     if {"speed", "v_follower"} & set(columns) and hasattr(kind, "speed_unit"):
-        options["speed_unit"] = scaled_table.scale.speed
+        options["speed_unit"] = scale.speed
     return Recognised(group, kind(path=str(raw.path.absolute()), **options))  # type: ignore[call-arg]
 
 
 def _people(raw: Raw, scaled_table: Scaled) -> Recognised:
-    scale, rows = scaled_table.scale, scaled_table.rows
-    columns = {meaning: recognised.column for meaning, recognised in scaled_table.meanings.items()}
+    scale, rows, columns = scaled_table.scale, scaled_table.rows, scaled_table.columns
     dt = rows.dt
     if scale.rate is not None and raw.rate is not None:  # what the file states is taken
         dt *= scale.rate / raw.rate
@@ -386,8 +375,8 @@ def _people(raw: Raw, scaled_table: Scaled) -> Recognised:
         options["t_seq"] = float(f"{steps * dt:.9g}")
     if np.ptp(rows.x[:, 1]) > np.ptp(rows.x[:, 0]):
         options["walking_axis"] = "y"
-    order = [raw.table.frame.columns.get_loc(c) for c in columns.values()] if raw.table else []
-    ordered = list(columns) == ["agent", "frame", "x", "y"] and order == [0, 1, 2, 3]
+    ordered = list(columns) == ["agent", "frame", "x", "y"]
+    ordered &= list(columns.values()) == list(map(str, raw.frame.columns[:4]))
     every = scale.rate is not None and abs(dt * scale.rate - 1) < 1e-6  # frame by frame
     text = not raw.named and raw.separator == " " and ordered and scale.position in ("cm", "m")
     if text and every:

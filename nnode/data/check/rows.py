@@ -6,20 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pandas as pd
 
 from nnode.data.check.columns import Meaning, are_pairs, clock_of, is_spaced, numbers
 from nnode.data.check.raw import Raw
+from nnode.data.readers.columns import joined
 from nnode.data.sequence import Domain
-from nnode.data.trajectories import Trajectories, driven
+from nnode.data.trajectories import Trajectories, driven, grouped_rows
 from nnode.data.units import FAIR, LAG, LIKELY, Medians, Scale, medians, scales, share
 from nnode.errors import DataError
 
+_WHO = ("follower", "leader")
 #: Columns whose names tell a unit.
 _TELL = {"position": ("x", "x_follower", "spacing"), "speed": ("speed", "vx", "v_follower")}
 
 
-@dataclass(frozen=True)
+@dataclass
 class Scaled:
     """The rows of a table in the units that are most probable.
 
@@ -42,6 +43,11 @@ class Scaled:
     def scale(self) -> Scale:
         """The units that are taken."""
         return self.scales[0]
+
+    @property
+    def columns(self) -> dict[str, str]:
+        """Names of columns by meaning."""
+        return {meaning: column.column for meaning, column in self.meanings.items()}
 
     @property
     def share(self) -> float:
@@ -95,11 +101,11 @@ def scaled(
         DataError: a column that is needed was not recognised, or nothing moves.
     """
     meanings = _counted(raw, _of_pairs(raw, dict(meanings)))
-    table = _rows(raw, meanings)
+    table = _rows(_Columns(raw, meanings))
     clock = clock_of(meanings)
     rows = table.in_order()
     if len(rows) < 2 or not rows.steps.size:
-        number = len(_cells(raw))
+        number = len(raw.frame)
         raise DataError(
             f"{raw.path}: {number} row{'s' * (number != 1)}, in which no agent of column "
             f"{meanings.get('agent', meanings[clock]).column!r} has numbers at two times; "
@@ -131,20 +137,30 @@ def scaled(
     return Scaled(meanings, every, domain_medians[scale.domain], table, si)
 
 
-def _cells(raw: Raw) -> pd.DataFrame:
-    assert raw.table is not None
-    return raw.table.frame
+@dataclass(frozen=True)
+class _Columns:
+    """Cells of a table by the meaning of their column."""
+
+    raw: Raw
+    meanings: Mapping[str, Meaning]
+
+    def numbers(self, *meanings: str) -> list[np.ndarray]:
+        """Those columns of numbers that the table has."""
+        held = (self.meanings[m].column for m in meanings if m in self.meanings)
+        return [numbers(self.raw.frame, column) for column in held]
+
+    def names(self, *meanings: str, empty: bool = True) -> list[np.ndarray]:
+        """Those columns of names that the table has."""
+        held = (self.meanings[m].column for m in meanings if m in self.meanings)
+        return [self.raw.cells.names(column, empty=empty) for column in held]
 
 
 def _counted(raw: Raw, meanings: dict[str, Meaning]) -> dict[str, Meaning]:
     """Meanings without a time that is nothing but the number of the frame."""
-    assert raw.table is not None
-    if not {"time", "frame"} <= set(meanings):
-        return meanings
-    time, frame = (numbers(raw.table.frame, meanings[m].column) for m in ("time", "frame"))
-    if not np.array_equal(time, frame, equal_nan=True):
-        return meanings
-    return {m: meaning for m, meaning in meanings.items() if m != "time"}
+    clocks = _Columns(raw, meanings).numbers("time", "frame")
+    if len(clocks) == 2 and np.array_equal(clocks[0], clocks[1], equal_nan=True):
+        del meanings["time"]
+    return meanings
 
 
 def _domains(
@@ -160,56 +176,38 @@ def _domains(
     return ["traffic"] if "lane" in meanings else ["crowd", "traffic"]
 
 
-def _rows(raw: Raw, meanings_of_columns: Mapping[str, Meaning]) -> Trajectories:
+def _rows(columns: _Columns) -> Trajectories:
     """The rows as they stand; names of recordings and sequences are part of the agents' names."""
-    table, pairs = raw.table, are_pairs(meanings_of_columns)
-    assert table is not None
-    _check_needed(raw, meanings_of_columns, pairs)
-
-    def cells(*meanings: str) -> list[np.ndarray]:
-        return [
-            numbers(table.frame, meanings_of_columns[m].column)
-            for m in meanings
-            if m in meanings_of_columns
-        ]
-
-    def names(*meanings: str) -> list[np.ndarray]:
-        return [
-            table.names(meanings_of_columns[m].column, empty=True)
-            for m in meanings
-            if m in meanings_of_columns
-        ]
-
-    parts = names("recording", "sequence")
-    (time,) = cells(clock_of(meanings_of_columns))
+    raw, meanings = columns.raw, columns.meanings
+    table, pairs = raw.cells, are_pairs(meanings)
+    _check_needed(raw, meanings, pairs)
+    (time,) = columns.numbers(clock_of(meanings))
     if pairs:
-        pair = _pairs(raw, meanings_of_columns)
-        leads = ["follower", "leader"]
+        pair = _pairs(columns)
         x = (
-            _integrated(raw, meanings_of_columns)
-            if is_spaced(meanings_of_columns)
-            else cells("x_follower", "x_leader")
+            _integrated(columns, time, pair)
+            if is_spaced(meanings)
+            else columns.numbers("x_follower", "x_leader")
         )
-        v = cells("v_follower", "v_leader")
+        v = columns.numbers("v_follower", "v_leader")
         return Trajectories(
             path=raw.path,
             name=raw.path.stem,
             where=lambda i: table.row(i % len(table)),
-            agent=np.concatenate([pair + f" {who}" for who in leads]),
+            agent=np.concatenate([pair + f" {who}" for who in _WHO]),
             time=np.tile(time, 2),
             x=np.concatenate(x)[:, None],
             v=np.abs(np.concatenate(v))[:, None] if len(v) == 2 else None,
             lane=np.tile(pair, 2),
         )
-    (agent,) = names("agent")
-    agents = _joined([*parts, agent])
+    parts, (agent,) = columns.names("recording", "sequence"), columns.names("agent")
+    agents = joined([*parts, agent])
     agents[agent == ""] = None
     # along the lane where there are lanes
-    x = cells("x") if "lane" in meanings_of_columns else cells("x", "y")
-    v = cells("vx", "vy")[: len(x)]
-    speed = [np.sqrt(sum(part**2 for part in v))] if len(v) == len(x) else cells("speed")
-    part = _joined(parts) if parts else None
-    lane = names("lane") or ([part] if part is not None and len(x) == 1 else [])
+    x = columns.numbers("x") if "lane" in meanings else columns.numbers("x", "y")
+    v = columns.numbers("vx", "vy")[: len(x)]
+    speed = [np.sqrt(sum(part**2 for part in v))] if len(v) == len(x) else columns.numbers("speed")
+    part = joined(parts) if parts else None
     return Trajectories(
         path=raw.path,
         name=raw.path.stem,
@@ -219,8 +217,8 @@ def _rows(raw: Raw, meanings_of_columns: Mapping[str, Meaning]) -> Trajectories:
         x=np.stack(x, -1),
         v=np.abs(speed[0])[:, None] if speed else None,
         recording=part,
-        lane=lane[0] if lane else None,
-        length=next(iter(cells("length")), None),
+        lane=next(iter(columns.names("lane")), part if len(x) == 1 else None),
+        length=next(iter(columns.numbers("length")), None),
     )
 
 
@@ -230,7 +228,7 @@ def _check_needed(raw: Raw, meanings: Mapping[str, Meaning], pairs: bool) -> Non
     lacking += [] if pairs or "x" in meanings else ["a position x"]
     lacking += [] if pairs or "agent" in meanings else ["an agent"]
     if lacking:
-        listed = ", ".join(map(str, _cells(raw).columns[:20]))
+        listed = ", ".join(map(str, raw.frame.columns[:20]))
         taken = ", ".join(f"{m.column} as {meaning}" for meaning, m in meanings.items())
         raise DataError(
             f"{raw.path}: no column was recognised as {' nor as '.join(lacking)}; it has {listed} "
@@ -238,53 +236,35 @@ def _check_needed(raw: Raw, meanings: Mapping[str, Meaning], pairs: bool) -> Non
         )
 
 
-def _joined(columns: list[np.ndarray]) -> np.ndarray:
-    return np.array([" ".join(cells) for cells in zip(*columns, strict=True)], dtype=object)
-
-
-def _pairs(raw: Raw, meanings: Mapping[str, Meaning]) -> np.ndarray:
+def _pairs(columns: _Columns) -> np.ndarray:
     """``(rows,)`` names of the pairs that rows are of."""
-    assert raw.table is not None
-    who = ("pair",) if "pair" in meanings else ("follower", "leader")
-    whose = [m for m in ("recording", "sequence", *who) if m in meanings]
-    parts = [
-        raw.table.names(meanings[m].column, empty=m not in ("follower", "leader")) for m in whose
-    ]
-    if not set(who) & set(meanings):
-        parts.append(np.full(len(raw.table), "pair", dtype=object))
-    return _joined(parts)
+    who = columns.names("pair") or columns.names(*_WHO, empty=False)
+    who = who or [np.full(len(columns.raw.cells), "pair", dtype=object)]
+    return joined([*columns.names("recording", "sequence"), *who])
 
 
 def _of_pairs(raw: Raw, meanings: dict[str, Meaning]) -> dict[str, Meaning]:
     """Meanings with those that columns have only beside a leader's."""
-    assert raw.table is not None
     if {"spacing", "v_leader", "speed"} <= set(meanings) and "v_follower" not in meanings:
         changed = {"v_follower" if m == "speed" else m: meaning for m, meaning in meanings.items()}
         meanings = changed if is_spaced(changed) else meanings
     if are_pairs(meanings) and {"pair", "split"} <= set(meanings) and "recording" not in meanings:
-        columns = [raw.table.names(meanings[m].column, empty=True) for m in ("pair", "split")]
-        names = set(zip(*columns, strict=True))
+        names = set(zip(*_Columns(raw, meanings).names("pair", "split"), strict=True))
         if len({pair for pair, _ in names}) < len(names):  # counted anew on either side
             meanings = {**meanings, "recording": meanings["split"]}
     return meanings
 
 
-def _integrated(raw: Raw, meanings: Mapping[str, Meaning]) -> list[np.ndarray]:
+def _integrated(columns: _Columns, time: np.ndarray, pairs: np.ndarray) -> list[np.ndarray]:
     """Positions of followers and leaders in the unit of the spacing, by the reader's rule.
 
     The distance that a unit of speed covers in a unit of time follows from how spacings change
     with the speeds: the ratio of the root mean squares of both changes over LAG samples.
     """
-    assert raw.table is not None
-    columns = [
-        meanings[m].column for m in (clock_of(meanings), "spacing", "v_follower", "v_leader")
-    ]
-    time, spacing, follower, leader = (numbers(raw.table.frame, c) for c in columns)
+    spacing, follower, leader = columns.numbers("spacing", "v_follower", "v_leader")
     x, measured, expected = np.full(len(time), np.nan), [], []
-    names = _pairs(raw, meanings)
-    for pair in pd.Series(names).groupby(names).indices.values():
+    for pair in grouped_rows(pairs, time=time):
         rows = pair[np.isfinite(time[pair])]
-        rows = rows[np.argsort(time[rows], kind="stable")]
         x[rows] = driven(time[rows], leader[rows])
         relative = x[rows] - driven(time[rows], follower[rows])
         measured.append(spacing[rows][LAG:] - spacing[rows][:-LAG])

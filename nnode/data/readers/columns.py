@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,10 @@ _WHOLE = 2.0**63
 
 #: So many bytes and lines are looked at to tell how a text is laid out.
 LOOKED_AT, _LINES = 1 << 16, 20
-_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|nan|inf", re.IGNORECASE)
+#: Endings of Parquet tables.
+PARQUET = (".parquet", ".pq")
+#: A cell of a text that is a number.
+NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|nan|inf", re.IGNORECASE)
 
 
 @dataclass
@@ -53,67 +56,73 @@ class Layout:
 
     Attributes:
         first: its first row.
-        cells: in that row.
+        cells: of that row.
         separator: ``,``, ``;``, tab, or a space for any white space.
-        decimal: the sign between whole and broken part of numbers.
         names: of the columns, where the first row holds none: those of the last comment, else
             ``column 1``, ...; None: the first row holds them.
         named: whether the names are the file's own.
-        above: lines above the first row.
         comments: lines that begin with ``#``.
+        options: of :func:`pandas.read_csv`.
     """
 
     first: str
-    cells: int
+    cells: list[str]
     separator: str
-    decimal: str
     names: list[str] | None
     named: bool
-    above: int
     comments: str
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Options of :func:`pandas.read_csv`."""
-        how: dict[str, Any] = {"sep": r"\s+" if self.separator == " " else self.separator}
-        how["decimal"] = self.decimal
-        # the rows' own lines are counted from the comments above them on
-        return how | ({"comment": "#", "skiprows": self.above} if self.comments else {})
+    options: dict[str, Any]
 
 
-def layout(text: str, whole: bool = True) -> Layout | None:
+def is_parquet(path: Path) -> bool:
+    """Whether a file's name says that it is a Parquet table."""
+    return path.suffix.lower() in PARQUET
+
+
+def beginning(path: Path) -> bytes:
+    """The first bytes of a file.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(LOOKED_AT)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def layout(start: bytes) -> Layout | None:
     """How a text holds a table; None of one without rows.
 
     Args:
-        text: its beginning.
-        whole: whether it is all of it.
+        start: the :func:`beginning` of the text.
     """
-    lines = text.splitlines() if whole else text.splitlines()[:-1] or [text]
+    text = start.decode("utf-8-sig", errors="replace")
+    lines = text.splitlines()
+    if len(start) == LOOKED_AT:  # the last line may not be whole
+        lines = lines[:-1] or [text]
     comments = [line for line in lines if line.startswith("#")]
     rows = [line for line in lines if line.strip() and not line.startswith("#")][:_LINES]
     if not rows:
         return None
     separator = _separator(rows)
     cells = _cells(rows[0], separator)
-    named = not all(_NUMBER.fullmatch(cell) or not cell for cell in cells)
+    named = not all(NUMBER.fullmatch(cell) or not cell for cell in cells)
     later = [cell for row in rows[1:] for cell in _cells(row, separator)]
-    comma = separator != "," and any("," in cell and _NUMBER.fullmatch(cell) for cell in later)
+    comma = separator != "," and any("," in cell and NUMBER.fullmatch(cell) for cell in later)
     names = None if named else [f"column {i + 1}" for i in range(len(cells))]
     if not named and comments and separator != " ":
         said = _cells(comments[-1].lstrip("# "), separator)
-        if len(said) == len(cells) and not any(_NUMBER.fullmatch(cell) for cell in said):
+        if len(said) == len(cells) and not any(NUMBER.fullmatch(cell) for cell in said):
             names, named = said, True
-    above = next(i for i, line in enumerate(lines) if line.strip() and line[0] != "#")
-    return Layout(
-        rows[0],
-        len(cells),
-        separator,
-        "," if comma else ".",
-        names,
-        named,
-        above,
-        "\n".join(comments),
-    )
+    options: dict[str, Any] = {
+        "sep": r"\s+" if separator == " " else separator,
+        "decimal": "," if comma else ".",
+    }
+    if comments:  # the rows' own lines are counted from the comments above them on
+        options |= {"comment": "#", "skiprows": lines.index(rows[0])}
+    return Layout(rows[0], cells, separator, names, named, "\n".join(comments), options)
 
 
 def _separator(rows: list[str]) -> str:
@@ -160,21 +169,27 @@ class Table:
             self._read(source, names, csv)
 
     def _read(self, path: Path, names: list[str] | None, csv: dict[str, Any]) -> None:
-        parquet = path.suffix.lower() in (".parquet", ".pq")
+        parquet = is_parquet(path)
         self.by_line = not parquet
         if not path.is_file():
             raise DataError(f"there is no table {path}; set data.path, or data.source, to it")
         if not parquet and names is None and not {"sep", "skiprows"} & csv.keys():
-            names, csv = self._laid_out(path, csv)
+            form = layout(beginning(path))
+            if form is not None:
+                names, csv = form.names, form.options | csv
         self._first = (2 if names is None else 1) + int(csv.get("skiprows", 0))
         try:
             if parquet:
                 frame = pd.read_parquet(path).reset_index(drop=True)
             else:
+                named = {} if names is None else {"names": names}
                 # Blank lines are kept at first, so that row numbers are those of the file.
-                how: dict[str, Any] = {"low_memory": False, "skip_blank_lines": False, **csv}
-                if names is not None:
-                    how["names"] = names
+                how: dict[str, Any] = {
+                    "low_memory": False,
+                    "skip_blank_lines": False,
+                    **csv,
+                    **named,
+                }
                 frame = pd.read_csv(path, **how)
         except pd.errors.EmptyDataError as error:
             raise DataError(f"{path} is empty; expected a line of column names and rows") from error
@@ -188,18 +203,6 @@ class Table:
                 "every column a name"
             )
         self._take(frame)
-
-    @staticmethod
-    def _laid_out(path: Path, csv: dict[str, Any]) -> tuple[list[str] | None, dict[str, Any]]:
-        """Names and options that read a text as it is laid out."""
-        try:
-            with path.open("rb") as file:
-                start = file.read(LOOKED_AT)
-        except OSError as error:
-            raise DataError(f"{path} cannot be read: {error.strerror}") from error
-        text = start.decode("utf-8-sig", errors="replace")
-        form = layout(text, whole=len(start) < LOOKED_AT)
-        return (None, csv) if form is None else (form.names, {**form.options, **csv})
 
     def _take(self, frame: pd.DataFrame) -> None:
         self.frame = frame
@@ -283,15 +286,13 @@ class Table:
         bad = ~np.isfinite(values)
         if empty:
             bad &= ~cells.isna().to_numpy()
-        if bad.any():
-            i = int(np.flatnonzero(bad)[0])
-            cell = cells.iloc[i]
-            shown = "nothing" if cells.isna().iloc[i] else quoted(cell)
-            more = f" (and {bad.sum() - 1} more rows)" if bad.sum() > 1 else ""
-            raise DataError(
-                f"{self.path}, {self.row(i)}: column {column!r} holds {shown}{more}; expected a "
-                "finite number"
-            )
+        further = f" (and {bad.sum() - 1} more rows)" if bad.sum() > 1 else ""
+        self.refuse(
+            bad,
+            lambda i: (
+                f"column {column!r} holds {_shown(cells, i)}{further}; expected a finite number"
+            ),
+        )
         return values
 
     def positive(self, column: str) -> np.ndarray:
@@ -301,13 +302,13 @@ class Table:
             DataError: a cell with another value; names the row.
         """
         values = self.numbers(column, empty=True)
-        wrong = np.flatnonzero(values <= 0)
-        if wrong.size:
-            raise DataError(
-                f"{self.path}, {self.row(int(wrong[0]))}: column {column!r} holds "
-                f"{values[wrong[0]]:g}; expected a positive number, or an empty cell where it is "
-                "not known"
-            )
+        self.refuse(
+            values <= 0,
+            lambda i: (
+                f"column {column!r} holds {values[i]:g}; expected a positive number, or an "
+                "empty cell where it is not known"
+            ),
+        )
         return values
 
     def instants(self, column: str) -> np.ndarray | None:
@@ -330,15 +331,14 @@ class Table:
             raise DataError(
                 f"{self.path}: column {column!r} holds no dates of our time: {error}"
             ) from error
-        valid = instants.notna().to_numpy()
-        if not valid.all():
-            i = int(np.flatnonzero(~valid)[0])
-            shown = "nothing" if cells.isna().iloc[i] else repr(str(cells.iloc[i])[:40])
-            raise DataError(
-                f"{self.path}, {self.row(i)}: column {column!r} holds {shown}; expected seconds, "
-                "or dates (2020-01-31 08:00:00.2), clock times (08:00:00.2) or durations in all "
-                "rows"
-            )
+        self.refuse(
+            instants.isna().to_numpy(),
+            lambda i: (
+                f"column {column!r} holds {_shown(cells.astype('string').str[:40], i)}; "
+                "expected seconds, or dates (2020-01-31 08:00:00.2), clock times (08:00:00.2) or "
+                "durations in all rows"
+            ),
+        )
         return np.asarray(instants.astype("int64"))
 
     @staticmethod
@@ -398,11 +398,9 @@ class Table:
         """
         cells = self.frame[column]
         absent = cells.isna().to_numpy()
-        if absent.any() and not empty:
-            i = int(np.flatnonzero(absent)[0])
-            raise DataError(
-                f"{self.path}, {self.row(i)}: column {column!r} is empty; expected a name or number"
-            )
+        self.refuse(
+            absent & (not empty), lambda _: f"column {column!r} is empty; expected a name or number"
+        )
         whole = pd.api.types.is_float_dtype(cells) and (cells.dropna() % 1 == 0).all()
         if whole and (cells.dropna().abs() < EXACT).all():
             cells = cells.astype("Int64")
@@ -417,7 +415,7 @@ class Table:
             filled = map(int, np.flatnonzero(~absent))
             i = next((i for i in filled if not _is_text(cells, i)), 0)
             raise DataError(
-                f"{self.path}, {self.row(i)}: column {column!r} holds {_quoted(cells, i)}; "
+                f"{self.path}, {self.row(i)}: column {column!r} holds {_shown(cells, i)}; "
                 "expected a name or number"
             ) from None
         return np.asarray(text, dtype=object)
@@ -434,13 +432,26 @@ class Table:
             DataError: names the row.
         """
         first = np.unique(owner, return_index=True)[1][owner]
-        differs = (values != values[first]) & ~(pd.isna(values) & pd.isna(values[first]))
-        if differs.any():
-            i = int(np.flatnonzero(differs)[0])
-            raise DataError(
-                f"{self.path}, {self.row(i)}: column {column!r} holds {values[i]!s}, before it "
-                f"{values[first[i]]!s}; {rule}"
-            )
+        self.refuse(
+            (values != values[first]) & ~(pd.isna(values) & pd.isna(values[first])),
+            lambda i: (
+                f"column {column!r} holds {values[i]!s}, before it {values[first[i]]!s}; {rule}"
+            ),
+        )
+
+    def refuse(self, wrong: np.ndarray, text: Callable[[int], str]) -> None:
+        """Refuse the table for the first row in which something is wrong.
+
+        Args:
+            wrong: ``(rows,)`` whether it is.
+            text: of the message, by the number of the row.
+
+        Raises:
+            DataError: names the row.
+        """
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            raise DataError(f"{self.path}, {self.row(i)}: {text(i)}")
 
     def row(self, i: int) -> str:
         """Where the i-th row stands in the file, in words."""
@@ -487,9 +498,10 @@ def _is_text(cells: pd.Series, i: int) -> bool:
     return True
 
 
-def _quoted(cells: pd.Series, i: int) -> str:
+def _shown(cells: pd.Series, i: int) -> str:
+    """A cell for messages."""
     try:
-        return quoted(cells.iloc[i])
+        return "nothing" if cells.isna().iloc[i] else quoted(cells.iloc[i])
     except ValueError:
         return "bytes that are no text"
 
@@ -518,6 +530,11 @@ def _since_first(values: np.ndarray, unit: float) -> tuple[int, np.ndarray]:
     if unit == 1.0 or first * unit < EPOCH:
         return 0, values * unit
     return round(int(first) * (unit * 1e9)), (values - int(first)) * unit
+
+
+def joined(columns: list[np.ndarray]) -> np.ndarray:
+    """``(rows,)`` the names of some columns in one."""
+    return np.array([" ".join(cells) for cells in zip(*columns, strict=True)], dtype=object)
 
 
 def opened(source: Path | str | Table) -> Table:
@@ -561,7 +578,7 @@ def table_rows(
     def words(key: str) -> np.ndarray | None:
         return table.names(names[key], empty=True) if key in names else None
 
-    v = length = recording = None
+    v = length = None
     if "speed" in names:
         unit = one_of("speed_unit", getattr(options, "speed_unit", "m/s"), SPEED_UNITS)
         v = np.abs(table.numbers(names["speed"]))[:, None] * unit
@@ -569,8 +586,6 @@ def table_rows(
         own_unit = getattr(options, "length_unit", None) or options.position_unit
         length = table.positive(names["length"]) * one_of("length_unit", own_unit, LENGTH_UNITS)
     parts = [table.names(names[key]) for key in ("recording", "sequence") if key in names]
-    if parts:
-        recording = np.array([" ".join(cells) for cells in zip(*parts, strict=True)], dtype=object)
     return Trajectories(
         path=table.path,
         name=table.path.stem,
@@ -579,7 +594,7 @@ def table_rows(
         time=table.times(names["time"], seconds_per_unit(options))[1],
         x=np.stack([table.measured(names[axis]) for axis in axes], -1) * metres,
         v=v,
-        recording=recording,
+        recording=joined(parts) if parts else None,
         lane=table.names(names["lane"]) if "lane" in names else None,
         length=length,
         kind=words("kind"),

@@ -38,7 +38,7 @@ def highd_files(options: HighDOptions) -> dict[str, Path]:
         ConfigError: ``data.path`` names no tracks.
         DataError: a table that is not there.
     """
-    tracks = table_path(options, "path", options.path)
+    tracks = table_path(options)
     if not tracks.name.endswith(TRACKS):
         raise ConfigError(f"data.path={options.path}: expected a file NAME{TRACKS}")
     stem = tracks.name.removesuffix(TRACKS)
@@ -106,21 +106,15 @@ def _tracks(path: Path, tracks: Table, vehicle: np.ndarray) -> tuple[np.ndarray,
     table = Table(path)
     names = table.choose(("id", "drivingDirection"), ("class",))
     direction = table.numbers(names["drivingDirection"])
-    odd = ~np.isin(direction, (LEFT, RIGHT))
-    if odd.any():
-        i = int(np.flatnonzero(odd)[0])
-        raise DataError(
-            f"{path}, {table.row(i)}: drivingDirection is {direction[i]:g}, expected {LEFT} or "
-            f"{RIGHT}"
-        )
+    table.refuse(
+        ~np.isin(direction, (LEFT, RIGHT)),
+        lambda i: f"drivingDirection is {direction[i]:g}, expected {LEFT} or {RIGHT}",
+    )
     place = {name: i for i, name in enumerate(table.names(names["id"]))}
-    unknown = np.array([name not in place for name in vehicle])
-    if unknown.any():
-        i = int(np.flatnonzero(unknown)[0])
-        raise DataError(
-            f"{tracks.path}, {tracks.row(i)}: track {vehicle[i]} is not in {path.name}; take both "
-            "files of one recording"
-        )
+    tracks.refuse(
+        np.array([name not in place for name in vehicle]),
+        lambda i: f"track {vehicle[i]} is not in {path.name}; take both files of one recording",
+    )
     at = np.array([place[name] for name in vehicle])
     kind = table.names(names["class"], empty=True)[at] if "class" in names else None
     return direction[at], kind

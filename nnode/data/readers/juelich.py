@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nnode.data.cut import Member, Reading, by_presence, sequence_of, uneven_text
-from nnode.data.exits import Exit, destinations, exits_of, read_exits
+from nnode.data.cut import Reading, by_presence, sequence_of, uneven_text
+from nnode.data.exits import goals_of, read_exits
 from nnode.data.options import DataOptions, one_of, positive
 from nnode.data.readers.recordings import natural, raw_files
 from nnode.data.sequence import Sequence
-from nnode.data.trajectories import Grid, Record, Trajectories, records
+from nnode.data.trajectories import Grid, Record, Trajectories, grouped_rows, records
 from nnode.errors import ConfigError, DataError
 
 #: Units of the coordinates, with their size in m.
@@ -143,23 +143,29 @@ def cut_people(people: People, options: JuelichOptions, walls: np.ndarray | None
         every = records(of_recording, grid, fill=options.fill, smoothing=options.smooth)
         every = [_with_velocity(record, dt, options) for record in every]
         notes += uneven_text(every, dt)
-        goals = _goals(of_recording, read_exits(options.exits))
+        of_people = grouped_rows(of_recording.agent, time=of_recording.time)
+        exits = read_exits(options.exits)
+        goals_by_row = goals_of(exits, of_recording, of_people) if exits else ()
+        goals = {of_recording.agent[row]: goal for row, goal in goals_by_row}
         before = round(options.history / dt)
         for number, (present, first, last) in enumerate(
             by_presence(every, steps, max(options.min_agents, 1), axis, view)
         ):
             present.sort(key=lambda record: natural(record.agent))
-            of = [Member(record.agent, record.row, [record]) for record in present]
+            at = first if goals else last
+            x = {record.agent: record.x[at - record.first] for record in present}
+            # nearest points of exits, or the last positions of the sequence
+            goal = [goals[who].point(x[who]) if goals else x[who] for who in x]
             sequences.append(
                 sequence_of(
                     f"{recording}/{number:03d}",
                     of_recording,
-                    of,
+                    present,
                     first,
                     last,
                     grid,
                     recording=recording,
-                    destination=_destinations(goals, present, first, last),
+                    destination=np.stack(goal),
                     preferred=_before(every, present, first, before, dt),
                     walls=walls,
                 )
@@ -182,32 +188,6 @@ def _with_velocity(record: Record, dt: float, options: JuelichOptions) -> Record
     step = np.diff(x, axis=0) / dt
     ahead, behind = np.concatenate([step, step[-1:]]), np.concatenate([step[:1], step])
     return replace(record, v=behind if scheme is Velocity.backward else (ahead + behind) / 2)
-
-
-_Goals = dict[str, Exit]
-
-
-def _goals(rows: Trajectories, exits: list[Exit]) -> _Goals:
-    """Everybody's exit by where he is first and last seen in the file, or nothing."""
-    if not exits:
-        return {}
-    order = np.argsort(rows.time, kind="stable")
-    agent = rows.agent[order].astype(str)
-    names, first = np.unique(agent, return_index=True)
-    last = len(agent) - 1 - np.unique(agent[::-1], return_index=True)[1]
-    try:
-        goals = exits_of(exits, rows.x[order[first]], rows.x[order[last]], names.tolist())
-    except DataError as error:
-        raise DataError(f"{rows.path}: {error}") from error
-    return dict(zip(names.tolist(), goals, strict=True))
-
-
-def _destinations(goals: _Goals, present: list[Record], first: int, last: int) -> np.ndarray:
-    """``(N, 2)`` m: nearest points of exits, or the last positions of the sequence."""
-    if not goals:
-        return np.stack([record.x[last - record.first] for record in present])
-    x = np.stack([record.x[first - record.first] for record in present])
-    return destinations([goals[record.agent] for record in present], x)
 
 
 def _interval(option: str, value: list[float] | None) -> tuple[float, float] | None:
@@ -347,15 +327,11 @@ def _walls(
     """Both walls, as long as the view or else the data, the corridor on the left of each."""
     patterns = [name for name in walls if name == recording]
     patterns += [name for name in walls if fnmatch(recording, name)]
-    if not patterns:
+    sides = _interval(f"walls.{patterns[0]}", walls[patterns[0]]) if patterns else None
+    if sides is None:
         return None
-    sides = _interval(f"walls.{patterns[0]}", walls[patterns[0]])
-    assert sides is not None
+    low, high = sides
     start, end = view or (np.nanmin(x[:, axis]), np.nanmax(x[:, axis]))
+    segments = np.array([[start, low, end, low], [end, high, start, high]])
     # Walking along y instead of x mirrors the plane, and with it left and right.
-    low, high = ((start, end), (end, start)) if axis == 0 else ((end, start), (start, end))
-    segments = np.empty((2, 4))
-    for row, side, (begin, stop) in zip(segments, sides, (low, high), strict=True):
-        row[axis], row[2 + axis] = begin, stop
-        row[1 - axis] = row[3 - axis] = side
-    return segments
+    return segments if axis == 0 else segments[:, ::-1]

@@ -20,7 +20,15 @@ from omegaconf import MISSING
 from shapely.geometry.polygon import orient
 
 from nnode.data.cut import Reading
-from nnode.data.readers.columns import EXACT, ColumnOptions, Table, opened, table_rows
+from nnode.data.readers.columns import (
+    EXACT,
+    PARQUET,
+    ColumnOptions,
+    Table,
+    beginning,
+    opened,
+    table_rows,
+)
 from nnode.data.readers.juelich import JuelichOptions, People, cut_people, load_people, people_of
 from nnode.data.readers.recordings import table_path
 from nnode.data.sequence import check_interval
@@ -32,11 +40,12 @@ MAGIC = b"SQLite format 3\x00"
 #: Keys of the files.
 PEOPLE, GEOMETRY = "trajectories", "geometry"
 
+#: Endings of files that are tables.
+TABLES = (".csv", *PARQUET)
+
 #: Rows that are converted together.
 _AT_ONCE = 100_000
 
-#: Endings of files that are tables.
-TABLES = (".csv", ".parquet", ".pq")
 
 #: Columns of a table.
 REQUIRED, OPTIONAL = ("agent", "time", "x", "y"), ("recording", "sequence")
@@ -57,9 +66,9 @@ class WalkwayOptions(ColumnOptions, JuelichOptions):
 def walkway_files(options: WalkwayOptions, table: Table | None = None) -> dict[str, Path | Table]:
     """The trajectories, or their path, and the path of the walkable area where it has a file of
     its own."""
-    files = {PEOPLE: table or table_path(options, "path", options.path)}
+    files = {PEOPLE: table or table_path(options)}
     if options.geometry is not None:
-        files[GEOMETRY] = table_path(options, "geometry", options.geometry)
+        files[GEOMETRY] = table_path(options, "geometry")
     return files
 
 
@@ -85,7 +94,7 @@ def read_walkway(
         DataError: a file that is not of its format, or no sequence at all.
     """
     area = None
-    if isinstance(path, Path) and path.is_file() and _is_database(path):
+    if isinstance(path, Path) and path.is_file() and beginning(path).startswith(MAGIC):
         table, rate, area = _read_database(path)
         if options.frame_rate not in (None, rate) or options.unit not in (None, "m"):
             raise ConfigError(
@@ -99,7 +108,11 @@ def read_walkway(
         people = load_people(path, options)
     walls = None
     if geometry is not None:
-        walls = walls_of(_text(geometry), str(geometry))
+        try:
+            text = geometry.read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
+            raise DataError(f"{geometry} cannot be read as text with WKT: {error}") from error
+        walls = walls_of(text, str(geometry))
     elif area is not None and not options.walls:
         walls = walls_of(area, f"{path}, table geometry")
     return cut_people(people, options, walls)
@@ -160,18 +173,6 @@ def _polygons(shape: object, where: str) -> Iterator[shapely.Polygon]:
             f"{where}: expected a POLYGON, MULTIPOLYGON or a collection of them, found "
             f"{getattr(shape, 'geom_type', 'nothing')}"
         )
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read as text with WKT: {error}") from error
-
-
-def _is_database(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(MAGIC)) == MAGIC
 
 
 def _read_database(path: Path) -> tuple[pd.DataFrame, float, str | None]:

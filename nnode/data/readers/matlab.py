@@ -41,9 +41,6 @@ _CELL, _STRUCT, _NUMERIC = 1, 2, range(6, 16)
 class Other:
     """A value of a class that is not read: text, objects, sparse or complex matrices."""
 
-    def __init__(self, number: int) -> None:
-        self.number = number
-
 
 def read_matlab(path: Path) -> dict[str, Any]:
     """The variables of a file by name.
@@ -134,7 +131,7 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
     if group == _STRUCT:
         return title, _structs(data, at, order, prod(shape), depth)
     if group not in _NUMERIC or is_complex:
-        return title, Other(group)
+        return title, Other()
     kind, raw, at = _element(data, at, order)
     values = _numbers(kind, raw, order)
     if len(values) != prod(shape):

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from nnode.data.cut import LaneOptions, Reading, by_lane, check_cutting
-from nnode.data.readers.columns import EXACT, Table
+from nnode.data.readers.columns import EXACT, NUMBER, Table, beginning, is_parquet, layout
 from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.data.sequence import LENGTH_UNITS
 from nnode.data.trajectories import Trajectories
@@ -51,7 +51,8 @@ LAYOUTS = {
 #: Columns by their name in small letters: files differ in capitals.
 _KNOWN = {name.lower(): name for names in LAYOUTS.values() for name in names}
 _NEEDED = ("Vehicle_ID", "Frame_ID", "Global_Time", "Local_Y", "Lane_ID")
-_USED = ("v_Vel", "v_Length", "v_Class", "Direction", "Location")
+_NUMBERS = ("v_Vel", "v_Length", "v_Class", "Direction")
+_USED = (*_NEEDED, *_NUMBERS, "Location")
 
 #: Columns of the reconstructed table that some have in place of the public file, in SI units.
 RECONSTRUCTED = {
@@ -111,35 +112,23 @@ def read_ngsim(path: Path, options: NgsimOptions) -> Reading:
 def _table(path: Path) -> Table:
     """The file as a table, its columns named as in ``LAYOUTS`` whatever their capitals."""
     names: list[str] | None = None
-    how: dict[str, Any] = {}
-    cells: list[str] = []
-    if path.suffix.lower() not in (".parquet", ".pq") and path.is_file():
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            first = next((line for line in file if line.strip()), "")
-        separated = "," in first
-        cells = first.split(",") if separated else first.split()
-        how = {"sep": ","} if separated else {"sep": r"\s+"}
-        if cells and _is_number(cells[0]):
-            names = LAYOUTS.get(len(cells))
+    # the portal has written 6042842.1 as "6,042,842.1" at times
+    how: dict[str, Any] = {"thousands": ","}
+    form = layout(beginning(path)) if path.is_file() and not is_parquet(path) else None
+    if form is not None:
+        number, how["sep"] = len(form.cells), form.options["sep"]
+        if NUMBER.fullmatch(form.cells[0]):
+            names = LAYOUTS.get(number)
             if names is None:
                 raise DataError(
-                    f"{path} has {len(cells)} columns without names; NGSIM's files have "
+                    f"{path} has {number} columns without names; NGSIM's files have "
                     f"{', '.join(map(str, LAYOUTS))}: set data=vehicles for a table of your own"
                 )
-    if set(_NEEDED) <= {_KNOWN.get(cell.strip().lower(), "") for cell in names or cells}:
-        how["usecols"] = lambda name: _KNOWN.get(name.strip().lower()) in (*_NEEDED, *_USED)
-    # the portal has written 6042842.1 as "6,042,842.1" at times
-    table = Table(path, names, thousands=",", **how)
+        if set(_NEEDED) <= {_KNOWN.get(cell.lower(), "") for cell in names or form.cells}:
+            how["usecols"] = lambda name: _KNOWN.get(name.strip().lower()) in _USED
+    table = Table(path, names, **how)
     table.rename([_KNOWN.get(name.lower(), name) for name in table.frame.columns])
     return table
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _periods(table: Table) -> Trajectories:
@@ -153,24 +142,18 @@ def _periods(table: Table) -> Trajectories:
             "data.columns"
         )
     number = {name: table.numbers(name) for name in _NEEDED}
-    for name in ("v_Vel", "v_Length", "v_Class", "Direction"):
-        if name in held:
-            number[name] = table.numbers(name, empty=True)
-    if np.isnan(number.get("v_Vel", np.nan)).any():
-        number.pop("v_Vel", None)
-    place = (
-        table.names("Location")
-        if "Location" in held
-        else np.full(len(table), table.path.stem, dtype=object)
-    )
-    roads = _roads(table, place, number.pop("Direction", None))
+    number |= {name: table.numbers(name, empty=True) for name in _NUMBERS if name in held}
+    place = np.full(len(table), table.path.stem, dtype=object)
+    if "Location" in held:
+        place = table.names("Location")
+    roads = _roads(table, place, number.get("Direction"))
     start = number["Global_Time"] - 100 * number["Frame_ID"]  # ms at frame 0
-    odd = np.flatnonzero(~(np.abs(start) < EXACT))
-    if odd.size:
-        raise DataError(
-            f"{table.path}, {table.row(int(odd[0]))}: Global_Time and Frame_ID put frame 0 at "
-            f"{start[odd[0]]:g} ms since 1970; correct them"
-        )
+    table.refuse(
+        ~(np.abs(start) < EXACT),
+        lambda i: (
+            f"Global_Time and Frame_ID put frame 0 at {start[i]:g} ms since 1970; correct them"
+        ),
+    )
     periods: dict[str, np.ndarray] = {}
     for location in dict.fromkeys(place[roads]):
         at_location = roads[place[roads] == location]
@@ -222,31 +205,21 @@ def _vehicles(
         periods: rows by the period's name.
         start: ms, of frame 0 by the row.
     """
-    rows = np.concatenate(list(periods.values()))
-    origin = np.concatenate(
-        [np.full(len(values_of), start[values_of].min()) for values_of in periods.values()]
-    )
-    values_of = {name: values[rows] for name, values in number.items()}
-    speed, length, kind = (values_of.get(name) for name in ("v_Vel", "v_Length", "v_Class"))
+    recording = np.full(len(table), "", dtype=object)
+    origin = np.zeros(len(table))
+    for name, of_period in periods.items():
+        recording[of_period], origin[of_period] = name, start[of_period].min()
+    speed, length = number.get("v_Vel"), number.get("v_Length")
     return Trajectories(
         path=table.path,
         name=table.path.stem,
-        where=lambda i: table.row(int(rows[i])),
-        recording=np.repeat(
-            np.array(list(periods), dtype=object), [len(o) for o in periods.values()]
-        ),
-        agent=_text(values_of["Vehicle_ID"]),
-        time=(values_of["Global_Time"] - origin) * 1e-3,
-        x=values_of["Local_Y"][:, None] * FOOT,
-        lane=_text(values_of["Lane_ID"]),
-        v=None if speed is None else np.abs(speed)[:, None] * FOOT,
+        where=table.row,
+        recording=recording,
+        agent=table.names("Vehicle_ID"),
+        time=(number["Global_Time"] - origin) * 1e-3,
+        x=number["Local_Y"][:, None] * FOOT,
+        lane=table.names("Lane_ID"),
+        v=None if speed is None or np.isnan(speed).any() else np.abs(speed)[:, None] * FOOT,
         length=None if length is None else length * FOOT,
-        kind=None if kind is None else _text(kind),
-    )
-
-
-def _text(values: np.ndarray) -> np.ndarray:
-    """Whole numbers as they are written, empty where there is none."""
-    whole = [f"{value:.0f}" if np.isfinite(value) else "" for value in np.unique(values)]
-    words = np.array(whole, dtype=object)
-    return words[np.unique(values, return_inverse=True)[1]]
+        kind=table.names("v_Class", empty=True) if "v_Class" in number else None,
+    ).at(np.concatenate(list(periods.values())))

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nnode.data.cut import Member, Reading, sequence_of, whole_steps, windows
-from nnode.data.options import DataOptions, check_known, one_of, positive, wanted
-from nnode.data.readers.columns import Table
+from nnode.data.cut import Reading, sequence_of, whole_steps, windows
+from nnode.data.options import DataOptions, chosen, one_of, positive
+from nnode.data.readers.columns import Table, beginning, is_parquet
 from nnode.data.readers.recordings import raw_files, tables_below
 from nnode.data.sequence import Sequence
-from nnode.data.smooth import smooth
-from nnode.data.trajectories import Grid, Record, Trajectories, driven
+from nnode.data.smooth import smooth_columns
+from nnode.data.trajectories import Grid, Record, Trajectories, driven, grouped_rows
 from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -94,7 +94,7 @@ def openacc_files(options: OpenAccOptions) -> dict[str, Path]:
             :func:`nnode.data.readers.recordings.tables_below` and ``raw_files``.
     """
     if options.path is not None:
-        return tables_below(options, options.path, options.files)
+        return tables_below(options, options.files)
     return raw_files(
         options,
         default="openacc",
@@ -125,9 +125,8 @@ def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> Reading:
     """
     _check(options)
     runs = [run for key, path in files.items() for run in _runs(key, path, options)]
-    asked = wanted(options.recording)
-    if asked is not None and options.path is not None:
-        check_known(asked, [run.name for run in runs])
+    if options.path is not None:
+        asked = chosen(options.recording, [run.name for run in runs])
         runs = [run for run in runs if run.name in asked]
     sequences = Reading()
     for run in runs:
@@ -144,11 +143,9 @@ def read_openacc(files: Mapping[str, Path], options: OpenAccOptions) -> Reading:
 
 
 def _check(options: OpenAccOptions) -> None:
-    for name in ("dt", "window", "length", "max_error"):
+    for name in ("dt", "window", "length", "max_error", "fill", "min_duration"):
         if getattr(options, name) is not None:
             positive(name, getattr(options, name))
-    positive("fill", options.fill)
-    positive("min_duration", options.min_duration)
     for name in ("kind", "group"):
         if getattr(options, name) is not None:
             one_of(name, getattr(options, name), dict.fromkeys(KNOWN, 0.0))
@@ -157,20 +154,19 @@ def _check(options: OpenAccOptions) -> None:
 
 
 def _runs(key: str, path: Path, options: OpenAccOptions) -> Iterator[Trajectories]:
-    name = re.sub(r"\.[^./]*$", "", key).replace("/", "_")
-    first = ""
-    if path.suffix.lower() not in (".parquet", ".pq") and path.is_file():
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            first = file.readline()
-    if first.startswith(HEAD[0] + ","):
-        yield _published_run(name, path, options)
+    start = b"" if is_parquet(path) or not path.is_file() else beginning(path)
+    lines = [*start.decode("utf-8-sig", errors="replace").splitlines(), *[""] * len(HEAD)]
+    if lines[0].startswith(HEAD[0] + ","):
+        name = re.sub(r"\.[^./]*$", "", key).replace("/", "_")
+        yield _published_run(name, path, lines, options)
     else:
         yield from _flat_runs(path, options)
 
 
-def _published_run(name: str, path: Path, options: OpenAccOptions) -> Trajectories:
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        head = [file.readline().strip().rstrip(",").split(",") for _ in HEAD]
+def _published_run(
+    name: str, path: Path, lines: list[str], options: OpenAccOptions
+) -> Trajectories:
+    head = [line.strip().rstrip(",").split(",") for line in lines[: len(HEAD)]]
     for number, (cells, expected) in enumerate(zip(head, HEAD, strict=True), start=1):
         if cells[0] != expected:
             raise DataError(f"{path}, line {number}: expected {expected},…, found {cells[0]!r}")
@@ -218,20 +214,18 @@ def _flat_runs(path: Path, options: OpenAccOptions) -> Iterator[Trajectories]:
     time = table.numbers("t")
     v, gap = (table.numbers(name, empty=True) for name in ("v", "gap"))
     words = {n: table.names(n, empty=True) for n in ("make", "acc", "setting") if n in names}
-    for name in dict.fromkeys(run):
-        rows = np.flatnonzero(run == name)
-        rows = rows[np.argsort(position[rows], kind="stable")]
+    for rows in grouped_rows(run, time=position):
+        first = rows.min()
         make = [str(p + 1) for p in range(int(position[rows[-1]]))]
         for row in rows if "make" in words else ():
             make[position[row] - 1] = words["make"][row]
-        first = int(np.flatnonzero(run == name)[0])
         acc = "acc" not in words or words["acc"][first].lower() in ("true", "1")
         setting = words["setting"][first] if "setting" in words and acc else "none"
         # nobody follows a vehicle that is not the next in front of it
         alone = ~np.isin(position[rows] - 1, position[rows])
         yield _run(
             path,
-            str(name),
+            str(run[first]),
             place=position[rows] - 1,
             make=make,
             told={"acc": "ACC" if acc else "people", "setting": setting or "none"},
@@ -283,13 +277,13 @@ def _run(
 def _positions(table: Table) -> np.ndarray:
     """Places in the platoon, counted from 1."""
     positions = table.numbers("position")
-    odd = np.flatnonzero(~((positions >= 1) & (positions <= MOST_VEHICLES) & (positions % 1 == 0)))
-    if odd.size:
-        i = int(odd[0])
-        raise DataError(
-            f"{table.path}, {table.row(i)}: position is {positions[i]:g}; expected the place in "
-            f"the platoon, a whole number from 1 to {MOST_VEHICLES}"
-        )
+    table.refuse(
+        ~((positions >= 1) & (positions <= MOST_VEHICLES) & (positions % 1 == 0)),
+        lambda i: (
+            f"position is {positions[i]:g}; expected the place in the platoon, a whole "
+            f"number from 1 to {MOST_VEHICLES}"
+        ),
+    )
     return positions.astype(int)
 
 
@@ -325,7 +319,7 @@ def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
     linked = np.isfinite(v) & np.isfinite(gap)
     linked[:, 1:] &= np.isfinite(v[:, :-1])
     linked[:, 0] = False
-    first_row = pd.Series(np.arange(len(rows))).groupby(rows.agent, sort=False).first()
+    first_rows = [int(of_vehicle[0]) for of_vehicle in grouped_rows(rows.agent)]
     table = replace(rows, x=rows.x[:, :1])
     sequences: list[Sequence] = []
     for first, last in _linked_intervals(linked, grid.dt, options):
@@ -337,20 +331,20 @@ def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
             front, platoon = way[part, i], []
             for n in range(i, end):
                 front = front - (gap[part, n] + (options.length or 0.0) if n > i else 0.0)
-                x, speeds = front, v[part, n]
+                x, speeds = front[:, None], v[part, n, None]
                 if options.smooth is not None:
-                    x, speeds = smooth(grid.dt * np.arange(len(x)), x, options.smooth)
-                    speeds = np.maximum(speeds, 0.0)
-                record = Record(
-                    str(first_row.index[n]),
-                    int(first_row.iloc[n]),
-                    first,
-                    x[:, None],
-                    speeds[:, None],
-                    added[part, n],
-                    np.zeros(len(x), dtype=bool),
+                    x, speeds = smooth_columns(grid.dt * np.arange(len(x)), x, options.smooth)
+                platoon.append(
+                    Record(
+                        str(rows.agent[first_rows[n]]),
+                        first_rows[n],
+                        first,
+                        x,
+                        speeds,
+                        added[part, n],
+                        np.zeros(len(x), dtype=bool),
+                    )
                 )
-                platoon.append(Member(record.agent, record.row, [record]))
             name = f"{rows.name}/{len(sequences):03d}"
             sequences.append(sequence_of(name, table, platoon[::-1], first, last, grid))
     return sequences
@@ -467,54 +461,35 @@ def check_laps(run: Trajectories) -> None:
     rows = np.flatnonzero(run.agent == run.agent[located[0]])
     rows = rows[np.argsort(run.time[rows], kind="stable")]
     with np.errstate(over="ignore", invalid="ignore"):  # of coordinates that are none
-        laps = find_laps(driven(run.time[rows], run.v[rows, 0]), run.x[rows])
-    if not len(laps.driven):
+        by_speed, path = find_laps(driven(run.time[rows], run.v[rows, 0]), run.x[rows])
+    if not len(by_speed):
         return
     text = (
-        f"{run.name}: complete laps of {run.agent[located[0]]}: {len(laps.driven)}, "
-        f"{laps.driven.min():.1f} to {laps.driven.max():.1f} m by its speed, "
-        f"{laps.path.min():.1f} to {laps.path.max():.1f} m by its coordinates"
+        f"{run.name}: complete laps of {run.agent[located[0]]}: {len(by_speed)}, "
+        f"{by_speed.min():.1f} to {by_speed.max():.1f} m by its speed, "
+        f"{path.min():.1f} to {path.max():.1f} m by its coordinates"
     )
-    if max(laps.spread, abs(laps.excess)) > CLOSED:
+    # of a lap from the median, and of all laps from the coordinates
+    ratios = np.append(by_speed / np.median(by_speed), by_speed.sum() / path.sum())
+    if np.abs(ratios - 1).max() > CLOSED:
         log.warning("%s: they differ by more than %g %%", text, 100 * CLOSED)
     else:
         log.info("%s", text)
 
 
-@dataclass(frozen=True)
-class Laps:
-    """A vehicle's complete laps.
-
-    Attributes:
-        driven: m per lap, by integrated speed.
-        path: m per lap, along the measured coordinates.
-    """
-
-    driven: np.ndarray
-    path: np.ndarray
-
-    @property
-    def spread(self) -> float:
-        """Greatest deviation of a lap from their median, as a share of it; 0 without two laps."""
-        usual = np.median(self.driven) if len(self.driven) else 1.0
-        return float(np.abs(self.driven / usual - 1).max()) if len(self.driven) > 1 else 0.0
-
-    @property
-    def excess(self) -> float:
-        """By which share more is driven than the coordinates tell; 0 without a lap."""
-        return float(self.driven.sum() / self.path.sum() - 1) if len(self.driven) else 0.0
-
-
-def find_laps(driven: np.ndarray, place: np.ndarray) -> Laps:
-    """Laps between passes of the point where a vehicle is first known to be.
+def find_laps(driven: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Complete laps between passes of the point where a vehicle is first known to be.
 
     Args:
         driven: ``(K,)`` m, integrated speed.
         place: ``(K, 2)`` m, coordinates; NaN where they are unknown.
+
+    Returns:
+        ``(L,)`` m per lap by integrated speed, and along the measured coordinates.
     """
     located = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(driven))
     if not len(located):
-        return Laps(np.empty(0), np.empty(0))
+        return np.empty(0), np.empty(0)
     driven, place = driven[located], place[located]
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
     start = int(np.argmax(driven - driven[0] > BACK))  # not while it stands before it starts
@@ -534,7 +509,7 @@ def find_laps(driven: np.ndarray, place: np.ndarray) -> Laps:
     # within a step the pass is where the way there and the way on are closest to the point
     at = [_along(place, i, place[start]) for i in passes]
     samples = np.arange(len(driven))
-    return Laps(np.diff(np.interp(at, samples, driven)), np.diff(np.interp(at, samples, path)))
+    return np.diff(np.interp(at, samples, driven)), np.diff(np.interp(at, samples, path))
 
 
 def _along(place: np.ndarray, i: int, point: np.ndarray) -> float:

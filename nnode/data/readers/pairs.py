@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from omegaconf import MISSING
 
 from nnode.data.cut import (
-    Member,
     Reading,
     chosen_lanes,
+    kinds_of,
+    members,
     numbered_parts,
     spans,
     uneven_text,
@@ -31,11 +31,19 @@ from nnode.data.cut import (
     windows,
 )
 from nnode.data.limits import LIMITS, UNEVEN
-from nnode.data.options import DataOptions, check_known, one_of, positive, wanted
+from nnode.data.options import DataOptions, chosen, one_of, positive
 from nnode.data.readers.columns import ColumnOptions, Table, opened, seconds_per_unit
 from nnode.data.readers.recordings import natural, place_below, tables_below
 from nnode.data.sequence import LENGTH_UNITS, SPEED_UNITS
-from nnode.data.trajectories import Grid, Record, Trajectories, driven, records
+from nnode.data.trajectories import (
+    Grid,
+    Record,
+    Trajectories,
+    driven,
+    group_numbers,
+    grouped_rows,
+    records,
+)
 from nnode.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -43,12 +51,11 @@ log = logging.getLogger(__name__)
 REQUIRED = ("time", "x_follower", "x_leader")
 #: What positions follow from where there are none.
 INTEGRATED = frozenset({"spacing", "v_follower", "v_leader"})
-_LENGTHS = ("leader_length", "follower_length")
 _SPEEDS = ("v_follower", "v_leader")
 _WHO = ("follower", "leader")
 #: What belongs to a pair as a whole.
 _WORDS = ("pair", "run", "follower", "leader", "lane", "split", "leader_kind", "follower_kind")
-OPTIONAL = (*_LENGTHS, "spacing", *_SPEEDS, *_WORDS)
+OPTIONAL = ("leader_length", "follower_length", "spacing", *_SPEEDS, *_WORDS)
 
 #: Key of the table that lists the files.
 INDEX = "index"
@@ -110,10 +117,10 @@ def pair_files(options: PairOptions, table: Table | None = None) -> dict[str, Pa
     """
     if table is not None:
         return {table.path.stem: table}
-    place = place_below(options, options.path)
+    place = place_below(options)
     listed = place / options.index if options.index is not None and place.is_dir() else None
     if listed is None or not listed.is_file():
-        return {**tables_below(options, options.path, options.files)}
+        return {**tables_below(options, options.files)}
     index = Table(listed)
     names = index.names(index.choose(("path",))["path"])
     for i, name in enumerate(names):
@@ -165,9 +172,7 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
             "recording", "sequence", "lane"
         )
     ]
-    asked = wanted(options.recording)
-    if asked is not None:
-        check_known(asked, [run for run, *_ in pairs])
+    asked = chosen(options.recording, [run for run, *_ in pairs])
     lanes = chosen_lanes(options.lane, {lane for _, _, lane, _ in pairs}, "the pairs have")
     steps = [rows.dt for *_, rows in pairs if np.isfinite(rows.dt)]
     dt = options.dt or (float(np.median(steps)) if steps else 1.0)
@@ -175,7 +180,7 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
     taken: dict[str, Path] = {}
     every: list[Record] = []
     for run, number, lane, rows in sorted(pairs, key=lambda p: (natural(p[0]), natural(p[1]))):
-        if (asked is not None and run not in asked) or lane not in lanes:
+        if run not in asked or lane not in lanes:
             continue
         name = f"{run}/{number}"
         if name in taken:
@@ -269,72 +274,43 @@ def _rows(
     if all(name in names for name in _SPEEDS):
         speed = table.numbers if integrated else table.measured
         v = np.stack([speed(names[name]) for name in _SPEEDS], -1) * speeds
-    words = {n: table.names(names[n], empty=True) for n in _WORDS if n in names}
-    same = _everywhere(key, table.path, options, listed, set(words))
-    for name, value in same.items():
-        words.setdefault(name, np.full(len(table), value, dtype=object))
-    unknown = np.full(len(table), np.nan)
-    follower = table.positive(names[_LENGTHS[1]]) * metres if _LENGTHS[1] in names else unknown
-    leader, spacing = unknown.copy(), unknown
-    if _LENGTHS[0] in names:
-        leader = table.positive(names[_LENGTHS[0]]) * metres
+    words = _words(key, table, names, options, listed)
+
+    def lengths(name: str) -> np.ndarray:
+        if name in names:
+            return table.positive(names[name]) * metres
+        return np.full(len(table), np.nan)
+
+    leader, spacing = lengths("leader_length"), np.full(len(table), np.nan)
     if "spacing" in names:
         spacing = table.numbers(names["spacing"], empty=not integrated) * metres
-    pair = pd.DataFrame({n: words[n] for n in ("run", "pair")}).groupby(["run", "pair"], sort=False)
-    rule = (
-        "it belongs to the pair and must be the same in all its rows: name pairs that are to be "
-        "told apart (data.columns.pair)"
-    )
-    for name in (word for word in _WORDS if word in names):
-        table.check_constant(names[name], words[name], pair.ngroup().to_numpy(), rule)
-    for place in pair.indices.values():
-        rows = np.asarray(place)[np.argsort(time[place], kind="stable")]
+    for rows in grouped_rows(words["run"], words["pair"], time=time):
         length = float(leader[rows[0]])
         if integrated:
             assert v is not None
             length = float(options.length or np.nan) if np.isnan(length) else length
             front = driven(time[rows], v[rows, 1])
             x[rows] = np.stack([front - np.nan_to_num(length) - spacing[rows], front], -1)
-        elif _LENGTHS[0] not in names:
+        elif "leader_length" not in names:
             length = _leader(table, x[rows, 1] - x[rows, 0] - spacing[rows], rows)
         leader[rows] = length
-    return origin, _both(
-        table,
-        options,
-        words,
-        time=np.tile(time, 2),
-        x=x.T.reshape(-1, 1),
-        v=None if v is None else v.T.reshape(-1, 1),
-        length=np.concatenate([follower, leader]),
-    )
-
-
-def _both(
-    table: Table, options: PairOptions, words: dict[str, np.ndarray], **columns: Any
-) -> Trajectories:
-    """Rows of followers and leaders, with what belongs to a pair as a whole.
-
-    Args:
-        words: ``(R,)`` by their meaning.
-        columns: ``(2 R, ...)`` further ones.
-    """
-    kinds = {str(code): str(called) for code, called in dict(options.kinds).items()}
     none = np.full(len(table), "", dtype=object)
     codes = np.concatenate([words.get(f"{who}_kind", none) for who in _WHO])
-    agents = []
-    for who in _WHO:
-        # one without an identifier is in no other pair
-        identifiers = words.get(who, none)
-        agents.append(np.where(identifiers == "", words["pair"] + f" {who}", identifiers))
-    names = {"recording": "run", "sequence": "pair", "lane": "lane", "split": "split"}
-    columns |= {field: np.tile(words[n], 2) for field, n in names.items() if n in words}
-    return Trajectories(
+    identifiers = np.concatenate([words.get(who, none) for who in _WHO])
+    # one without an identifier is in no other pair
+    anonymous = np.concatenate([words["pair"] + f" {who}" for who in _WHO])
+    columns = {"recording": "run", "sequence": "pair", "lane": "lane", "split": "split"}
+    return origin, Trajectories(
         path=table.path,
         name=options.name,
         where=lambda i: table.row(i % len(table)),
-        agent=np.concatenate(agents),
-        kind=np.array([kinds.get(c, c) for c in codes], dtype=object) if any(codes) else None,
-        **columns,
+        agent=np.where(identifiers == "", anonymous, identifiers),
+        time=np.tile(time, 2),
+        x=x.T.reshape(-1, 1),
+        v=None if v is None else v.T.reshape(-1, 1),
+        length=np.concatenate([lengths("follower_length"), leader]),
+        kind=kinds_of(codes, options.kinds) if any(codes) else None,
+        **{field: np.tile(words[n], 2) for field, n in columns.items() if n in words},
     )
 
 
@@ -353,24 +329,34 @@ def _columns(table: Table, options: PairOptions) -> tuple[dict[str, str], bool]:
         ) from error
 
 
-def _everywhere(
-    key: str, path: Path, options: PairOptions, listed: dict[str, str], held: set[str]
-) -> dict[str, str]:
-    """What is the same in all rows of a file: set by hand, from the index, from its path."""
-    said = {"run": options.name, "pair": path.stem}
+def _words(
+    key: str, table: Table, names: dict[str, str], options: PairOptions, listed: dict[str, str]
+) -> dict[str, np.ndarray]:
+    """``(R,)`` what belongs to pairs as a whole: from columns, else the same in all rows of a
+    file, as set by hand, by the index, by its path."""
+    words = {n: table.names(names[n], empty=True) for n in _WORDS if n in names}
+    said = {"run": options.name, "pair": table.path.stem}
     said |= {str(name): str(value) for name, value in options.constant.items()}
     said |= listed
     if options.pattern is not None:
-        groups = re.compile(options.pattern).groupindex
+        lacking = sorted(set(re.compile(options.pattern).groupindex) - set(words))
         match = re.search(options.pattern, key)
-        if match is None and not set(groups) <= held:
-            raise DataError(
-                f"{path}: its path {key!r} does not fit data.pattern={options.pattern}, and the "
-                f"file has no columns {', '.join(sorted(set(groups) - held))}"
-            )
         if match is not None:
             said |= {name: value for name, value in match.groupdict().items() if value}
-    return said
+        elif lacking:
+            raise DataError(
+                f"{table.path}: its path {key!r} does not fit data.pattern={options.pattern}, and "
+                f"the file has no columns {', '.join(lacking)}"
+            )
+    words = {n: np.full(len(table), value, dtype=object) for n, value in said.items()} | words
+    pair = group_numbers(words["run"], words["pair"])
+    rule = (
+        "it belongs to the pair and must be the same in all its rows: name pairs that are to be "
+        "told apart (data.columns.pair)"
+    )
+    for name in (word for word in _WORDS if word in names):
+        table.check_constant(names[name], words[name], pair, rule)
+    return words
 
 
 def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:
@@ -383,11 +369,11 @@ def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:
         return float("nan")
     usual = float(np.nanmedian(length))
     off = np.abs(length - usual)
-    if np.nanmax(off) > LIMITS["traffic"].noise:
-        i = int(rows[np.nanargmax(off)])
+    i = np.nanargmax(off)
+    if off[i] > LIMITS["traffic"].noise:
         raise DataError(
-            f"{table.path}, {table.row(i)}: x_leader - x_follower - spacing is "
-            f"{length[np.nanargmax(off)]:.2f} m, {usual:.2f} m in other rows of the pair; expected "
+            f"{table.path}, {table.row(int(rows[i]))}: x_leader - x_follower - spacing is "
+            f"{length[i]:.2f} m, {usual:.2f} m in other rows of the pair; expected "
             "one length of the leader: leave out data.columns.spacing and give leader_length"
         )
     if usual <= 0:
@@ -425,9 +411,7 @@ def by_pair(rows: Trajectories, dt: float, options: PairOptions) -> tuple[Readin
         )
     grid = Grid(dt, 0.0 if options.dt is not None else float(rows.time.min()))
     pair_records = records(rows, grid, fill=options.fill, smoothing=options.smooth)
-    vehicles = [Member(str(rows.agent[i]), i) for i in (0, len(rows) // 2)]
-    for record in pair_records:
-        vehicles[record.row >= len(rows) // 2].records.append(record)
+    vehicles = sorted(members(rows, pair_records), key=lambda member: member.row)
     parts = spans(vehicles)
     if len(parts) > 1 and options.gaps is Gaps.error:
         end, start = (grid.origin + dt * k for k in (parts[0][1], parts[1][0]))

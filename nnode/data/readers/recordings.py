@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nnode.data import download
-from nnode.data.options import DataOptions, check_known, wanted
+from nnode.data.options import DataOptions, chosen
 from nnode.errors import ConfigError, DataError, NNodeError
 
 #: What Python and its libraries raise for contents that no reader expects.
@@ -83,11 +83,8 @@ def raw_files(
     source = options.source or os.environ.get(download.FOLDER_VARIABLE) or ""
     folder = None if "://" in source or not source else Path(source).expanduser()
     local = _matches(pattern, [] if folder is None else sorted(download.held(folder, dataset)))
-    asked = wanted(options.recording)
-    if asked is None:
-        asked = public if set(public) & set(local) or not local else local
-    else:
-        check_known(asked, [*public, *local])
+    every = public if set(public) & set(local) or not local else local
+    asked = chosen(options.recording, [*public, *local], every)
     files = download.locate(
         dataset,
         [file_name(name) for name in asked],
@@ -97,14 +94,14 @@ def raw_files(
     return dict(zip(asked, files.values(), strict=True))
 
 
-def table_path(options: DataOptions, option: str, path: str) -> Path:
-    """The path of a user's table: as given, or else below ``data.source``.
+def table_path(options: DataOptions, option: str = "path") -> Path:
+    """The path of a user's table: as an option gives it, or else below ``data.source``.
 
     Raises:
         ConfigError: the path is not set, or ``data.source`` is an address.
         DataError: there is no such file.
     """
-    place = place_below(options, path, option)
+    place = place_below(options, option)
     if not place.is_file():
         raise DataError(
             f"data.{option}: {place} is a folder, expected a file; set data.{option} to a table of "
@@ -113,13 +110,14 @@ def table_path(options: DataOptions, option: str, path: str) -> Path:
     return place
 
 
-def place_below(options: DataOptions, path: str, option: str = "path") -> Path:
+def place_below(options: DataOptions, option: str = "path") -> Path:
     """A file or a folder: as an option gives it, or else below ``data.source``.
 
     Raises:
         ConfigError: no path, or ``data.source`` is an address.
         DataError: there is no such thing.
     """
+    path = getattr(options, option)
     if not path or path == "???":
         raise ConfigError(f"data.{option} is not set; expected the path of a table")
     place = Path(path).expanduser()
@@ -138,18 +136,17 @@ def place_below(options: DataOptions, path: str, option: str = "path") -> Path:
     return place
 
 
-def tables_below(options: DataOptions, path: str, patterns: Iterable[str]) -> dict[str, Path]:
+def tables_below(options: DataOptions, patterns: Iterable[str]) -> dict[str, Path]:
     """A file, or the files of a folder, by their path below it; a single file by its name.
 
     Args:
-        options: ``name`` and ``source`` are read.
-        path: see :func:`place_below`.
+        options: ``name``, ``source`` and ``path`` are read.
         patterns: of the files of a folder, of which the first that fits any is taken.
 
     Raises:
         ConfigError, DataError: see :func:`place_below`; or a folder without such a file.
     """
-    place = place_below(options, path)
+    place = place_below(options)
     if place.is_file():
         return {place.name: place}
     for pattern in patterns:

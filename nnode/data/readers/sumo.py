@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import math
+import sys
 import zlib
 from array import array
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ class SumoOptions(LaneOptions):
 
 def sumo_files(options: SumoOptions) -> dict[str, Path]:
     """The file's path."""
-    path = table_path(options, "path", options.path)
+    path = table_path(options)
     return {_stem(path): path}
 
 
@@ -80,28 +81,14 @@ def _stem(path: Path) -> str:
     return name
 
 
-class _Names:
-    """Texts as numbers, each text kept once."""
-
-    def __init__(self) -> None:
-        self.codes: dict[str, int] = {}
-        self.column = array("q")
-
-    def add(self, text: str) -> None:
-        self.column.append(self.codes.setdefault(text, len(self.codes)))
-
-    def cells(self) -> np.ndarray:
-        return np.array(list(self.codes), dtype=object)[np.asarray(self.column)]
-
-
 class _Content:
     """What the elements of a file hold."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.vehicle, self.lane, self.kind = _Names(), _Names(), _Names()
-        self.time, self.x, self.speed, self.length = (array("d") for _ in range(4))
-        self.line = array("q")
+        # of interned names each text is kept once
+        self.names: dict[str, list[str]] = {"id": [], "lane": [], "type": []}
+        self.numbers = {key: array("d") for key in ("time", "pos", "speed", "length", "line")}
         self.now: float | None = None
         self.root: str | None = None
         self.parser = expat.ParserCreate()
@@ -129,7 +116,7 @@ class _Content:
             ) from error
         except (OSError, EOFError, zlib.error) as error:
             raise DataError(f"{self.path} cannot be read: {error}") from error
-        if not self.time:
+        if not self.names["id"]:
             raise DataError(
                 f"{self.path} holds no vehicle; expected <vehicle> within <timestep>, as "
                 "sumo --fcd-output writes them"
@@ -141,24 +128,23 @@ class _Content:
         Raises:
             DataError: nobody is left.
         """
-        lane = self.lane.cells()
-        keep = np.array([within or not name.startswith(INTERNAL) for name in lane])
+        names = {key: np.array(cells, dtype=object) for key, cells in self.names.items()}
+        keep = np.array([within or not name.startswith(INTERNAL) for name in names["lane"]])
         if not keep.any():
             raise DataError(
                 f"{self.path}: all vehicles are on lanes within junctions, which are left out; "
                 "name those to read in data.lane"
             )
-        line = np.asarray(self.line)[keep]
-        speed, length = np.asarray(self.speed)[keep], np.asarray(self.length)[keep]
-        kind = self.kind.cells()[keep]
+        agent, lane, kind = (cells[keep] for cells in names.values())
+        time, x, speed, length, line = (np.asarray(c)[keep] for c in self.numbers.values())
         return Trajectories(
             path=self.path,
             name=_stem(self.path),
-            where=lambda i: f"line {line[i]}",
-            agent=self.vehicle.cells()[keep],
-            time=np.asarray(self.time)[keep],
-            x=np.asarray(self.x)[keep, None],
-            lane=lane[keep],
+            where=lambda i: f"line {line[i]:.0f}",
+            agent=agent,
+            time=time,
+            x=x[:, None],
+            lane=lane,
             v=None if np.isnan(speed).any() else np.abs(speed)[:, None],
             length=None if np.isnan(length).all() else length,
             kind=kind if (kind != "").any() else None,
@@ -174,20 +160,19 @@ class _Content:
         elif name == "vehicle":
             if self.now is None:
                 raise self._error("a <vehicle> stands outside <timestep>")
-            for key, names in (("id", self.vehicle), ("lane", self.lane)):
-                if not attributes.get(key):
+            for key, names in self.names.items():
+                if not attributes.get(key) and key != "type":
                     raise self._error(
                         f"a <vehicle> has no attribute {key!r}; expected id, pos and lane: leave "
                         "--fcd-output.attributes out, or name them there"
                     )
-                names.add(attributes[key])
-            self.kind.add(attributes.get("type", ""))
-            self.time.append(self.now)
-            self.x.append(self._number(name, attributes, "pos"))
-            for key, column in (("speed", self.speed), ("length", self.length)):
-                given = key in attributes
-                column.append(self._number(name, attributes, key) if given else math.nan)
-            self.line.append(self.parser.CurrentLineNumber)
+                names.append(sys.intern(attributes.get(key, "")))
+            self.numbers["time"].append(self.now)
+            for key in ("pos", "speed", "length"):
+                given = key in attributes or key == "pos"
+                value = self._number(name, attributes, key) if given else math.nan
+                self.numbers[key].append(value)
+            self.numbers["line"].append(self.parser.CurrentLineNumber)
 
     def _end(self, name: str) -> None:
         if name == "timestep":

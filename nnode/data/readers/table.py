@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from omegaconf import MISSING
 
 from nnode.data.cut import Reading, by_sequence
-from nnode.data.exits import destinations, exits_of, read_exits
-from nnode.data.options import DataOptions, check_known, wanted
+from nnode.data.exits import goals_of, read_exits
+from nnode.data.options import DataOptions, chosen
 from nnode.data.readers.columns import ColumnOptions, Table, opened, table_rows
 from nnode.data.readers.recordings import natural, table_path
 from nnode.data.sequence import LENGTH_UNITS
-from nnode.data.trajectories import Trajectories
+from nnode.data.trajectories import Trajectories, group_numbers, grouped_rows
 from nnode.errors import ConfigError, DataError
 
 REQUIRED = ("sequence", "time", "agent", "x")
@@ -47,9 +46,9 @@ class TableOptions(ColumnOptions, DataOptions):
 
 def table_files(options: TableOptions, table: Table | None = None) -> dict[str, Path | Table]:
     """The table, or its path, and the path of the walls where there are such."""
-    files = {TABLE: table or table_path(options, "path", options.path)}
+    files = {TABLE: table or table_path(options)}
     if options.walls is not None:
-        files[WALLS] = table_path(options, "walls", options.walls)
+        files[WALLS] = table_path(options, "walls")
     return files
 
 
@@ -79,11 +78,9 @@ def read_table(source: Path | Table, options: TableOptions, walls: Path | None =
             to an agent.
     """
     rows = _rows(opened(source), options)
-    asked = wanted(options.recording)
-    if asked is not None:
-        assert rows.recording is not None
-        check_known(asked, rows.recording)
-        rows = rows.at(np.flatnonzero(np.isin(rows.recording, asked)))
+    assert rows.recording is not None
+    asked = chosen(options.recording, rows.recording)
+    rows = rows.at(np.flatnonzero(np.isin(rows.recording, asked)))
     segments = None if walls is None else _segments(walls)
     sequences = by_sequence(rows, options, natural)
     sequences[:] = [replace(s, walls=segments) for s in sequences]
@@ -119,8 +116,8 @@ def _rows(table: Table, options: TableOptions) -> Trajectories:
     belongings = {key: getattr(rows, key) for key in ("length", "kind", "group")}
     if destination is not None:
         belongings |= dict(zip(goals, destination.T, strict=True))
-    whose = pd.DataFrame({"r": rows.recording, "s": sequence, "a": rows.agent})
-    owner = whose.groupby(["r", "s", "a"], sort=False).ngroup().to_numpy()
+    whose = rows.recording, sequence, rows.agent
+    owner = group_numbers(*whose)
     rule = "it belongs to the agent and must be the same in all its rows of a sequence"
     for key, values in belongings.items():
         if values is not None:
@@ -130,23 +127,12 @@ def _rows(table: Table, options: TableOptions) -> Trajectories:
             raise ConfigError(
                 "data.exits are for crowds without the columns dest_x and dest_y; leave it out"
             )
-        rows = replace(rows, destination=_goals(rows, options))
+        destination, people = np.empty_like(rows.x), grouped_rows(*whose, time=rows.time)
+        exits = goals_of(read_exits(options.exits), rows, people)
+        for of_person, (start, exit_) in zip(people, exits, strict=True):
+            destination[of_person] = exit_.point(rows.x[start])
+        rows = replace(rows, destination=destination)
     return rows
-
-
-def _goals(rows: Trajectories, options: TableOptions) -> np.ndarray:
-    """``(R, 2)`` m, the destinations of people by their exits."""
-    exits, goal = read_exits(options.exits), np.full_like(rows.x, np.nan)
-    code = pd.DataFrame({"r": rows.recording, "s": rows.sequence, "a": rows.agent})
-    measured = np.isfinite(rows.x).all(axis=1)
-    for numbers in code.groupby(["r", "s", "a"], sort=False).indices.values():
-        of_person = np.asarray(numbers)[np.argsort(rows.time[numbers], kind="stable")]
-        located = of_person[measured[of_person]] if measured[of_person].any() else of_person
-        start, end = rows.x[located[:1]], rows.x[located[-1:]]
-        group = None if rows.group is None else [str(rows.group[of_person[0]])]
-        chosen = exits_of(exits, start, end, [str(rows.agent[of_person[0]])], group)
-        goal[of_person] = destinations(chosen, start)
-    return goal
 
 
 def _is_crowd(options: TableOptions) -> bool:
@@ -162,7 +148,5 @@ def _segments(path: Path) -> np.ndarray:
     table.choose(_WALL)
     walls = np.stack([table.numbers(name) for name in _WALL], axis=-1)
     point = (walls[:, :2] == walls[:, 2:]).all(axis=1)
-    if point.any():
-        row = table.row(int(np.flatnonzero(point)[0]))
-        raise DataError(f"{path}, {row}: a wall that begins where it ends has no sides")
+    table.refuse(point, lambda _: "a wall that begins where it ends has no sides")
     return walls

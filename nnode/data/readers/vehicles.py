@@ -35,7 +35,7 @@ def vehicle_files(options: LaneOptions, table: Table | None = None) -> dict[str,
     """The table, or its path."""
     if table is not None:
         return {table.path.stem: table}
-    path = table_path(options, "path", options.path)
+    path = table_path(options)
     return {path.stem: path}
 
 

@@ -98,11 +98,13 @@ def platoon_table(
     measured = measured + truth.noise * rng.standard_normal(measured.shape)
     samples = len(measured)
     clock = dt * np.arange(samples) + (duration + _PAUSE) * np.arange(platoons)[:, None]
+    # each car of the whole table has a number of its own
+    agent = 1 + np.arange(platoons * cars).reshape(platoons, cars)
     table = pd.DataFrame(
         {
             "sequence": np.repeat(np.arange(1, platoons + 1), samples * cars),
             "time": np.repeat(clock.round(6), cars),
-            "agent": _agents(platoons, samples, cars),
+            "agent": np.tile(agent, samples).ravel(),
             "x": measured.transpose(1, 0, 2).ravel().round(3),
         }
     )
@@ -110,12 +112,6 @@ def platoon_table(
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(table.to_csv(index=False, lineterminator="\n").encode("ascii"))
     return path
-
-
-def _agents(platoons: int, samples: int, cars: int) -> np.ndarray:
-    """One number per car of the whole table, ``(platoons * samples * cars,)``."""
-    number = 1 + np.arange(platoons * cars).reshape(platoons, 1, cars)
-    return np.broadcast_to(number, (platoons, samples, cars)).ravel()
 
 
 def _advanced(

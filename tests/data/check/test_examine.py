@@ -13,7 +13,6 @@ import pytest
 import nnode
 from nnode.data.check.examine import Examination, examine
 from nnode.data.check.recognise import recognised
-from nnode.data.prepare import FORMATS
 from nnode.data.readers.jupedsim import WalkwayOptions
 from nnode.data.readers.pairs import PairOptions
 from nnode.data.readers.vehicles import VehicleTableOptions
@@ -42,37 +41,32 @@ def test_a_sound_table_is_read_with_the_options_that_are_told(tmp_path: Path) ->
     assert (options.position_unit, options.time_unit, options.speed_unit) == ("m", "s", "m/s")
     assert (options.direction, options.dt) == (1, 0.2)
     assert certainty(found.scale.probability) == "sure"
-    kind = FORMATS[type(options)]
-    (platoon,) = kind.read(kind.files(options), options)
+    (platoon,) = found.sequences
     assert platoon.n_agents == 12
     assert platoon.agents[-1] == "0"  # the leader
     assert found.rows.dt == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("speeds", [True, False])
-def test_feet_for_metres(tmp_path: Path, speeds: bool) -> None:
-    table = cars()
-    table[["x", "length"]] /= 0.3048
-    found = examine(saved(table if speeds else table.drop(columns="v"), tmp_path))
-    assert vehicles(found).position_unit == "ft"
+@pytest.mark.parametrize(
+    ("scale", "units", "lacking"),
+    [
+        ({"x": 1 / 0.3048, "length": 1 / 0.3048}, ("ft", "s", "m/s"), []),
+        ({"x": 1 / 0.3048, "length": 1 / 0.3048}, ("ft", "s", "m/s"), ["v"]),
+        ({"v": 3.6}, ("m", "s", "km/h"), []),
+        ({"t": 1000}, ("m", "ms", "m/s"), []),
+    ],
+)
+def test_other_units(
+    tmp_path: Path, scale: dict[str, float], units: tuple[str, ...], lacking: list[str]
+) -> None:
+    table = cars().drop(columns=lacking)
+    for column, factor in scale.items():
+        table[column] = (factor * table[column]).round(9)
+    found = examine(saved(table, tmp_path))
+    options = vehicles(found)
+    assert (options.position_unit, options.time_unit, options.speed_unit) == units
     assert said(found) == {}
     assert np.ptp(found.rows.x) == pytest.approx(np.ptp(cars()["x"]), rel=1e-9)
-
-
-def test_speeds_in_kilometres_an_hour(tmp_path: Path) -> None:
-    table = cars()
-    table["v"] *= 3.6
-    found = examine(saved(table, tmp_path))
-    assert (vehicles(found).speed_unit, vehicles(found).position_unit) == ("km/h", "m")
-    assert said(found) == {}
-
-
-def test_milliseconds(tmp_path: Path) -> None:
-    table = cars()
-    table["t"] = (1000 * table["t"]).round().astype(int)
-    found = examine(saved(table, tmp_path))
-    assert (vehicles(found).time_unit, vehicles(found).position_unit) == ("ms", "m")
-    assert said(found) == {}
 
 
 def test_the_rate_of_frames_follows_from_speeds_in_the_file(tmp_path: Path) -> None:
@@ -223,27 +217,16 @@ def test_the_copied_eth_set_and_its_rate(tmp_path: Path) -> None:
     assert "15 frames/s fit" in text_
     # and the file that would be read says so
     assert found.source.group == "pedpy"
-    options = found.source.options
-    kind = FORMATS[type(options)]
-    sequences = kind.read(kind.files(options), options)
     speed = np.concatenate(
-        [np.linalg.norm(np.diff(s.x, axis=0), axis=-1).ravel() / s.dt for s in sequences]
+        [np.linalg.norm(np.diff(s.x, axis=0), axis=-1).ravel() / s.dt for s in found.sequences]
     )
     assert np.median(speed) == pytest.approx(1.47, rel=0.05)
 
 
-def test_pairs_and_tidy_tables_and_semicolons(tmp_path: Path) -> None:
-    table = cars(2)
-    lead, follow = (table[table["veh"] == i].reset_index() for i in (0, 1))
-    pairs = pd.DataFrame(
-        {
-            "t": lead["t"],
-            "xFollower": follow["x"],
-            "x_leader": lead["x"],
-            "v_follower": follow["v"],
-            "v_leader": lead["v"],
-        }
-    )
+def test_pairs_and_tidy_tables(tmp_path: Path) -> None:
+    lead, follow = pair()
+    pairs = pd.DataFrame({"t": lead["t"], "xFollower": follow["x"], "x_leader": lead["x"]})
+    pairs = pairs.assign(v_follower=follow["v"], v_leader=lead["v"])
     found = examine(saved(pairs, tmp_path, "pairs.csv"))
     assert found.source.group == "pairs"
     assert said(found) == {}
@@ -252,20 +235,17 @@ def test_pairs_and_tidy_tables_and_semicolons(tmp_path: Path) -> None:
     found = examine(saved(tidy[["sequence", "time", "agent", "x"]], tmp_path, "tidy.csv"))
     assert found.source.group == "table"
     assert len(found.sequences) == 1
-    path = tmp_path / "german.csv"
-    cars().to_csv(path, index=False, sep=";", decimal=",")
-    found = examine(path)
-    assert found.source.group == "vehicles"
-    options = found.source.options
-    kind = FORMATS[type(options)]
-    (platoon,) = kind.read(kind.files(options), options)
-    assert platoon.n_agents == 12
+
+
+def pair() -> tuple[pd.DataFrame, ...]:
+    """A leader and its follower."""
+    table = cars(2)
+    return tuple(table[table["veh"] == i].reset_index() for i in (0, 1))
 
 
 def spaced(units: dict[str, float]) -> pd.DataFrame:
     """Four pairs of spacings and speeds, numbered anew on either side of a division."""
-    table = cars(2)
-    lead, follow = (table[table["veh"] == i].reset_index() for i in (0, 1))
+    lead, follow = pair()
     own = pd.DataFrame(
         {
             "t": lead["t"],
@@ -343,14 +323,15 @@ def test_dates_and_epochs_are_recognised(tmp_path: Path, group: str, kind: str) 
     assert found.sequences
 
 
-def test_dates_are_read_from_any_text(tmp_path: Path) -> None:
+@pytest.mark.parametrize("dates", [True, False])
+def test_semicolons_and_commas(tmp_path: Path, dates: bool) -> None:
     path = tmp_path / "german.csv"
-    table = cars().assign(t=DATES["dates"](cars()["t"]))
+    table = cars()
+    table["t"] = DATES["dates"](table["t"]) if dates else table["t"]
     table.to_csv(path, index=False, sep=";", decimal=",")
     found = examine(path)
-    options = vehicles(found)
-    kind = FORMATS[type(options)]
-    (platoon,) = kind.read(kind.files(options), options)
+    assert found.source.group == "vehicles"
+    (platoon,) = found.sequences
     assert platoon.n_agents == 12
     assert platoon.time[0] == 0.0
 
@@ -483,15 +464,9 @@ def test_times_that_are_numbers_of_frames(tmp_path: Path) -> None:
 def test_people_sampled_coarsely_have_no_clock(tmp_path: Path) -> None:
     """At 2.5 positions a second what is left of the sway is the slow turns of the way."""
     k = np.arange(60)
+    y = 0.5 * np.sin(2 * np.pi * 0.06 * 0.4 * k)
     parts = [
-        pd.DataFrame(
-            {
-                "id": i,
-                "frame": k + 10 * i,
-                "x": 0.4 * 1.3 * k,
-                "y": i + 0.5 * np.sin(2 * np.pi * 0.06 * 0.4 * k),
-            }
-        )
+        pd.DataFrame({"id": i, "frame": k + 10 * i, "x": 0.4 * 1.3 * k, "y": i + y})
         for i in range(12)
     ]
     found = examine(saved(pd.concat(parts), tmp_path), domain="crowd", rate=2.5)
@@ -560,9 +535,6 @@ def test_the_window_that_noise_asks_for_reads_and_smooths(tmp_path: Path) -> Non
         for more in ({}, {"smooth": float(window[1])})
     )
     true = table[table.veh == 0].set_index("t").v  # the leader, last in its platoon
-    for s, most in ((raw, None), (smooth, 0.25)):
+    for s, low, high in ((raw, 1.0, np.inf), (smooth, 0.0, 0.25)):
         error = s.velocity()[5:-5, -1, 0] - true.loc[s.time[5:-5].round(6)].to_numpy()
-        if most is None:
-            assert np.std(error) > 1.0
-        else:
-            assert np.std(error) < most
+        assert low < np.std(error) < high

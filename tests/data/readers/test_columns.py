@@ -10,20 +10,21 @@ import pandas as pd
 import pytest
 
 import nnode
+from nnode.data.options import DataOptions
 from nnode.data.readers.columns import Table, floats
 from nnode.data.readers.ngsim import NgsimOptions, read_ngsim
 from nnode.data.readers.openacc import OpenAccOptions, read_openacc
+from nnode.data.readers.pairs import PairOptions
 from nnode.data.readers.recordings import reading
 from nnode.data.readers.sumo import SumoOptions, read_sumo
+from nnode.data.readers.table import TableOptions
 from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.errors import ConfigError, DataError
+from tests.data.tables import read, saved, tidy
 
 
 def lane() -> pd.DataFrame:
-    k, n = (m.ravel() for m in np.meshgrid(np.arange(20), np.arange(3), indexing="ij"))
-    agent = [f"c{i}" for i in n]
-    x = 25.0 * n + 3.0 * k
-    return pd.DataFrame({"sequence": "s", "time": 0.2 * k, "agent": agent, "x": x, "note": "-"})
+    return tidy(20, 3).assign(note="-", agent=lambda t: "c" + t.agent.astype(str))
 
 
 def cells(value: Any) -> pd.Series:
@@ -87,6 +88,25 @@ def test_what_nobody_thought_of_names_the_file() -> None:
         raise ConfigError("own")
 
 
+@pytest.mark.parametrize("length", [0.0, -4.5])
+@pytest.mark.parametrize(
+    ("kind", "column"),
+    [
+        (TableOptions, "length"),
+        (VehicleTableOptions, "length"),
+        (PairOptions, "leader_length"),
+        (PairOptions, "follower_length"),
+    ],
+)
+def test_lengths_are_positive(
+    tmp_path: Path, kind: type[DataOptions], column: str, length: float
+) -> None:
+    table = tidy(4, 2).assign(vehicle=0, x_follower=0.0, x_leader=30.0).assign(**{column: length})
+    path = saved(tmp_path / "t.csv", table)
+    with pytest.raises(DataError, match=f"line 2: column '{column}' holds .*expected a positive"):
+        read(kind, path, domain="traffic")
+
+
 def platoon(folder: Path, row: str) -> Path:
     rows = [f"r,{p},{0.1 * i:.1f},10,15" for p in (1, 2, 3) for i in range(12)]
     path = folder / "flat.csv"
@@ -116,17 +136,6 @@ def test_an_encoding_of_xml_that_is_not_read(tmp_path: Path, encoding: str) -> N
     )
     with pytest.raises(DataError):
         read_sumo(path, SumoOptions(path=str(path)))
-
-
-def test_a_time_that_steps_cannot_count(tmp_path: Path) -> None:
-    path = tmp_path / "a.xml"
-    moments = [
-        f'<timestep time="{t}"><vehicle id="a" lane="e_0" pos="{i}" speed="1"/></timestep>'
-        for i, t in enumerate(("0", "0.5", "1", "1.5", "4e38"))
-    ]
-    path.write_text(f"<fcd-export>{''.join(moments)}</fcd-export>")
-    with pytest.raises(DataError, match=r"line 1: the time is 4e\+38 s, which steps"):
-        read_sumo(path, SumoOptions(path=str(path), dt=0.5))
 
 
 def test_clocks_of_ngsim_out_of_range(tmp_path: Path) -> None:

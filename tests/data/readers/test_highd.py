@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,9 @@ import pytest
 
 from nnode.data.options import Faults
 from nnode.data.prepare import prepare
-from nnode.data.readers.highd import HighDOptions, highd_files, read_highd
-from nnode.data.sequence import Sequence
+from nnode.data.readers.highd import HighDOptions
 from nnode.errors import ConfigError, DataError
+from tests.data import tables
 
 #: id, lane, direction, length (m), corner at the start (m), class; 20 m/s.
 CARS = [
@@ -54,9 +55,7 @@ def recording(tmp_path: Path) -> Path:
     return tmp_path / "07_tracks.csv"
 
 
-def read(path: Path, **options: object) -> list[Sequence]:
-    chosen = HighDOptions(path=str(path), **options)  # type: ignore[arg-type]
-    return read_highd(highd_files(chosen), chosen)
+read = partial(tables.read, HighDOptions)
 
 
 def test_fronts_grow_in_both_directions(recording: Path) -> None:

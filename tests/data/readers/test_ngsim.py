@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,13 @@ import pytest
 
 from nnode.data.options import Agents
 from nnode.data.prepare import prepare
-from nnode.data.readers.ngsim import NgsimOptions, read_ngsim
+from nnode.data.readers.ngsim import NgsimOptions
 from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.errors import ConfigError, DataError
+from tests.data import tables
 from tests.data.readers.ngsim_file import COLUMNS, FOOT, STREET, period, published, quarter
 
-
-def read(path: Path, **options: object) -> list:
-    return read_ngsim(path, NgsimOptions(**{"window": 10.0, **options}))  # type: ignore[arg-type]
+read = partial(tables.read, NgsimOptions, window=10.0)
 
 
 def test_the_published_file(tmp_path: Path) -> None:

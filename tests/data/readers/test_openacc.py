@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,9 @@ import pytest
 from nnode.data import download
 from nnode.data.options import Agents
 from nnode.data.prepare import prepare
-from nnode.data.readers.openacc import OpenAccOptions, find_laps, openacc_files, read_openacc
-from nnode.data.sequence import Sequence
+from nnode.data.readers.openacc import OpenAccOptions, find_laps
 from nnode.errors import ConfigError, DataError
+from tests.data import tables
 
 MAKES = ("SMART", "TESLA", "BMW", "TESLA")
 #: m/s and m of the run below.
@@ -49,9 +50,7 @@ def save(path: Path, table: pd.DataFrame, acc: str = "1", setting: str = "S", n:
     return path
 
 
-def read(path: Path, **options: object) -> list[Sequence]:
-    own = OpenAccOptions(path=str(path), **options)  # type: ignore[arg-type]
-    return read_openacc(openacc_files(own), own)
+read = partial(tables.read, OpenAccOptions)
 
 
 def test_positions_are_the_leaders_path_and_the_gaps(tmp_path: Path) -> None:
@@ -128,14 +127,14 @@ def test_laps_of_a_circle(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> N
     t = np.arange(0, 200, 0.1)
     s = 12.0 * t
     circle = 100 * np.stack([np.cos(s / 100), np.sin(s / 100)], -1)
-    laps = find_laps(s, circle)
-    np.testing.assert_allclose(laps.driven, 2 * np.pi * 100, rtol=1e-4)
-    assert len(laps.driven) == 3
-    assert laps.spread < 1e-4
+    by_speed, path = find_laps(s, circle)
+    assert len(by_speed) == 3
+    np.testing.assert_allclose(by_speed, 2 * np.pi * 100, rtol=1e-4)
     # chords of 1.2 m are shorter than arcs by 6e-6
-    assert abs(laps.excess) < 1e-4
-    assert find_laps(1.02 * s, circle).excess == pytest.approx(0.02, abs=1e-4)
-    assert len(find_laps(s, np.full((len(s), 2), np.nan)).driven) == 0
+    np.testing.assert_allclose(path, by_speed, rtol=1e-4)
+    faster, path = find_laps(1.02 * s, circle)
+    assert faster.sum() / path.sum() == pytest.approx(1.02, abs=1e-4)
+    assert len(find_laps(s, np.full((len(s), 2), np.nan))[0]) == 0
     table = run(150.0)
     with caplog.at_level(logging.INFO):
         read(save(tmp_path / "a.csv", table))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from nnode.data.readers.pairs import Gaps, PairOptions, pair_files, read_pairs
 from nnode.data.sequence import Sequence
 from nnode.data.split import split
 from nnode.errors import ConfigError, DataError
+from tests.data import tables
+from tests.data.tables import saved
 
 FOOT = 0.3048
 CONF = Path(__file__).parents[3] / "conf" / "data"
@@ -43,19 +46,7 @@ def drive(first: int = 0, last: int = 50, unit: float = 1.0, **more: object) -> 
     )
 
 
-def save(path: Path, *parts: pd.DataFrame) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    table = pd.concat(parts)
-    if path.suffix == ".parquet":
-        table.to_parquet(path)
-    else:
-        table.to_csv(path, index=False)
-    return path
-
-
-def read(path: Path, **options: object) -> list[Sequence]:
-    own = PairOptions(path=str(path), **options)  # type: ignore[arg-type]
-    return read_pairs(pair_files(own), own)
+read = partial(tables.read, PairOptions)
 
 
 def configured(name: str, path: Path | str, source: Path | None = None) -> PairOptions:
@@ -73,7 +64,7 @@ def configured(name: str, path: Path | str, source: Path | None = None) -> PairO
 def test_a_pair_is_a_platoon_of_two(tmp_path: Path, suffix: str) -> None:
     more = {"follower": 7, "leader": 5, "run": "a", "leader_kind": "CAV", "split": "Test"}
     (s,) = read(
-        save(tmp_path / f"one{suffix}", drive(unit=FOOT, **more)),
+        saved(tmp_path / f"one{suffix}", drive(unit=FOOT, **more)),
         position_unit="ft",
         speed_unit="ft/s",
         kinds={"CAV": "automated"},
@@ -92,7 +83,7 @@ def test_a_pair_is_a_platoon_of_two(tmp_path: Path, suffix: str) -> None:
 def test_pairs_of_one_table_in_any_order_with_a_given_length(tmp_path: Path) -> None:
     parts = [drive(pair=p, leader_length=4.5).drop(columns="spacing") for p in (3, 1)]
     table = pd.concat(parts).sample(frac=1.0, random_state=1)
-    found = read(save(tmp_path / "all.csv", table), window=1.0)
+    found = read(saved(tmp_path / "all.csv", table), window=1.0)
     assert len(found) == 10
     assert {s.name for s in found} == {f"pairs/{p}_{k:03d}" for p in (1, 3) for k in range(5)}
     assert {s.n_samples for s in found} == {11}
@@ -102,7 +93,7 @@ def test_pairs_of_one_table_in_any_order_with_a_given_length(tmp_path: Path) -> 
 
 
 def test_gaps_split_a_pair_or_are_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "one.csv", drive(0, 20), drive(30, 50))
+    path = saved(tmp_path / "one.csv", drive(0, 20), drive(30, 50))
     first, second = read(path)
     assert (first.name, second.name) == ("pairs/one_000", "pairs/one_001")
     assert (first.time[-1], second.time[0]) == pytest.approx((2.0, 3.0))
@@ -114,7 +105,7 @@ def test_uneven_times_of_pairs_are_interpolated_and_told(tmp_path: Path) -> None
     table = drive(0, 50)
     table["time"] += np.random.default_rng(2).uniform(-0.02, 0.02, 51)
     table["x_follower"], table["x_leader"] = 10 * table.time, 24 + 11 * table.time
-    path = save(tmp_path / "one.csv", table.drop(columns="spacing"))
+    path = saved(tmp_path / "one.csv", table.drop(columns="spacing"))
     found = read(path, dt=0.1)
     assert isinstance(found, Reading)
     (s,) = found
@@ -125,7 +116,7 @@ def test_uneven_times_of_pairs_are_interpolated_and_told(tmp_path: Path) -> None
 
 def test_pairs_in_frames(tmp_path: Path) -> None:
     table = drive().assign(time=lambda t: (10 * t.time).round().astype(int))
-    path = save(tmp_path / "one.csv", table)
+    path = saved(tmp_path / "one.csv", table)
     (s,) = read(path, time_unit="frame", frame_rate=10.0)
     np.testing.assert_allclose(s.time, 0.1 * np.arange(51), atol=1e-12)
     with pytest.raises(ConfigError, match="frame_rate=None: expected a positive number"):
@@ -133,7 +124,7 @@ def test_pairs_in_frames(tmp_path: Path) -> None:
 
 
 def test_a_coarser_grid(tmp_path: Path) -> None:
-    path = save(tmp_path / "one.csv", drive(3, 50))
+    path = saved(tmp_path / "one.csv", drive(3, 50))
     with pytest.raises(ConfigError, match=r"dt=0\.05 s is finer than the 0\.1 s"):
         read(path, dt=0.05)
     (s,) = read(path, dt=0.4)
@@ -155,11 +146,11 @@ def test_rows_that_are_no_pair_are_refused(
 ) -> None:
     table = drive(pair="p", follower=1).assign(**change)
     with pytest.raises(DataError, match=said):
-        read(save(tmp_path / "one.csv", table))
+        read(saved(tmp_path / "one.csv", table))
 
 
 def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "one.csv", drive(lane=2))
+    path = saved(tmp_path / "one.csv", drive(lane=2))
     assert len(read(path, lane=2)) == 1
     for options, said in (
         ({"pattern": "(?P<colour>.*)"}, "group 'colour' is unknown"),
@@ -180,10 +171,10 @@ def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:
 def test_files_as_they_are_published(tmp_path: Path) -> None:
     table = drive(unit=FOOT, leader_length=4.0 / FOOT).rename(columns={"time": "t"})
     start = "ngsim_final_I80_trajectories-0400pm-0415pm_runfinal_I80_trajectories-0400pm-0415pm"
-    save(tmp_path / "train" / f"{start}_f13_l15_00035.csv", table)
-    save(tmp_path / "test" / f"{start}_f254_l253_00014.csv", table)
+    saved(tmp_path / "train" / f"{start}_f13_l15_00035.csv", table)
+    saved(tmp_path / "test" / f"{start}_f254_l253_00014.csv", table)
     # of an earlier extraction, which the list does not name
-    save(tmp_path / "train" / f"{start}_f254_l253_00002.csv", table)
+    saved(tmp_path / "train" / f"{start}_f254_l253_00002.csv", table)
     listed = {
         "path": [f"train/{start}_f13_l15_00035.csv", f"test/{start}_f254_l253_00014.csv"],
         "split": ["train", "test"],
@@ -192,7 +183,7 @@ def test_files_as_they_are_published(tmp_path: Path) -> None:
         "lane": [4.0, 2.0],
         "run": f"{start[6:]}",
     }
-    save(tmp_path / "manifest.csv", pd.DataFrame(listed))
+    saved(tmp_path / "manifest.csv", pd.DataFrame(listed))
     options = configured("ngsim_pairs", tmp_path)
     two, one = read_pairs(pair_files(options), options)
     assert {s.recording for s in (one, two)} == {"0400pm-0415pm"}
@@ -212,7 +203,7 @@ def test_files_as_they_are_published(tmp_path: Path) -> None:
         f"{q}_{who.lower()}": f"{q}{who}Real" for q in "xv" for who in ("Leader", "Follower")
     }
     own = drive(follower_id=16, leader_id=6, run_no=1).rename(columns=names)
-    save(tmp_path / "Data" / "CAV" / "run-1-veh-16-pair-7.csv", own)
+    saved(tmp_path / "Data" / "CAV" / "run-1-veh-16-pair-7.csv", own)
     options = configured("tgsim", tmp_path / "Data")
     (s,) = read_pairs(pair_files(options), options)
     assert (s.name, s.agents, s.kind) == ("1/run-1-veh-16-pair-7", ("16", "6"), ("HV", "CAV"))
@@ -229,7 +220,7 @@ def spaced(pair: object, spacing: float = 20.0, k: int = 51, **more: object) -> 
 
 def test_positions_follow_from_spacing_and_speeds(tmp_path: Path) -> None:
     table = spaced(1)
-    (s,) = read(save(tmp_path / "p.csv", table))
+    (s,) = read(saved(tmp_path / "p.csv", table))
     assert s.length is not None
     assert s.v is not None
     # the trapezium rule is exact for a speed that changes evenly
@@ -242,11 +233,11 @@ def test_positions_follow_from_spacing_and_speeds(tmp_path: Path) -> None:
     assert np.isnan(s.length[0])
 
     # the length of a leader changes where fronts are, and no gap
-    (longer,) = read(save(tmp_path / "q.csv", spaced(1, leader_length=12.0)))
+    (longer,) = read(saved(tmp_path / "q.csv", spaced(1, leader_length=12.0)))
     assert longer.length is not None
     assert longer.length[1] == 12.0
     np.testing.assert_allclose(longer.x[:, 0] - s.x[:, 0], -7.0)
-    (unknown,) = read(save(tmp_path / "p.csv", spaced(1)), length=None)
+    (unknown,) = read(saved(tmp_path / "p.csv", spaced(1)), length=None)
     assert unknown.length is None
     np.testing.assert_allclose(unknown.x[:, 1, 0] - unknown.x[:, 0, 0], table.spacing)
 
@@ -256,24 +247,24 @@ def test_speeds_and_spacings_have_their_units(tmp_path: Path) -> None:
     feet = table.assign(
         spacing=table.spacing / FOOT, v_leader=table.v_leader * 3.6, v_follower=36.0
     )
-    (s,) = read(save(tmp_path / "p.csv", feet), position_unit="ft", speed_unit="km/h")
-    (si,) = read(save(tmp_path / "q.csv", table))
+    (s,) = read(saved(tmp_path / "p.csv", feet), position_unit="ft", speed_unit="km/h")
+    (si,) = read(saved(tmp_path / "q.csv", table))
     np.testing.assert_allclose(s.x, si.x, atol=1e-9)
 
 
 def test_without_positions_the_spacing_needs_both_speeds(tmp_path: Path) -> None:
     for missing in ("spacing", "v_follower", "v_leader"):
-        path = save(tmp_path / "p.csv", spaced(1).drop(columns=missing))
+        path = saved(tmp_path / "p.csv", spaced(1).drop(columns=missing))
         with pytest.raises(DataError, match="spacing, v_follower and v_leader are needed"):
             read(path)
-    path = save(tmp_path / "p.csv", spaced(1).assign(spacing=[np.nan] + [20.0] * 50))
+    path = saved(tmp_path / "p.csv", spaced(1).assign(spacing=[np.nan] + [20.0] * 50))
     with pytest.raises(DataError, match="line 2: column 'spacing' holds nothing"):
         read(path)
 
 
 def test_anonymous_pairs_are_a_cluster_each(tmp_path: Path) -> None:
     parts = [spaced(i, 20.0 + i) for i in range(12)]
-    found = read(save(tmp_path / "p.csv", *parts), window=1.0)
+    found = read(saved(tmp_path / "p.csv", *parts), window=1.0)
     assert len(found) == 60
     label = clusters(index_of(found))
     assert label.max() + 1 == 12
@@ -284,14 +275,14 @@ def test_anonymous_pairs_are_a_cluster_each(tmp_path: Path) -> None:
 
 def test_pairs_that_name_one_vehicle_share_that_one(tmp_path: Path) -> None:
     parts = [spaced(i, follower=i // 2) for i in range(6)]
-    found = read(save(tmp_path / "p.csv", *parts))
+    found = read(saved(tmp_path / "p.csv", *parts))
     assert clusters(index_of(found)).tolist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     holed = spaced(3).drop(index=range(5, 51, 5))
     parts = [spaced(1), spaced(2, k=4), holed, spaced(4, spacing=0.2, leader_length=0.5)]
-    path = save(tmp_path / "p.csv", *parts)
+    path = saved(tmp_path / "p.csv", *parts)
     store = prepare(PairOptions(path=str(path), min_samples=10, fill=0.0), tmp_path / "store")
     left = {entry["name"]: entry["why"] for entry in store.manifest["left_out"]}
     assert left == {
@@ -311,17 +302,9 @@ def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptur
     ]
 
 
-@pytest.mark.parametrize("length", [0.0, -4.5])
-@pytest.mark.parametrize("column", ["leader_length", "follower_length"])
-def test_lengths_are_positive(tmp_path: Path, column: str, length: float) -> None:
-    path = save(tmp_path / "p.csv", drive(**{column: length}).drop(columns="spacing"))
-    with pytest.raises(DataError, match=f"line 2: column '{column}' holds .*expected a positive"):
-        read(path)
-
-
 def test_a_spacing_of_fronts_is_refused(tmp_path: Path) -> None:
     table = drive()
-    path = save(tmp_path / "p.csv", table.assign(spacing=table.x_leader - table.x_follower))
+    path = saved(tmp_path / "p.csv", table.assign(spacing=table.x_leader - table.x_follower))
     with pytest.raises(DataError, match=r"leader's length, is 0.00 m; .*data\.columns\.spacing"):
         read(path)
     (s,) = read(path, columns={"spacing": None})
@@ -340,7 +323,7 @@ def test_the_published_division_is_taken(tmp_path: Path) -> None:
         drive(pair=i, follower=2 * i, leader=2 * i + 1 if i else 4, split=side)
         for i, side in enumerate(sides)
     ]
-    store = prepare(PairOptions(path=str(save(tmp_path / "p.csv", *parts))), tmp_path / "store")
+    store = prepare(PairOptions(path=str(saved(tmp_path / "p.csv", *parts))), tmp_path / "store")
     for mode in (SplitMode.auto, SplitMode.published):
         found = split(store, SplitOptions(mode=mode))
         assert (found.train, found.heldout, found.dropped) == ([0, 1, 3], [2], [4])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ from hypothesis import strategies as st
 
 from nnode.data.options import Faults
 from nnode.data.prepare import prepare
-from nnode.data.readers.sumo import SumoOptions, read_sumo, sumo_files
-from nnode.data.sequence import Sequence
+from nnode.data.readers.sumo import SumoOptions, sumo_files
 from nnode.errors import ConfigError, DataError, NNodeError
+from tests.data import tables
 
 HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<!-- by SUMO -->\n<fcd-export>\n'
 
@@ -45,8 +46,7 @@ def write(path: Path, *parts: str, end: str = "</fcd-export>\n") -> Path:
     return path
 
 
-def read(path: Path, **options: object) -> list[Sequence]:
-    return read_sumo(path, SumoOptions(path=str(path), **options))  # type: ignore[arg-type]
+read = partial(tables.read, SumoOptions)
 
 
 def test_a_platoon(tmp_path: Path) -> None:

@@ -1,0 +1,61 @@
+"""Tables that tests make up, as files, what the readers make of them, and entries of an index."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from nnode.data.cut import Reading
+from nnode.data.options import DataOptions
+from nnode.data.prepare import FORMATS
+
+
+def entry(start: float, end: float, *agents: str, recording: str = "r") -> dict[str, Any]:
+    """What clusters and splits know of a sequence."""
+    return {
+        "name": f"{recording}/{start:g}",
+        "recording": recording,
+        "start": start,
+        "end": end,
+        "agents": list(agents),
+    }
+
+
+def tidy(
+    samples: int, agents: int, sequences: Iterable[str] = "s", step: float = 1.0
+) -> pd.DataFrame:
+    """Agents 30 m apart who move ``step`` m in each 0.1 s, by sequence, agent and time."""
+    parts = [
+        pd.DataFrame(
+            {
+                "sequence": sequence,
+                "time": 0.1 * np.arange(samples),
+                "agent": agent,
+                "x": 30.0 * agent + step * np.arange(samples),
+            }
+        )
+        for sequence in sequences
+        for agent in range(agents)
+    ]
+    return pd.concat(parts, ignore_index=True)
+
+
+def saved(path: Path, *tables: pd.DataFrame) -> Path:
+    """Tables one below the other, as Parquet where the file's name says so, else as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table = pd.concat(tables)
+    if path.suffix == ".parquet":
+        table.to_parquet(path)
+    else:
+        table.to_csv(path, index=False)
+    return path
+
+
+def read(kind: type[DataOptions], path: Path, /, **options: object) -> Reading:
+    """The sequences that the reader of some options makes of a file."""
+    made = kind(path=str(path), **options)  # type: ignore[call-arg, arg-type]
+    return FORMATS[kind].sequences(FORMATS[kind].files(made), made)
