@@ -85,13 +85,13 @@ class DiscoveryBenchmarkConfig:
 
 
 @dataclass
-class TortureConfig:
-    """``scripts/torture.py``: misuse on purpose."""
+class FaultInjectionConfig:
+    """``scripts/fault_injection.py``: misuse on purpose."""
 
     # what is tried: kills | disk | folder | fuzz
     campaigns: list[str] = field(default_factory=lambda: ["kills", "disk", "folder", "fuzz"])
     kills: int = 200  # over all jobs
-    jobs: list[str] | None = None  # scripts that are tortured; null: all that keep results
+    jobs: list[str] | None = None  # scripts that are tested; null: all that keep results
     repeats: int = 4  # second runs in a folder, per job
     inputs: int = 104000  # malformed files over all targets
     targets: list[str] | None = None  # what is given them; null: every reader and loader
@@ -101,7 +101,7 @@ class TortureConfig:
 SCHEMAS = {
     "benchmark_schema": BenchmarkConfig,
     "benchmark_discovery_schema": DiscoveryBenchmarkConfig,
-    "torture_schema": TortureConfig,
+    "fault_injection_schema": FaultInjectionConfig,
 }
 
 

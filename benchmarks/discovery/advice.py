@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from benchmarks.discovery.task import sources
-from benchmarks.truths.arms import first_seed
+from benchmarks.synthetic_cases.arms import first_seed
 from studies.runner import Task, run_tasks
 
 #: Samples' distance and Euler's steps, s; time before the first sample, s; vehicles, platoons.

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.discovery import level
-from benchmarks.truths.score import EQUALS
+from benchmarks.synthetic_cases.score import EQUALS
 
 #: Label, name of the measure, bound, whether at least. A near miss is asked for what one effect
 #: is; a list of equals is one of rivals that 5 % told apart, and holds the right one as often.

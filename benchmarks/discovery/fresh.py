@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from benchmarks.truths.measure import closure
+from benchmarks.synthetic_cases.measure import closure
 from nnode.app.python.report import Report
 from nnode.data.options import Faults
 from nnode.data.readers.table import TableOptions

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from benchmarks.discovery.task import ERROR
-from benchmarks.truths.score import LEVEL, UNKNOWN
+from benchmarks.synthetic_cases.score import LEVEL, UNKNOWN
 
 #: A gate keeps its level where the one-sided test against it is not rejected at this probability.
 REJECTED = 0.025

@@ -9,7 +9,7 @@ import pandas as pd
 from benchmarks.discovery import level, tables
 from benchmarks.discovery.criteria import criteria
 from benchmarks.discovery.figures import confusion_figure, map_figure, uniform_figure
-from benchmarks.truths import ARMS
+from benchmarks.synthetic_cases import ARMS
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 

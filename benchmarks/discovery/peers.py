@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from omegaconf import OmegaConf
 
-from benchmarks.truths.regression import PEERS, Library
+from benchmarks.synthetic_cases.regression import PEERS, Library
 from nnode.calibrate.parameters import ParameterVector
 from nnode.config import SCHEMAS
 from nnode.data.options import Faults
@@ -62,7 +62,7 @@ def peers_on_table(
     leader: str,
     seed: int,
 ) -> dict[str, dict[str, Any]]:
-    """The peers' reports by name, with what :func:`benchmarks.truths.score.score` reads of one.
+    """The peers' reports by name, with what :func:`benchmarks.synthetic_cases.score.score` reads.
 
     Effects with a number per agent are no columns and are not offered to the peers.
 

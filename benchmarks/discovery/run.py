@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from benchmarks.config import DiscoveryBenchmarkOptions
 from benchmarks.discovery.page import SUBTITLE, TITLE, blocks_of
 from benchmarks.discovery.task import diagnose_case, sources, task_of
-from benchmarks.truths import ARMS, Case
-from benchmarks.truths.arms import cases, first_seed, hides
+from benchmarks.synthetic_cases import ARMS, Case
+from benchmarks.synthetic_cases.arms import cases, first_seed, hides
 from nnode.errors import ConfigError
 from nnode.machine import cores
 from nnode.pages.page import write_page

@@ -16,8 +16,8 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.discovery.task import diagnose_case, sources
-from benchmarks.truths.arms import cases, first_seed
-from benchmarks.truths.score import UNKNOWN
+from benchmarks.synthetic_cases.arms import cases, first_seed
+from benchmarks.synthetic_cases.score import UNKNOWN
 from nnode.discover.rules import Rules
 from studies.runner import Task, run_tasks
 

@@ -8,7 +8,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from benchmarks.discovery.criteria import OTHER, headline
-from benchmarks.truths.score import UNKNOWN
+from benchmarks.synthetic_cases.score import UNKNOWN
 
 
 def frame_of(rows: list[dict[str, Any]]) -> pd.DataFrame:

@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import nnode
-from benchmarks.truths import TABLE, WALLS, Case, generate
-from benchmarks.truths.score import score
+from benchmarks.synthetic_cases import TABLE, WALLS, Case, generate
+from benchmarks.synthetic_cases.score import score
 from nnode.errors import NNodeError
 from studies.runner import Task
 
@@ -27,7 +27,7 @@ _SOURCES = (
     *(f"benchmarks/discovery/{n}.py" for n in ("fresh", "peers", "task")),
 )
 _FOLDERS = (
-    "benchmarks/truths",
+    "benchmarks/synthetic_cases",
     *(f"nnode/{name}" for name in ("discover", "models", "data", "calibrate", "solvers")),
 )
 
@@ -48,7 +48,7 @@ def diagnose_case(
     The truth stays outside the folder that the diagnosis is given.
 
     Args:
-        case: of :class:`benchmarks.truths.Case`, as plain JSON.
+        case: of :class:`benchmarks.synthetic_cases.Case`, as plain JSON.
         peers: scores of the peers as well, by name.
         seeds_of: hash of the commit that the seed comes from; is handed through.
         structure: as in the options of the diagnosis.

@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.discovery.task import sources
 from benchmarks.open_world import by_jupedsim, by_sumo, laws
 from benchmarks.open_world.page import write
-from benchmarks.truths.arms import first_seed
+from benchmarks.synthetic_cases.arms import first_seed
 from studies.runner import Task, run_tasks
 
 

@@ -25,7 +25,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.open_world.answers import NOTHING, Answer, diagnosed
-from benchmarks.truths.laws.case import accelerations
+from benchmarks.synthetic_cases.laws.case import accelerations
 
 #: Roads, vehicles on each with the leader, seconds before and of the recording, SUMO's step (s).
 ROADS, CARS, WARM, SECONDS, STEP = 40, 5, 20.0, 30.0, 0.1

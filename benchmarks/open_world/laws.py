@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks.open_world.answers import diagnosed
-from benchmarks.truths.laws.case import LawCase, measured
-from benchmarks.truths.laws.motion import FIRST_ORDER, RANGES
+from benchmarks.synthetic_cases.laws.case import LawCase, measured
+from benchmarks.synthetic_cases.laws.motion import FIRST_ORDER, RANGES
 
 #: Effects of a reaction to speeds ahead, and of speeds that do not change at once.
 _REACTION = ("relative_speed", "asymmetric_response")

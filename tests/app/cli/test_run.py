@@ -134,7 +134,7 @@ WRONG = [
     ("check none.csv", r"error: there is no file none.csv", 2),
     ("discover discover.alpha=2", "error: .*must lie between 0 and 1", 2),
     ("discover 'discover.effects=[inerta]'", r"did you mean inertia\?", 2),
-    ("torture 'campaigns=[kill]'", "expected some of kills, disk, folder, fuzz", 2),
+    ("fault_injection 'campaigns=[kill]'", "expected some of kills, disk, folder, fuzz", 2),
     ("benchmark_discovery 'benchmark_discovery.arms=[foo]'", "expected one of single, pair", 2),
     ("train data=table data.domain=traffic data.path=none.csv", "error: .*csv is not there", 1),
     ("train data=table data.domain=traffic data.path=$T/empty.csv", "is empty", 1),

@@ -14,7 +14,7 @@ from benchmarks.config import DiscoveryBenchmarkConfig, DiscoveryBenchmarkOption
 from benchmarks.discovery import criteria, level, tables
 from benchmarks.discovery import run as module
 from benchmarks.discovery.run import benchmark_discovery, cases_of
-from benchmarks.truths.arms import first_seed
+from benchmarks.synthetic_cases.arms import first_seed
 from nnode.app import discover
 from nnode.errors import ConfigError, DataError
 

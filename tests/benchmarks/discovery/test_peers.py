@@ -7,8 +7,8 @@ import pytest
 
 from benchmarks.discovery.peers import _effect
 from benchmarks.discovery.task import diagnose_case
-from benchmarks.truths import Case
-from benchmarks.truths.regression import PEERS
+from benchmarks.synthetic_cases import Case
+from benchmarks.synthetic_cases.regression import PEERS
 from nnode.discover.statistics.score import Trace
 from nnode.model.effects import CATALOGUE, Probe
 

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.open_world import by_jupedsim, by_sumo, laws
 from benchmarks.open_world.answers import Answer
 from benchmarks.open_world.page import by_law, criteria, scene_criteria, share, write
-from benchmarks.truths.laws.motion import RANGES
+from benchmarks.synthetic_cases.laws.motion import RANGES
 from nnode.app.nearest_law import LAWS
 from nnode.model.effects import CATALOGUE
 

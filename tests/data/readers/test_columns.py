@@ -130,7 +130,7 @@ def test_a_time_that_steps_cannot_count(tmp_path: Path) -> None:
 
 
 def test_clocks_of_ngsim_out_of_range(tmp_path: Path) -> None:
-    from benchmarks.torture.formats import ngsim
+    from benchmarks.fault_injection.formats import ngsim
 
     path = tmp_path / "a.csv"
     path.write_bytes(ngsim().replace(b",1113433135100,", b",1e308,", 1))

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.truths.laws.case import LawCase, measured
+from benchmarks.synthetic_cases.laws.case import LawCase, measured
 from nnode.app.nearest_law import LAWS, candidates
 from nnode.app.python.inputs import model_options, table_options
 from nnode.calibrate.parameters import ParameterVector

@@ -1,0 +1,158 @@
+"""Synthetic measured crowds in which an effect is hidden."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.synthetic_cases.case import STRENGTHS, Case, check_effects
+from benchmarks.synthetic_cases.crowd.catalogue import EFFECTS, Coefficients
+from benchmarks.synthetic_cases.crowd.motion import Base, Hidden, simulate
+from benchmarks.synthetic_cases.crowd.replay import Windows, cost_by_sequence
+from benchmarks.synthetic_cases.crowd.scene import BURN_IN, SUBSTEPS, Scene, set_scene
+from benchmarks.synthetic_cases.strength import Amplitude, Costs, Range, set_strength
+
+#: Standard deviation of people's accelerations, m/s².
+AMPLITUDES = Range(preferred=(0.02, 0.15), extreme=(0.005, 0.35), idle=(0.04, 0.15), probe=0.02)
+#: Standard deviation of eta where people differ and that is a nuisance.
+_NUISANCE = (0.15, 0.35)
+#: So many crowds show how large a misfit or a displacement is about; all show the share.
+_SOME = 8
+#: Steps between two samples when the truth is replayed.
+_FINE = 2
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What acts in a case.
+
+    Attributes:
+        effects: coefficients by effect; nuisances are part of it.
+        amplitude: standard deviation of people's accelerations, m/s².
+        bell: places act by a bell curve, not by an exponential.
+    """
+
+    effects: dict[str, Coefficients]
+    amplitude: float = 0.0
+    bell: bool = False
+
+    @property
+    def hidden(self) -> Hidden:
+        """As the equations of motion take it."""
+        fields: dict[str, float] = {"bell": float(self.bell)}
+        for name, values in self.effects.items():
+            fields |= EFFECTS[name].acting(values)
+        return Hidden(**fields)
+
+    @property
+    def eta(self) -> float:
+        """Standard deviation of how vigorously people steer."""
+        return self.effects.get("walker_heterogeneity", {}).get("sigma", 0.0)
+
+
+class CrowdCase:
+    """A case of crowds: draws what is hidden, sets its strength, and measures.
+
+    Args:
+        case: what is asked for.
+        truth: what acts, where it is known already; None draws it.
+
+    Attributes:
+        case: what was asked for.
+        truth: what acts.
+        scene: where it acts.
+        amplitude: how people's noise was chosen.
+
+    Raises:
+        ConfigError: an effect that crowds do not know.
+    """
+
+    def __init__(self, case: Case, truth: Truth | None = None) -> None:
+        check_effects(case, EFFECTS)
+        self.case = case
+        self.scene: Scene = set_scene(case)
+        self._some = list(range(min(_SOME, case.n_sequences)))
+        if truth is not None:
+            self.truth = truth
+            self.amplitude = Amplitude(STRENGTHS[case.strength], truth.amplitude)
+            return
+        rng = case.generator("effects")
+        effects = {name: EFFECTS[name].draw(rng, self.scene.width) for name in case.effects}
+        if case.variant == "heterogeneous":
+            effects["walker_heterogeneity"] = {"sigma": float(rng.uniform(*_NUISANCE))}
+        self.truth = Truth(effects, bell=case.variant == "smooth")
+        self.amplitude = set_strength(self, rng, AMPLITUDES)
+
+    def simulate(self, truth: Truth, scene: Scene | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """``(S, K + 1, N, 2)`` positions (m) and velocities (m/s), burnt in."""
+        scene = self.scene if scene is None else scene
+        sequences, people = scene.group.shape
+        burn = round(BURN_IN / self.case.dt)
+        kick = np.zeros((sequences, 1, people, 2))
+        if truth.amplitude:
+            kick = truth.amplitude * scene.kick
+        x, v = simulate(
+            scene.base,
+            truth.hidden,
+            scene.x,
+            scene.v,
+            scene.goal,
+            scene.group,
+            truth.eta * scene.eta,
+            scene.phase,
+            scene.points,
+            scene.segments,
+            kick,
+            scene.clocks - BURN_IN,
+            np.full(sequences, -BURN_IN),
+            scene.step,
+            (burn + self.case.n_steps) * SUBSTEPS,
+            SUBSTEPS,
+        )
+        return x[:, burn:], v[:, burn:]
+
+    def measured(self, x: np.ndarray) -> np.ndarray:
+        """Positions with the error of their measurement, m."""
+        return np.asarray(x + self.case.sigma * self.scene.error)
+
+    def rescale(self, factors: dict[str, float]) -> bool:
+        """Scale effects as far as their ranges go; whether anything changed."""
+        changed = dict(self.truth.effects)
+        for name, factor in factors.items():
+            changed[name] = EFFECTS[name].rescaled(changed[name], factor)
+        same = changed == self.truth.effects
+        self.truth = replace(self.truth, effects=changed)
+        return not same
+
+    def misfit(self, names: list[str]) -> float:
+        """Mean squared misfit (m²) of the recalibrated base law to some of the effects alone."""
+        kept = {k: v for k, v in self.truth.effects.items() if k in names}
+        some = self.scene.only(self._some)
+        x, v = self.simulate(replace(self.truth, effects=kept, amplitude=0.0), some)
+        windows = Windows(some, x, v, x, self.case.dt)
+        error = windows.errors(windows.recalibrated(some.base))
+        return float(cost_by_sequence(error).mean())
+
+    def spread(self, probe: float) -> float:
+        """Mean squared displacement (m²) by noise of 1 m/s², probed with a smaller one."""
+        truth, some = replace(self.truth, amplitude=probe), self.scene.only(self._some)
+        x, v = self.simulate(truth, some)
+        windows = Windows(some, x, v, x, self.case.dt)
+        return float(self._oracle(windows, truth).mean()) / probe**2
+
+    def costs(self, truth: Truth) -> Costs:
+        """Costs on measured data."""
+        x, v = self.simulate(truth)
+        measured = self.measured(x)
+        windows = Windows(self.scene, x, v, measured, self.case.dt)
+        base: Base = windows.recalibrated(self.scene.base)
+        floor = float(((measured - x) ** 2).sum(-1).mean())
+        parameters = {"A": base.A, "k": base.k, "kappa": base.kappa}
+        return Costs(
+            cost_by_sequence(windows.errors(base)), self._oracle(windows, truth), floor, parameters
+        )
+
+    def _oracle(self, windows: Windows, truth: Truth) -> np.ndarray:
+        error = windows.errors(self.scene.base, truth.hidden, eta=truth.eta, substeps=_FINE)
+        return cost_by_sequence(error)
