@@ -239,7 +239,7 @@ def jobs(raw: Path) -> list[Job]:
                     "sizes=[4]",
                     "variants=[white,autocorrelated,heterogeneous]",
                     "noises=[0.05]",
-                    "peer_seeds=0",
+                    "baseline_seeds=0",
                     "workers=1",
                 )
             ],

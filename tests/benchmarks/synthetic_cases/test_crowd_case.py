@@ -14,7 +14,7 @@ from benchmarks.synthetic_cases.crowd.case import CrowdCase
 from benchmarks.synthetic_cases.crowd.catalogue import CATALOGUE, EFFECTS
 from benchmarks.synthetic_cases.crowd.closure import crowd_costs
 from benchmarks.synthetic_cases.crowd.replay import Windows, cost_by_sequence
-from benchmarks.synthetic_cases.measure import closure
+from benchmarks.synthetic_cases.score import closure
 from nnode.data.quality import find_faults
 from nnode.data.readers.table import TableOptions, read_table
 

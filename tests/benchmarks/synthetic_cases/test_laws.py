@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_cases.laws.case import LawCase, measured
-from benchmarks.synthetic_cases.laws.motion import RANGES, STEP, followed, still
+from benchmarks.synthetic_cases.laws import RANGES, STEP, followed, measured, still
 from nnode.errors import ConfigError
 
 MIDDLE = {law: {k: (a + b) / 2 for k, (a, b) in every.items()} for law, every in RANGES.items()}
@@ -43,7 +42,7 @@ def test_who_follows_steadily_keeps_the_gap_of_his_law(law: str) -> None:
 
 @pytest.mark.parametrize("law", RANGES)
 def test_nobody_drives_backwards_or_into_anybody(law: str) -> None:
-    table, _ = measured(LawCase(law, 3, sequences=4, seconds=20.0))
+    table, _ = measured(law, 3, sequences=4, seconds=20.0)
     for _, run in table.groupby("sequence"):
         x = run.pivot(index="time", columns="agent", values="x").to_numpy()
         # errors of measurement are 0.3 m at most, and drivers disturb themselves
@@ -52,11 +51,11 @@ def test_nobody_drives_backwards_or_into_anybody(law: str) -> None:
 
 
 def test_equal_cases_give_equal_tables() -> None:
-    case = LawCase("idm", 7, sequences=2, seconds=5.0)
-    first, parameters = measured(case)
-    assert first.equals(measured(case)[0])
-    assert not first.equals(measured(LawCase("idm", 8, sequences=2, seconds=5.0))[0])
+    first, again, other = (measured("idm", s, sequences=2, seconds=5.0)[0] for s in (7, 7, 8))
+    assert first.equals(again)
+    assert not first.equals(other)
+    _, parameters = measured("idm", 7, sequences=1, seconds=5.0)
     assert all(a <= parameters[k] <= b for k, (a, b) in RANGES["idm"].items())
     assert first.groupby("sequence")["agent"].nunique().tolist() == [5, 5]
     with pytest.raises(ConfigError, match="law=newell is unknown"):
-        LawCase("newell", 0)
+        measured("newell", 0)

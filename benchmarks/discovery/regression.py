@@ -1,10 +1,11 @@
-"""Peers of the diagnosis: ways of choosing columns of a library by regression alone.
+"""Baselines of the diagnosis: ways of choosing columns of a library by regression alone.
 
-They are those of scikit-learn and pysindy. Each takes the same columns and targets, from which what
-the base model's own parameters can do has been taken out, and returns one coefficient per column,
-0 where the column is not chosen. Penalties and thresholds are chosen by cross-validation over
-clusters, or by an information criterion. Forward selection and orthogonal matching pursuit are not
-among them: scikit-learn's always choose a column, also where there is nothing.
+The methods are those of scikit-learn and pysindy. Each takes the same columns and targets, from
+which what the base model's own parameters can do has been taken out, and returns one coefficient
+per column, 0 where the column is not chosen. Penalties and thresholds are chosen by
+cross-validation over clusters, or by an information criterion. Forward selection and orthogonal
+matching pursuit are not among them: scikit-learn's always choose a column, also where there is
+nothing.
 """
 
 from __future__ import annotations
@@ -147,8 +148,8 @@ def _seeded(seed: int) -> Iterator[None]:
         np.random.set_state(state)
 
 
-#: Peers by name.
-PEERS: dict[str, Callable[[Library, int], np.ndarray]] = {
+#: Baselines by name.
+BASELINES: dict[str, Callable[[Library, int], np.ndarray]] = {
     "recalibration": nothing,
     "lasso": lasso,
     "lasso_bic": lasso_bic,

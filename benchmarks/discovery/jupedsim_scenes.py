@@ -1,8 +1,8 @@
-"""People whom JuPedSim moves, in scenes from a seed, and what each should be called.
+"""Scenes that JuPedSim simulates from a seed, and the right answer for each.
 
-Two groups walk towards each other through a wide room, a corridor or past a pillar, again and again
-with other people. What is right to say was written down before anything was run. Silence is right
-where nothing is hidden but another law.
+Two groups walk towards each other through a wide room, a corridor, a door or past a pillar. The
+right answers were written down before anything was run. Where nothing is hidden but another law,
+the right answer is to name nothing.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.open_world.answers import Answer, diagnosed
+from benchmarks.discovery.worlds import Answer
+from benchmarks.programs.jupedsim import SAMPLE, STEP, facing, walked
 
-#: Sequences of a scene, people of a group, JuPedSim's step and that of the recording (s), seconds
-#: before the recording and of it.
-SEQUENCES, GROUP, STEP, SAMPLE, WARM, SECONDS = 24, 5, 0.01, 0.1, 2.0, 5.0
+#: Sequences of a scene, people of a group, seconds before the recording and of the recording.
+SEQUENCES, GROUP, WARM, SECONDS = 24, 5, 2.0, 5.0
 #: Half the width of the room and of a corridor, and how far the goals are, m.
 ROOM, HALF, GOAL = 30.0, 1.6, 60.0
 #: Half the width of a door, m.
@@ -120,7 +120,7 @@ SCENES: dict[str, Scene] = {
 
 
 def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
-    """The table of a scene (sequence, time, agent, x, y), and the walls where they are known.
+    """The table of a scene (sequence, time, agent, x, y), and the walls if they are known.
 
     Raises:
         ImportError: JuPedSim is not installed.
@@ -129,8 +129,7 @@ def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
 
     jupedsim = import_module("jupedsim")
     scene = SCENES[name]
-    digest = hashlib.sha256(f"{name} {seed}".encode()).digest()
-    rng = np.random.default_rng(list(digest))
+    rng = np.random.default_rng(list(hashlib.sha256(f"{name} {seed}".encode()).digest()))
     kind, values, person = scene.draw(rng)
     half = HALF if scene.corridor else ROOM
     room = shapely.box(-1.5 * GOAL, -half, 1.5 * GOAL, half)
@@ -141,90 +140,55 @@ def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
         room = room.difference(wall.difference(shapely.box(-1.0, -DOOR, 1.0, DOOR)))
     error = rng.uniform(*ERROR)
     rows: list[pd.DataFrame] = []
-    with TemporaryDirectory() as place:
+    with TemporaryDirectory() as folder:
         for number in range(SEQUENCES):
-            path = Path(place) / f"{number}.sqlite"
-            simulation = jupedsim.Simulation(
-                model=getattr(jupedsim, kind)(**values),
-                geometry=room,
-                dt=STEP,
-                trajectory_writer=jupedsim.SqliteTrajectoryWriter(
-                    output_file=path, every_nth_frame=round(SAMPLE / STEP)
-                ),
+            people = [{**person, **each} for each in _people(rng, scene, kind)]
+            goals = np.array(
+                [(-np.sign(p["position"][0]) * GOAL, p["position"][1]) for p in people]
             )
-            rows.append(_moved(jupedsim, simulation, scene, f"{kind}AgentParameters", person, rng))
-            rows[-1].insert(0, "sequence", f"s{number:03d}")
+            sequence, order = walked(
+                jupedsim,
+                Path(folder) / f"{number}.sqlite",
+                getattr(jupedsim, kind)(**values),
+                getattr(jupedsim, f"{kind}AgentParameters"),
+                people,
+                goals,
+                room,
+                WARM + SECONDS,
+                every=round(SAMPLE / STEP),
+            )
+            first = round(WARM / SAMPLE)
+            x = sequence.x[first:, np.argsort(order)]
+            k, n = (axis.ravel() for axis in np.indices(x.shape[:2]))
+            rows.append(
+                pd.DataFrame(
+                    {
+                        "sequence": f"s{number:03d}",
+                        "time": sequence.time[first:].round(3)[k],
+                        "agent": [f"s{number:03d}-{i}" for i in n],
+                        "x": x[..., 0].ravel(),
+                        "y": x[..., 1].ravel(),
+                    }
+                )
+            )
     table = pd.concat(rows, ignore_index=True)
-    table["agent"] = table["sequence"] + "-" + table["agent"].astype(str)
     table[["x", "y"]] += error * rng.standard_normal((len(table), 2))
-    walls = None
-    if scene.known:
-        end = 1.5 * GOAL
-        walls = pd.DataFrame(
-            [(-end, -half, end, -half), (-end, half, end, half)], columns=["x1", "y1", "x2", "y2"]
-        )
-    return table, walls
+    end = 1.5 * GOAL
+    walls = pd.DataFrame(
+        [(-end, -half, end, -half), (-end, half, end, half)], columns=["x1", "y1", "x2", "y2"]
+    )
+    return table, walls if scene.known else None
 
 
-def _moved(
-    jupedsim: Any,
-    simulation: Any,
-    scene: Scene,
-    kind: str,
-    person: dict[str, float],
-    rng: np.random.Generator,
-) -> pd.DataFrame:
-    """One sequence: time, agent, x, y."""
-    stage = simulation.add_direct_steering_stage()
-    journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
-    places: list[np.ndarray] = []
-    agents = {}
-    while len(places) < 2 * GROUP:
-        side = -1.0 if len(places) < GROUP else 1.0
+def _people(rng: np.random.Generator, scene: Scene, kind: str) -> list[dict[str, Any]]:
+    """Places and speeds of both groups."""
+    found: list[dict[str, Any]] = []
+    while len(found) < 2 * GROUP:
+        side = -1.0 if len(found) < GROUP else 1.0
         at = np.array([side * rng.uniform(3.0, 9.0), rng.uniform(-1.1, 1.1)])
-        if any(np.linalg.norm(at - other) < 1.2 for other in places):
+        if any(np.linalg.norm(at - other["position"]) < 1.2 for other in found):
             continue
         speed = scene.speeds[int(side > 0)] * rng.uniform(0.95, 1.05)
-        more: dict[str, Any] = {"position": tuple(at), "desired_speed": speed}
-        if "Centrifugal" in kind:
-            more |= {"speed": speed, "orientation": (-side, 0.0), "desired_direction": (-side, 0.0)}
-        own = simulation.add_agent(
-            getattr(jupedsim, kind)(journey_id=journey, stage_id=stage, **person, **more)
-        )
-        simulation.agent(own).target = (-side * GOAL, float(at[1]))
-        agents[own] = len(places)
-        places.append(at)
-    every, rows = round(SAMPLE / STEP), []
-    for step in range(round((WARM + SECONDS) / STEP) + 1):
-        if step % every == 0 and step * STEP >= WARM - 1e-9:
-            rows += [
-                (round(step * STEP, 3), agents[one.id], *one.position)
-                for one in simulation.agents()
-            ]
-        simulation.iterate()
-    return pd.DataFrame(rows, columns=["time", "agent", "x", "y"])
-
-
-def diagnosed_people(scene: str, seed: int) -> dict[str, Any]:
-    """One scene, diagnosed with the social force; plain JSON, see :meth:`Answer.judge`."""
-    table, walls = recorded(scene, seed)
-    model = {"name": "sf", "term": "social_force", "desired": "direction", "walls": False}
-    with TemporaryDirectory() as place:
-        path = None
-        if walls is not None:
-            path = Path(place) / "walls.csv"
-            walls.to_csv(path, index=False)
-        report, nearest, seconds = diagnosed(table, "crowd", seed, model=model, walls=path)
-    return {
-        "program": "JuPedSim",
-        "scene": scene,
-        "seed": seed,
-        "asked": "sf",
-        **SCENES[scene].answer.judge(report, nearest),
-        "seconds": seconds,
-    }
-
-
-def cases(first_seed: int, number: int) -> list[dict[str, Any]]:
-    """Arguments of :func:`diagnosed_people`."""
-    return [{"scene": name, "seed": first_seed + i} for name in SCENES for i in range(number)]
+        values: dict[str, Any] = {"position": tuple(at), "desired_speed": speed}
+        found.append(values | (facing(-side, speed) if "Centrifugal" in kind else {}))
+    return found

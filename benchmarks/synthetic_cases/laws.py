@@ -1,21 +1,31 @@
-"""Vehicles behind each other by laws of the literature, step by step as their sources say.
+"""Measured platoons of laws of the literature, integrated step by step as their sources say.
 
-Speeds of laws that say an acceleration are stepped by :data:`STEP` s, places with the mean of both
-speeds (Treiber & Kanagaraj 2015). Krauss' law is the map that SUMO steps, Gipps' the map of his
-paper, whose step is the reaction time; both are linear in between. Drivers disturb all of them:
-their accelerations, or the speeds of laws of first order, have a part that fades within seconds.
+Laws of accelerations are stepped by :data:`STEP` s, and positions with the mean of the old and the
+new speed (Treiber & Kanagaraj 2015). Krauss' law is the map that SUMO steps, Gipps' the map of his
+paper, whose step is the reaction time; both are linear in between. Accelerations of drivers, or
+speeds of laws of first order, are disturbed for some seconds at a time.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 
 import numpy as np
+import pandas as pd
+
+from nnode.errors import ConfigError
 
 #: s, of the simulations.
 STEP = 0.05
 #: m/s, below which disturbances of laws of first order fade.
 SLOW = 5.0
+#: s: simulated before the recording.
+WARM = 20.0
+#: Standard deviation of drivers' disturbances, m/s² and m/s, and their correlation time, s.
+PUSH, FIRST_PUSH, LASTS = (0.05, 0.3), (0.1, 0.4), (1.0, 5.0)
+#: Errors of measured positions, m; in half of the cases they have this correlation time, s.
+ERROR, ERROR_LASTS = (0.02, 0.3), 1.0
 Parameters = dict[str, float]
 
 #: Law to the ranges that its parameters are drawn from: m, s, and what is made of them.
@@ -42,6 +52,87 @@ MAPS: dict[str, Callable[[Parameters], float]] = {
     "gipps": lambda p: round(p["T"] / STEP) * STEP,
 }
 FIRST_ORDER = ("lin", "log")
+
+
+def measured(
+    law: str,
+    seed: int,
+    *,
+    sequences: int = 40,
+    vehicles: int = 5,
+    seconds: float = 30.0,
+    dt: float = 0.2,
+) -> tuple[pd.DataFrame, Parameters]:
+    """The table (sequence, time, agent, x, length) of a law and a seed, and the law's parameters.
+
+    Args:
+        law: a name of :data:`RANGES`.
+        seed: of everything random; equal arguments give equal tables.
+        vehicles: of a platoon, its leader included.
+        seconds: duration of a sequence, s.
+        dt: sampling interval, s.
+
+    Raises:
+        ConfigError: an unknown law.
+    """
+    if law not in RANGES:
+        raise ConfigError(f"law={law} is unknown, expected one of {', '.join(RANGES)}")
+    rng = np.random.default_rng(list(hashlib.sha256(f"{law} {seed}".encode()).digest()))
+    p = {name: float(rng.uniform(*ends)) for name, ends in RANGES[law].items()}
+    size = rng.uniform(*(FIRST_PUSH if law in FIRST_ORDER else PUSH))
+    lasts, error = rng.uniform(*LASTS), rng.uniform(*ERROR)
+    keep = np.exp(-dt / ERROR_LASTS) if rng.random() < 0.5 else 0.0
+    fastest = 0.85 * p.get("v0", 30.0) * (1 if law != "log" else 1.5)
+    every, steps = round(dt / STEP), round((WARM + seconds) / STEP) + 1
+    tables = []
+    for s in range(sequences):
+        length = rng.uniform(4.0, 5.5, vehicles)
+        lead = _leader(rng, steps, fastest)
+        push = _fading(rng, (steps, vehicles - 1), np.exp(-STEP / lasts), size)
+        x = followed(law, p, lead, length, push)[round(WARM / STEP) :: every]
+        x = x - x[0, -1] + _fading(rng, x.shape, keep, error)
+        k, n = (axis.ravel() for axis in np.indices(x.shape))
+        tables.append(
+            pd.DataFrame(
+                {
+                    "sequence": f"s{s:03d}",
+                    "time": 1000.0 * s + dt * k,
+                    "agent": [f"{s}-{i}" for i in n],
+                    "x": x.ravel(),
+                    "length": length[n],
+                }
+            )
+        )
+    return pd.concat(tables, ignore_index=True), p
+
+
+def accelerations(rng: np.random.Generator, steps: int, step: float) -> list[float]:
+    """At least ``steps`` accelerations of a leader, m/s²: for 2 to 7 s each it keeps its speed,
+    accelerates or brakes."""
+    found: list[float] = []
+    while len(found) < steps:
+        rate = rng.choice([0.0, rng.uniform(0.3, 1.2), -rng.uniform(0.3, 2.0)])
+        found += [float(rate)] * round(rng.uniform(2, 7) / step)
+    return found
+
+
+def _leader(rng: np.random.Generator, steps: int, fastest: float) -> np.ndarray:
+    """``(K,)`` positions, m."""
+    rates = accelerations(rng, steps, STEP)
+    speed = [float(rng.uniform(0.3, 0.9) * fastest)]
+    for rate in rates[: steps - 1]:
+        speed.append(min(max(speed[-1] + STEP * rate, 0.0), fastest))
+    return np.asarray(np.concatenate([[0.0], np.cumsum(speed[:-1])]) * STEP)
+
+
+def _fading(
+    rng: np.random.Generator, shape: tuple[int, ...], keep: float, size: float
+) -> np.ndarray:
+    """Noise of a standard deviation, of which a step keeps a share."""
+    found = size * rng.normal(size=shape)
+    for k in range(1, shape[0]):
+        found[k] = keep * found[k - 1] + np.sqrt(1 - keep**2) * found[k]
+    return found
 
 
 def followed(

@@ -1,10 +1,9 @@
-"""Peers of the diagnosis on its own library, residuals and split: reports like its own."""
+"""Regression baselines on the columns, residuals and split of the diagnosis."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
@@ -12,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 from omegaconf import OmegaConf
 
-from benchmarks.synthetic_cases.regression import PEERS, Library
+from benchmarks.discovery.regression import BASELINES, Library
 from nnode.calibrate.parameters import ParameterVector
 from nnode.config import SCHEMAS
 from nnode.data.options import Faults
@@ -36,24 +35,7 @@ from nnode.model.system import System
 _CELL = 0.3
 
 
-@dataclass(frozen=True)
-class Column:
-    """One column of the library.
-
-    Attributes:
-        trace: it belongs to.
-        number: its place in the trace.
-    """
-
-    trace: Trace
-    number: int
-
-    @property
-    def effect(self) -> type[Effect]:
-        return self.trace.effect
-
-
-def peers_on_table(
+def baselines_on_table(
     path: Path,
     domain: str,
     *,
@@ -62,9 +44,9 @@ def peers_on_table(
     leader: str,
     seed: int,
 ) -> dict[str, dict[str, Any]]:
-    """The peers' reports by name, with what :func:`benchmarks.synthetic_cases.score.score` reads.
+    """The baselines' reports by name, with the parts that the score reads.
 
-    Effects with a number per agent are no columns and are not offered to the peers.
+    Effects with a number per agent are not offered to the baselines.
 
     Raises:
         NNodeError: as :func:`nnode.app.discover.diagnose_table`.
@@ -81,34 +63,38 @@ def peers_on_table(
         name="table",
         faults=Faults.drop,
     )
-    with TemporaryDirectory(prefix="nnode-peers-") as scratch:
+    with TemporaryDirectory(prefix="nnode-baselines-") as scratch:
         sequences = read_inputs(data, Path(scratch)).sequences
     division = divide(sequences, DiscoverOptions(seed=seed))
     exploration, confirmation = division.exploration, division.confirmation
     engine = windows_of(system, [sequences[i] for i in exploration], division.label[exploration])
     fit = converged_fit(engine, copy.deepcopy(system).double())
     offered = [e for e in CATALOGUE.of(cast(Domain, domain)) if not e.individual]
-    found = [trace for effect in offered for trace in traces(engine, fit, effect)]
-    columns = [Column(trace, i) for trace in found for i in range(trace.columns.shape[1])]
-    values = np.concatenate([trace.columns for trace in found], axis=1)
+    columns = [trace for effect in offered for trace in traces(engine, fit, effect)]
+    values = np.concatenate([trace.columns for trace in columns], axis=1)
     library = Library(values, -fit.residual, fit.tangents, engine.cluster)
 
     whole = engine_of(system, [sequences[i] for i in confirmation], whole=True)
     whole.fit_whitening(fit.system, ParameterVector(fit.system).row)
     before, floor = square_of(whole, fit.system), whole.noise_floor()
-    split = {"sealed": [sequences[i].name for i in confirmation]}
     reports = {}
-    for name, choose in PEERS.items():
+    for name, choose in BASELINES.items():
         theta = choose(library, seed)
-        names = list(dict.fromkeys(columns[j].effect.name for j in np.flatnonzero(theta)))
+        ends = np.cumsum([trace.columns.shape[1] for trace in columns])
+        chosen = [
+            (trace, part)
+            for trace, part in zip(columns, np.split(theta, ends[:-1]), strict=True)
+            if part.any()
+        ]
+        names = list(dict.fromkeys(trace.effect.name for trace, _ in chosen))
         after = before
         if names:
-            after = square_of(whole, _calibrated(engine, _with(fit, columns, values, theta)))
+            after = square_of(whole, _calibrated(engine, _with(fit, chosen, values @ theta)))
         reports[name] = {
             "verdict": "named" if names else "none",
             "effects": [{"name": n, "coefficients": {}, "alternatives": []} for n in names],
             "gap": {"before": before, "after": after, "noise_floor": floor},
-            "split": split,
+            "split": {"sealed": [sequences[i].name for i in confirmation]},
         }
     return reports
 
@@ -121,19 +107,14 @@ def _calibrated(engine: Engine, system: System) -> System:
         return system
 
 
-def _with(fit: Fit, columns: list[Column], values: np.ndarray, theta: np.ndarray) -> System:
-    """The base model with the chosen effects, its own parameters moved as they ask for."""
-    system = copy.deepcopy(fit.system)
-    if theta.any():
-        rest = fit.residual + values @ theta
-        row = fit.row.copy()
-        row[fit.free] -= np.linalg.lstsq(fit.tangents, rest, rcond=None)[0]
-        system = ParameterVector(system).fill_(row)
-        system.project_()
-    traces_by_id = {id(columns[j].trace): columns[j].trace for j in np.flatnonzero(theta)}
-    for key, trace in traces_by_id.items():
-        own = np.array([t for t, c in zip(theta, columns, strict=True) if id(c.trace) == key])
-        system, _ = extended(system, _effect(trace, own))
+def _with(fit: Fit, chosen: list[tuple[Trace, np.ndarray]], change: np.ndarray) -> System:
+    """The base model with the chosen effects; its own parameters follow their ``change``, m."""
+    row = fit.row.copy()
+    row[fit.free] -= np.linalg.lstsq(fit.tangents, fit.residual + change, rcond=None)[0]
+    system = ParameterVector(copy.deepcopy(fit.system)).fill_(row)
+    system.project_()
+    for trace, theta in chosen:
+        system, _ = extended(system, _effect(trace, theta))
     return system
 
 
@@ -142,12 +123,9 @@ def _effect(trace: Trace, theta: np.ndarray) -> Effect:
     kind = trace.effect
     if kind.consecutive:
         strong = int(np.argmax(np.abs(theta)))
-        like = theta * np.sign(theta[strong]) >= _CELL * abs(theta[strong])
-        first = last = strong
-        while first > 0 and like[first - 1]:
-            first -= 1
-        while last + 1 < len(theta) and like[last + 1]:
-            last += 1
+        other = np.flatnonzero(theta * np.sign(theta[strong]) < _CELL * abs(theta[strong]))
+        first = int(max(other[other < strong], default=-1)) + 1
+        last = int(min(other[other > strong], default=len(theta))) - 1
         (name,) = kind.strengths
         ends = {"a": trace.probes[first].options["a"], "b": trace.probes[last].options["b"]}
         return kind(**{**ends, name: _plausible(kind, name, float(theta[first : last + 1].mean()))})

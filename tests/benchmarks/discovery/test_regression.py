@@ -1,11 +1,11 @@
-"""The peers are given what they are said to be given, and what they choose is read rightly."""
+"""Each baseline chooses the right columns from the data that it is given."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_cases.regression import PEERS, Library
+from benchmarks.discovery.regression import BASELINES, Library
 
 CHOOSING = ["lasso", "lasso_bic", "ensemble_sindy"]
 CROSS_VALIDATED = ["lasso", "ensemble_sindy"]
@@ -13,7 +13,7 @@ CROSS_VALIDATED = ["lasso", "ensemble_sindy"]
 
 def choose(name: str, library: Library, seed: int = 0) -> np.ndarray:
     pytest.importorskip("pysindy" if name == "ensemble_sindy" else "sklearn")
-    return PEERS[name](library, seed)
+    return BASELINES[name](library, seed)
 
 
 def library(seed: int = 0) -> tuple[Library, np.ndarray]:
@@ -27,7 +27,7 @@ def library(seed: int = 0) -> tuple[Library, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["lasso_bic", "ensemble_sindy"])
-def test_sparse_peers_find_the_columns_and_no_other(name):
+def test_sparse_methods_find_the_columns_and_no_other(name):
     some, theta = library()
     found = choose(name, some)
     assert ((found != 0) == (theta != 0)).all()
@@ -43,7 +43,7 @@ def test_cross_validated_lasso_keeps_what_is_there():
 
 
 def test_recalibration_names_nothing():
-    assert not PEERS["recalibration"](library()[0], 0).any()
+    assert not BASELINES["recalibration"](library()[0], 0).any()
 
 
 @pytest.mark.parametrize("name", CHOOSING)

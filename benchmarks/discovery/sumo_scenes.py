@@ -1,34 +1,30 @@
-"""Platoons whose followers SUMO drives, in scenes from a seed, and what each should be called.
+"""Platoons whose followers SUMO drives, in scenes from a seed, and the right answer for each.
 
-Every platoon has a road of its own. Its leader is told its speed at every step; the rest is SUMO's.
-What is right to say was written down before anything was run: see
-:class:`~benchmarks.open_world.answers.Answer`. A name that is listed as not to be told from the one
-that was chosen counts as said.
+Every platoon has a road of its own. Its leader is given its speed at every step; SUMO does the
+rest. The right answers were written down before anything was run: see
+:class:`~benchmarks.discovery.worlds.Answer`.
 """
 
 from __future__ import annotations
 
 import hashlib
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
 
-from benchmarks.open_world.answers import NOTHING, Answer, diagnosed
-from benchmarks.synthetic_cases.laws.case import accelerations
+from benchmarks.discovery.worlds import NOTHING, Answer
+from benchmarks.programs.sumo import STEP, network, run, sumo_home
+from benchmarks.synthetic_cases.laws import accelerations
 
-#: Roads, vehicles on each with the leader, seconds before and of the recording, SUMO's step (s).
-ROADS, CARS, WARM, SECONDS, STEP = 40, 5, 20.0, 30.0, 0.1
+#: Roads, vehicles on each with the leader, seconds before and of the recording.
+ROADS, CARS, WARM, SECONDS = 40, 5, 20.0, 30.0
 #: Samples are so many steps apart. Errors of measured places, m.
 EVERY, ERROR = 2, (0.02, 0.2)
 #: Length of a road, of its stretch in the middle (m), and of vehicles.
@@ -122,30 +118,57 @@ SCENES: dict[str, Scene] = {
 }
 
 
-def recorded(name: str, seed: int) -> pd.DataFrame:
-    """The table of a scene: sequence, time, agent, x, length, kind.
+def recorded(name: str, seed: int) -> tuple[pd.DataFrame, None]:
+    """The table of a scene: sequence, time, agent, x, length, kind; there are no walls.
 
     Raises:
         ImportError: SUMO is not installed.
     """
     scene = SCENES[name]
-    digest = hashlib.sha256(f"{name} {seed}".encode()).digest()
-    rng = np.random.default_rng(list(digest))
+    rng = np.random.default_rng(list(hashlib.sha256(f"{name} {seed}".encode()).digest()))
     values = {**scene.draw(rng), **{k: rng.uniform(*v) for k, v in scene.more.items()}}
-    with TemporaryDirectory() as place:
-        folder = Path(place)
-        home = Path(str(import_module("sumo").SUMO_HOME))
-        command = _written(home, folder, scene, values, rng)
-        _simulated(command, home, scene, rng)
-        table = _read(folder / "fcd.xml")
+    with TemporaryDirectory() as folder:
+        path = _simulated(sumo_home(), Path(folder), scene, values, rng)
+        table = _read(path)
     table["x"] += rng.uniform(*ERROR) * rng.standard_normal(len(table))
-    return table
+    return table, None
 
 
-def _written(
+def _simulated(
     home: Path, folder: Path, scene: Scene, values: dict[str, float], rng: np.random.Generator
-) -> list[str]:
-    """Write the roads and the traffic; returns how SUMO is started."""
+) -> Path:
+    """Write the roads and the traffic, and run SUMO; returns its output."""
+    _write(home, folder, scene, values, rng)
+    number = int(rng.integers(1 << 30))
+    steps = round((WARM + SECONDS) / STEP)
+    speeds = np.stack([_speeds(rng, steps) for _ in range(ROADS)])
+    begin = WARM + rng.uniform(0.2, 0.5) * SECONDS
+    slow = rng.uniform(*LIMIT)
+
+    def control(traci: ModuleType, step: int) -> None:
+        for k in range(ROADS):
+            if not step:
+                traci.vehicle.setSpeedMode(f"{k}-0", 0)
+            traci.vehicle.setSpeed(f"{k}-0", float(speeds[k, step]))
+        for name in traci.vehicle.getIDList() if scene.drop and not step else []:
+            if not name.startswith("unseen"):
+                traci.vehicle.setLaneChangeMode(name, 0)
+        if scene.period and step in (round(begin / STEP), round((begin + 8) / STEP)):
+            limit = slow if step == round(begin / STEP) else FREE
+            for name in traci.edge.getIDList():
+                traci.edge.setMaxSpeed(name, limit)
+        for name in traci.trafficlight.getIDList() if scene.red else []:
+            red = begin <= step * STEP < begin + 8
+            traci.trafficlight.setRedYellowGreenState(name, "r" if red else "G")
+
+    options = ["--precision", 6, "--seed", number, "--collision.action", "none"]
+    return run(home, folder, "fcd.xml", "id,type,x,y", steps, control, *options)
+
+
+def _write(
+    home: Path, folder: Path, scene: Scene, values: dict[str, float], rng: np.random.Generator
+) -> None:
+    """Write the roads and the traffic."""
     ends = {"a": 0.0, "b": STRETCH[0], "c": STRETCH[1], "d": ROAD}
     allowed = rng.uniform(*scene.limit)
     limit = rng.uniform(*LIMIT) if scene.stretch else allowed
@@ -188,82 +211,8 @@ def _written(
                     f'<route edges="a{k} b{k} c{k}"/></vehicle>'
                 )
             x -= length + 2.5 + 12 * rng.uniform(1.0, 1.8)
-    (folder / "a.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>")
-    (folder / "a.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
-    (folder / "a.con.xml").write_text(f"<connections>{''.join(goes_on)}</connections>")
     (folder / "a.rou.xml").write_text(f"<routes>{''.join(cars)}</routes>")
-    made = [
-        home / "bin" / "netconvert",
-        "-n",
-        folder / "a.nod.xml",
-        "-e",
-        folder / "a.edg.xml",
-        "-x",
-        folder / "a.con.xml",
-        "-o",
-        folder / "a.net.xml",
-        "--no-internal-links",
-        "--junctions.minimal-shape",
-    ]
-    subprocess.run([str(part) for part in made], check=True, capture_output=True)
-    return [
-        str(part)
-        for part in (
-            home / "bin" / "sumo",
-            "-n",
-            folder / "a.net.xml",
-            "-r",
-            folder / "a.rou.xml",
-            "--step-length",
-            STEP,
-            "--precision",
-            6,
-            "--no-step-log",
-            "--no-warnings",
-            "--seed",
-            int(rng.integers(1 << 30)),
-            "--fcd-output",
-            folder / "fcd.xml",
-            "--fcd-output.attributes",
-            "id,type,x,y",
-            "--collision.action",
-            "none",
-        )
-    ]
-
-
-def _simulated(command: list[str], home: Path, scene: Scene, rng: np.random.Generator) -> None:
-    """Run SUMO, every leader at speeds of its own."""
-    sys.path.append(str(home / "tools"))
-    try:
-        traci: ModuleType = import_module("traci")
-    finally:
-        sys.path.remove(str(home / "tools"))
-    steps = round((WARM + SECONDS) / STEP)
-    speeds = np.stack([_speeds(rng, steps) for _ in range(ROADS)])
-    begin = WARM + rng.uniform(0.2, 0.5) * SECONDS
-    slow = rng.uniform(*LIMIT)
-    traci.start(command, stdout=subprocess.DEVNULL)
-    try:
-        traci.simulationStep()
-        for k in range(ROADS):
-            traci.vehicle.setSpeedMode(f"{k}-0", 0)
-        for name in traci.vehicle.getIDList() if scene.drop else []:
-            if not name.startswith("unseen"):
-                traci.vehicle.setLaneChangeMode(name, 0)
-        for step in range(steps):
-            for k in range(ROADS):
-                traci.vehicle.setSpeed(f"{k}-0", float(speeds[k, step]))
-            if scene.period and step in (round(begin / STEP), round((begin + 8) / STEP)):
-                limit = slow if step == round(begin / STEP) else FREE
-                for name in traci.edge.getIDList():
-                    traci.edge.setMaxSpeed(name, limit)
-            for name in traci.trafficlight.getIDList() if scene.red else []:
-                red = begin <= step * STEP < begin + 8
-                traci.trafficlight.setRedYellowGreenState(name, "r" if red else "G")
-            traci.simulationStep()
-    finally:
-        traci.close()
+    network(home, folder, "".join(nodes), "".join(edges), "".join(goes_on))
 
 
 def _speeds(rng: np.random.Generator, steps: int) -> np.ndarray:
@@ -293,21 +242,3 @@ def _read(path: Path) -> pd.DataFrame:
     table["length"] = np.where(table["kind"] == "truck", TRUCK, LENGTH)
     table.insert(0, "sequence", "s" + table["agent"].str.partition("-")[0].str.zfill(3))
     return table
-
-
-def diagnosed_scene(scene: str, seed: int, asked: str = "idm") -> dict[str, Any]:
-    """One scene, diagnosed; plain JSON, see :meth:`Answer.judge`."""
-    report, nearest, seconds = diagnosed(recorded(scene, seed), "traffic", seed, model=asked)
-    return {
-        "program": "SUMO",
-        "scene": scene,
-        "seed": seed,
-        "asked": asked,
-        **SCENES[scene].answer.judge(report, nearest),
-        "seconds": seconds,
-    }
-
-
-def cases(first_seed: int, number: int) -> list[dict[str, Any]]:
-    """Arguments of :func:`diagnosed_scene`."""
-    return [{"scene": name, "seed": first_seed + i} for name in SCENES for i in range(number)]
