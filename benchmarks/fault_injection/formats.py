@@ -14,16 +14,11 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from nnode.app.check import check_file
 from nnode.data.identity import identify
 from nnode.data.options import DataOptions
 from nnode.data.prepare import FORMATS
 from nnode.data.quality import drop_absent, find_faults
 from nnode.data.readers.highd import RECORDING_META, TRACKS, TRACKS_META, HighDOptions
-from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, WalkwayOptions
-from nnode.data.readers.ngsim import NgsimOptions
-from nnode.data.readers.openacc import OpenAccOptions
-from nnode.data.readers.sumo import SumoOptions
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.sequences import Sequences
 
@@ -116,13 +111,6 @@ def ngsim() -> bytes:
     return str(pd.DataFrame(rows).to_csv(index=False)).encode()
 
 
-def read_ngsim(path: Path) -> None:
-    """By lanes' intervals and by windows."""
-    for window in (None, 0.4):
-        options = NgsimOptions(path=str(path), min_samples=2, dt=0.1, window=window)
-        read_all(options, {path.stem: path})
-
-
 def highd(folder: Path) -> bytes:
     """Tracks; what is known of them is written to the folder."""
     rows = [
@@ -170,11 +158,6 @@ def sumo() -> list[bytes]:
     return [plain, gzip.compress(plain)]
 
 
-def read_sumo(path: Path) -> None:
-    """All lanes."""
-    read_all(SumoOptions(path=str(path), dt=0.5, min_samples=2), {path.stem: path})
-
-
 def walkway(folder: Path) -> bytes:
     """A database of JuPedSim."""
     path = folder / "seed.sqlite"
@@ -194,18 +177,6 @@ def walkway(folder: Path) -> bytes:
     return content
 
 
-def read_walkway(path: Path) -> None:
-    """The walkable area of the database."""
-    read_all(WalkwayOptions(path=str(path), t_seq=1.0), {PEOPLE: path})
-
-
-def read_geometry(people: Path) -> Any:
-    """A reader of a walkable area beside people."""
-    return lambda path: read_all(
-        WalkwayOptions(path=str(people), t_seq=1.0), {PEOPLE: people, GEOMETRY: path}
-    )
-
-
 def flat_platoons() -> bytes:
     """Platoons as one row per vehicle and time."""
     rows = [
@@ -214,11 +185,6 @@ def flat_platoons() -> bytes:
         for k in range(60)
     ]
     return str(pd.DataFrame(rows).to_csv(index=False)).encode()
-
-
-def read_platoons(path: Path) -> None:
-    """Either layout."""
-    read_all(OpenAccOptions(path=str(path), min_duration=0.3), {path.name: path})
 
 
 def strange_frame(content: bytes, rng: random.Random) -> bytes:
@@ -271,8 +237,3 @@ def _changed(frame: pd.DataFrame, rng: random.Random) -> pd.DataFrame:
 def read_frame(path: Path) -> None:
     """As a notebook gives it; what pickle makes of it is the campaign's own."""
     Sequences.of(pickle.loads(path.read_bytes()))
-
-
-def check(path: Path) -> None:
-    """The check's words."""
-    repr(check_file(path))

@@ -19,7 +19,6 @@ import traceback
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -70,29 +69,6 @@ _WRITES = frozenset(
 )
 
 
-@dataclass
-class Fuzzed:
-    """What became of one target's inputs.
-
-    Attributes:
-        target: its name.
-        tried: number of inputs.
-        read: how many were read all the same.
-        refused: how many were refused with an error of the package.
-        losses: all others, in words with the number of the input.
-        seconds: for all of them.
-        megabytes: the most memory that the child had more than at its start.
-    """
-
-    target: str
-    tried: int = 0
-    read: int = 0
-    refused: int = 0
-    losses: list[str] = field(default_factory=list)
-    seconds: float = 0.0
-    megabytes: float = 0.0
-
-
 class _TooSlow(BaseException):
     """An input takes longer than a reader may."""
 
@@ -101,18 +77,18 @@ class _Watch:
     """Counts what a reader must never do; an audit hook stays as long as its process."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.seen = str(folder), Counter[str]()
-        sys.addaudithook(self._look)
+        self.folder, self.events = str(folder), Counter[str]()
+        sys.addaudithook(self._hook)
 
-    def _look(self, event: str, arguments: tuple[Any, ...]) -> None:
+    def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
         if event in _STARTS:
-            self.seen[f"{event} {arguments[:1]!r}"[:200]] += 1
+            self.events[f"{event} {arguments[:1]!r}"[:200]] += 1
         elif event in _WRITES or (event == "open" and self._writes(arguments)):
             for path in arguments[:2] if event in ("os.rename", "shutil.move") else arguments[:1]:
                 if isinstance(path, str | bytes | os.PathLike):
                     place = os.path.abspath(os.fsdecode(path))
                     if not place.startswith((self.folder, "/dev/null")):
-                        self.seen[f"{event} {place}"[:200]] += 1
+                        self.events[f"{event} {place}"[:200]] += 1
 
     @staticmethod
     def _writes(arguments: tuple[Any, ...]) -> bool:
@@ -122,7 +98,7 @@ class _Watch:
         return isinstance(flags, int) and bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
 
 
-def fuzz(folder: Path, inputs: int, seed: int, names: list[str] | None = None) -> list[Fuzzed]:
+def fuzz(folder: Path, inputs: int, seed: int, names: list[str] | None = None) -> list[Row]:
     """Give every target its share of ``inputs`` malformed files.
 
     Args:
@@ -131,25 +107,26 @@ def fuzz(folder: Path, inputs: int, seed: int, names: list[str] | None = None) -
         seed: the same seed makes the same files.
         names: of the targets; None takes all.
     """
+    import pedpy  # noqa: F401  the children share it: loading takes longer than a thousand inputs
+
     scratch, outside = folder / "fuzz", folder / "outside"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     known = targets(scratch, outside)
     check_names("targets", names or [], [target.name for target in known])
-    chosen = [t for t in known if names is None or t.name in names]
-    whole = sum(target.share for target in chosen)
-    found = []
-    shares = {target.name: float(target.share) for target in chosen}
-    with Stages("malformed files", shares, forks=True) as stages:
-        for target in chosen:
-            stages.begin(target.name)
-            number = round(inputs * target.share / whole)
-            found.append(_all_of(target, number, seed, scratch, stages.within))
+    chosen = {target: target.share for target in known if names is None or target.name in names}
+    rows = []
+    shares = {target.name: float(share) for target, share in chosen.items()}
+    with Stages("malformed files", shares, forks=True) as bar:
+        for target, share in chosen.items():
+            bar.begin(target.name)
+            number = round(inputs * share / sum(shares.values()))
+            rows.append(_all_of(target, number, seed, scratch, bar.within))
             if outside.exists():
-                found[-1].losses.append(f"{outside} was made")
+                rows[-1].losses.append(f"{outside} was made")
                 shutil.rmtree(outside) if outside.is_dir() else outside.unlink()
     shutil.rmtree(scratch)
-    return found
+    return rows
 
 
 def make(target: Target, seed: int, number: int) -> bytes:
@@ -160,13 +137,14 @@ def make(target: Target, seed: int, number: int) -> bytes:
 
 def _all_of(
     target: Target, inputs: int, seed: int, scratch: Path, within: Callable[[float], None]
-) -> Fuzzed:
-    """All inputs of a target; a child that dies is a loss, and another one goes on behind it."""
-    found, start, next_one = Fuzzed(target.name), time.monotonic(), 0
-    notes = scratch / "notes.json"
-    while next_one < inputs:
+) -> Row:
+    """All inputs of a target; a child that dies is a loss, and another one continues after it."""
+    row, start, first = Row("fuzz", target.name, 0), time.monotonic(), 0
+    counts = Counter(read=0, refused=0)
+    megabytes, notes = 0.0, scratch / "notes.json"
+    while first < inputs:
         notes.unlink(missing_ok=True)
-        child = Child(partial(_work, target, next_one, inputs, seed, scratch, notes))
+        child = Child(partial(_work, target, first, inputs, seed, scratch, notes))
         before, last = -1, time.monotonic()
         while child.status(0.1) is None:
             at = _read_number(scratch)
@@ -176,20 +154,20 @@ def _all_of(
             elif time.monotonic() - last > 6 * SLOW:
                 child.kill()
         if notes.is_file():
-            told = json.loads(notes.read_text())
-            found.tried += told["tried"]
-            found.read += told["read"]
-            found.refused += told["refused"]
-            found.losses += told["losses"]
-            found.megabytes = max(found.megabytes, told["megabytes"])
+            noted = json.loads(notes.read_text())
+            row.tried += noted["tried"]
+            row.losses += noted["losses"]
+            counts.update(noted["counts"])
+            megabytes = max(megabytes, noted["megabytes"])
         if child.status(0) == 0:
             break
         at = _read_number(scratch)
-        found.losses.append(f"input {at}: the process ended with status {child.status(0)}")
-        found.tried += 1
-        next_one = at + 1
-    found.seconds = time.monotonic() - start
-    return found
+        row.losses.append(f"input {at}: the process ended with status {child.status(0)}")
+        row.tried += 1
+        first = at + 1
+    row.seconds = time.monotonic() - start
+    row.facts = {**counts, "MB": round(megabytes)}
+    return row
 
 
 def _read_number(scratch: Path) -> int:
@@ -205,33 +183,32 @@ def _work(target: Target, first: int, last: int, seed: int, scratch: Path, notes
     address = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (address + ROOM, address + ROOM))
     signal.signal(signal.SIGALRM, _too_slow)
-    watch, found, path = _Watch(scratch), Fuzzed(target.name), scratch / target.file
+    watch, path, counts = _Watch(scratch), scratch / target.file, Counter[str]()
     counter = os.open(scratch / "number", os.O_RDWR | os.O_CREAT)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    losses: list[str] = []
     for number in range(first, last):
         os.pwrite(counter, f"{number:09d}".encode(), 0)
         path.write_bytes(make(target, seed, number))
-        watch.seen.clear()
+        watch.events.clear()
         signal.setitimer(signal.ITIMER_REAL, SLOW)
         try:
             target.read(path)
-            found.read += 1
+            counts["read"] += 1
         except NNodeError as error:
-            found.refused += 1
-            found.losses += [f"input {number}: {what}" for what in _unfit(str(error))]
+            counts["refused"] += 1
+            losses += [f"input {number}: {what}" for what in _unfit(str(error))]
         except (Exception, _TooSlow) as error:
             where = "".join(traceback.format_tb(error.__traceback__)[-3:])
-            found.losses.append(f"input {number}: {type(error).__name__}: {error}\n{where}"[:900])
+            losses.append(f"input {number}: {type(error).__name__}: {error}\n{where}"[:900])
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
-        found.losses += [f"input {number} did {what}" for what in watch.seen]
-        found.tried += 1
+        losses += [f"input {number} did {what}" for what in watch.events]
         if (number - first) % 500 == 499 or number == last - 1:
             after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            found.megabytes = (after - before) / 1024
-            more = len(found.losses) - _TOLD
-            told = found.losses[:_TOLD] + ([""] * more if more > 0 else [])
-            notes.write_text(json.dumps({**asdict(found), "losses": told}))
+            noted = losses[:_TOLD] + [""] * (len(losses) - _TOLD)
+            noted_row = {"tried": number - first + 1, "counts": counts, "losses": noted}
+            notes.write_text(json.dumps({**noted_row, "megabytes": (after - before) / 1024}))
 
 
 def _unfit(message: str) -> list[str]:
@@ -243,20 +220,3 @@ def _unfit(message: str) -> list[str]:
 
 def _too_slow(number: int, frame: FrameType | None) -> None:
     raise _TooSlow(f"longer than {SLOW} s")
-
-
-def rows(folder: Path, inputs: int, seed: int, names: list[str] | None = None) -> list[Row]:
-    """The campaign, see :func:`fuzz`, as lines of the table."""
-    import pedpy  # noqa: F401  the children share it: loading takes longer than a thousand inputs
-
-    return [
-        Row(
-            "fuzz",
-            f.target,
-            f.tried,
-            f.losses,
-            f.seconds,
-            {"read": f.read, "refused": f.refused, "MB": round(f.megabytes)},
-        )
-        for f in fuzz(folder, inputs, seed, names)
-    ]

@@ -39,7 +39,7 @@ def fault_injection(config: DictConfig, folder: Path) -> None:
         "kills": lambda: kills.kills(root, folder, options.kills, options.seed, options.jobs),
         "disk": lambda: disk.disk(root, folder, options.jobs),
         "folder": lambda: one_folder.folder(root, folder, options.jobs, options.repeats),
-        "fuzz": lambda: fuzz.rows(folder, options.inputs, options.seed, options.targets),
+        "fuzz": lambda: fuzz.fuzz(folder, options.inputs, options.seed, options.targets),
     }
     check_names("campaigns", options.campaigns, campaigns)
     if min(options.kills, options.inputs, options.repeats) < 1:

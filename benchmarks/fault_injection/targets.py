@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import pickle
@@ -14,18 +15,25 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from omegaconf import MISSING
 from scipy.io import savemat
 
 from benchmarks.fault_injection import formats
 from benchmarks.fault_injection.formats import read_all
 from benchmarks.fault_injection.gadgets import evil_checkpoint, strange_checkpoint
 from benchmarks.fault_injection.inputs import damaged_bytes, damaged_formula, damaged_text
+from nnode.app.check import check_file
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.optimizers import AdadeltaOptions, build_optimizer
+from nnode.data.options import DataOptions
 from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.readers.highd import TRACKS
 from nnode.data.readers.juelich import JuelichOptions
+from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, WalkwayOptions
+from nnode.data.readers.ngsim import NgsimOptions
+from nnode.data.readers.openacc import OpenAccOptions
 from nnode.data.readers.pairs import PairOptions
+from nnode.data.readers.sumo import SumoOptions
 from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS, TableOptions
 from nnode.data.readers.vehicles import VehicleTableOptions
@@ -48,7 +56,7 @@ _FORMULAS = (
 _QUANTITIES = {"v0": "30 m/s", "T": "1.2 s", "s0": "2 m", "a": "1.3 m/s²", "b": "1.7 m/s²"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Target:
     """A reader and its malformed inputs.
 
@@ -264,86 +272,107 @@ def targets(scratch: Path, outside: Path) -> list[Target]:
     texts = [_csv(f) for f in (traffic, crowd, _vehicles(), _pairs())]
     texts += [_corridor(), formats.ngsim(), _platoon(), formats.flat_platoons()]
 
-    def vehicles(path: Path) -> None:
-        for window in (None, 0.4):
-            options = VehicleTableOptions(path=str(path), min_samples=2, window=window)
-            read_all(options, {path.stem: path})
+    def reads(*every: DataOptions, key: str | None = None, **more: Path) -> Callable[[Path], None]:
+        """A reader of a file, once with each of the options.
 
-    def pairs(path: Path) -> None:
-        for options in (PairOptions(), PairOptions(dt=0.4, window=0.8, min_samples=2)):
-            options.path = str(path)
-            read_all(options, {path.name: path})
+        Args:
+            key: of the file among those that are read; by default its stem.
+            more: further files, which are sound.
+        """
 
+        def read(path: Path) -> None:
+            for options in every:
+                given = copy.copy(options)
+                if vars(given).get("path", MISSING) == MISSING:
+                    vars(given)["path"] = str(path)
+                read_all(given, {**more, key or path.stem: path})
+
+        return read
+
+    windows = (None, 0.4)
+    area = WalkwayOptions(path=str(scratch / "room.txt"), t_seq=1.0)
+    fcd = SumoOptions(dt=0.5, min_samples=2)
+    vehicles = [VehicleTableOptions(min_samples=2, window=window) for window in windows]
+    pairs = [PairOptions(), PairOptions(dt=0.4, window=0.8, min_samples=2)]
+    ngsim = [NgsimOptions(min_samples=2, dt=0.1, window=window) for window in windows]
     return [
         Target(
             "esimas",
             "sequence_datademo.mat",
             [_mat(packed=False), _mat(packed=True)],
             damaged_bytes,
-            lambda path: read_all(EsimasOptions(), {"demo": path}),
+            reads(EsimasOptions(), key="demo"),
         ),
         Target(
             "juelich",
             "corridor.txt",
             [_corridor()],
             damaged_text,
-            lambda path: read_all(pandas_only, {"corridor": path}),
+            reads(pandas_only, key="corridor"),
         ),
         Target(
             "table CSV",
             "table.csv",
             [_csv(traffic)],
             damaged_text,
-            lambda path: read_all(of_traffic, {TIDY: path}),
+            reads(of_traffic, key=TIDY),
         ),
         Target(
             "table CSV, crowd",
             "people.csv",
             [_csv(crowd)],
             damaged_text,
-            lambda path: read_all(of_crowd, {TIDY: path}),
+            reads(of_crowd, key=TIDY),
         ),
         Target(
             "table Parquet",
             "table.parquet",
             [_parquet(traffic)],
             damaged_bytes,
-            lambda path: read_all(of_traffic, {TIDY: path}),
+            reads(of_traffic, key=TIDY),
         ),
-        Target("vehicles CSV", "cars.csv", [_csv(_vehicles())], damaged_text, vehicles),
-        Target("pairs CSV", "pairs.csv", [_csv(_pairs())], damaged_text, pairs),
+        Target("vehicles CSV", "cars.csv", [_csv(_vehicles())], damaged_text, reads(*vehicles)),
+        Target(
+            "pairs CSV", "pairs.csv", [_csv(_pairs())], damaged_text, reads(*pairs, key="pairs.csv")
+        ),
         Target(
             "OpenACC",
             "platoon.csv",
             [_platoon(), formats.flat_platoons()],
             damaged_text,
-            formats.read_platoons,
+            reads(OpenAccOptions(min_duration=0.3), key="platoon.csv"),
         ),
-        Target("NGSIM", "ngsim.csv", [formats.ngsim()], damaged_text, formats.read_ngsim),
+        Target("NGSIM", "ngsim.csv", [formats.ngsim()], damaged_text, reads(*ngsim)),
         Target("highD, tracks", f"highd/01{TRACKS}", [tracks], damaged_text, formats.read_highd),
-        Target("SUMO", "fcd.xml", formats.sumo(), damaged_text, formats.read_sumo),
+        Target(
+            "SUMO",
+            "fcd.xml",
+            formats.sumo(),
+            damaged_text,
+            reads(fcd),
+        ),
         Target(
             "JuPedSim",
             "walk.sqlite",
             [formats.walkway(scratch)],
             damaged_bytes,
-            formats.read_walkway,
+            reads(WalkwayOptions(t_seq=1.0), key=PEOPLE),
         ),
         Target(
             "walkable area",
             "area.wkt",
             [formats.ROOM.encode()],
             damaged_text,
-            formats.read_geometry(scratch / "room.txt"),
+            reads(area, key=GEOMETRY, **{PEOPLE: scratch / "room.txt"}),
         ),
         Target("data frame", "frame.pickle", pickled, formats.strange_frame, formats.read_frame),
-        Target("check", "checked.csv", texts, damaged_text, formats.check),
+        Target("check", "checked.csv", texts, damaged_text, lambda path: repr(check_file(path))),
         Target(
             "walls CSV",
             "walls.csv",
             [walls],
             damaged_text,
-            lambda path: read_all(of_crowd, {TIDY: scratch / "crowd.csv", WALLS: path}),
+            reads(of_crowd, key=WALLS, **{TIDY: scratch / "crowd.csv"}),
         ),
         Target("checkpoint, bytes", "bytes.pt", [checkpoint], damaged_bytes, _open_checkpoint),
         Target(

@@ -27,11 +27,13 @@ def generate(case: Case, folder: Path) -> dict[str, Any]:
     Raises:
         ConfigError: an effect that the domain does not know.
     """
+    from benchmarks.synthetic_cases.files import write
+
     # compiled code is loaded for one domain alone
     if case.domain == "crowd":
-        from benchmarks.synthetic_cases.crowd.files import write_crowd
+        from benchmarks.synthetic_cases.crowd.case import CrowdCase
 
-        return write_crowd(case, folder)
-    from benchmarks.synthetic_cases.traffic.files import write_traffic
+        return write(CrowdCase(case), folder)
+    from benchmarks.synthetic_cases.traffic.case import TrafficCase
 
-    return write_traffic(case, folder)
+    return write(TrafficCase(case), folder)

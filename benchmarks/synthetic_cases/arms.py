@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection
+from itertools import product
+from typing import NamedTuple
 
 from benchmarks.synthetic_cases import faults
 from benchmarks.synthetic_cases.case import ARMS, Case
@@ -46,8 +47,25 @@ CROWD_PAIRS = (
 )
 
 
-@dataclass(frozen=True)
-class Hides:
+#: Effects and variants of near misses.
+_NEAR: dict[str, tuple[tuple[str, str], ...]] = {
+    "traffic": (
+        ("speed_zone", "smooth"),
+        ("speed_period", "smooth"),
+        ("relative_speed", "heavy_tails"),
+        ("multi_anticipation", "heavy_tails"),
+    ),
+    "crowd": (
+        ("obstacle", "smooth"),
+        ("attraction", "smooth"),
+        ("group_cohesion", "heavy_tails"),
+        ("preferred_speed", "heavy_tails"),
+    ),
+}
+_CATALOGUES = {"traffic": traffic_catalogue, "crowd": crowd_catalogue}
+
+
+class Hides(NamedTuple):
     """What one case of an arm hides.
 
     Attributes:
@@ -60,56 +78,33 @@ class Hides:
     runs: int = 0
 
 
-def _traffic() -> dict[str, list[Hides]]:
-    return {
-        "single": [Hides((name,)) for name in traffic_catalogue.CATALOGUE],
-        "pair": [Hides(pair) for pair in TRAFFIC_PAIRS],
-        "nothing": [Hides((), variant) for variant in NULLS] + [Hides((), "recording", runs=2)],
-        "outside": [Hides((name,)) for name in traffic_catalogue.OUTSIDE],
-        "near_miss": [
-            Hides(("speed_zone",), "smooth"),
-            Hides(("speed_period",), "smooth"),
-            Hides(("relative_speed",), "heavy_tails"),
-            Hides(("multi_anticipation",), "heavy_tails"),
-            Hides((), "heavy_tails"),
-        ],
-        "no_excitation": [Hides((name,)) for name in traffic_catalogue.NEEDS_EXCITATION],
-        "fault": [Hides((), kind) for kind in faults.KINDS],
-    }
-
-
-def _crowd() -> dict[str, list[Hides]]:
-    return {
-        "single": [Hides((name,)) for name in crowd_catalogue.CATALOGUE],
-        "pair": [Hides(pair) for pair in CROWD_PAIRS],
-        "nothing": [Hides((), variant) for variant in (*NULLS, "slow")],
-        "outside": [Hides((name,)) for name in crowd_catalogue.OUTSIDE],
-        "near_miss": [
-            Hides(("obstacle",), "smooth"),
-            Hides(("attraction",), "smooth"),
-            Hides(("group_cohesion",), "heavy_tails"),
-            Hides(("preferred_speed",), "heavy_tails"),
-            Hides((), "heavy_tails"),
-        ],
-        "no_excitation": [Hides((name,)) for name in crowd_catalogue.NEEDS_EXCITATION],
-        "fault": [Hides((), kind) for kind in faults.KINDS],
-    }
-
-
-_HIDES = {"traffic": _traffic, "crowd": _crowd}
-
-
 def hides(domain: str, arm: str) -> list[Hides]:
     """What the cases of an arm hide.
 
     Raises:
         ConfigError: an unknown domain or arm.
     """
-    if domain not in _HIDES:
-        raise ConfigError(f"domain={domain}: expected one of {', '.join(_HIDES)}")
+    if domain not in _CATALOGUES:
+        raise ConfigError(f"domain={domain}: expected one of {', '.join(_CATALOGUES)}")
     if arm not in ARMS:
         raise ConfigError(f"arm={arm}: expected one of {', '.join(ARMS)}")
-    return _HIDES[domain]()[arm]
+    catalogue, traffic = _CATALOGUES[domain], domain == "traffic"
+    names = {
+        "single": catalogue.CATALOGUE,
+        "outside": catalogue.OUTSIDE,
+        "no_excitation": catalogue.NEEDS_EXCITATION,
+    }
+    if arm in names:
+        return [Hides((name,)) for name in names[arm]]
+    if arm == "pair":
+        return [Hides(pair) for pair in (TRAFFIC_PAIRS if traffic else CROWD_PAIRS)]
+    if arm == "near_miss":
+        near = [Hides((name,), variant) for name, variant in _NEAR[domain]]
+        return [*near, Hides((), "heavy_tails")]
+    if arm == "fault":
+        return [Hides((), kind) for kind in faults.KINDS]
+    last = Hides((), "recording", runs=2) if traffic else Hides((), "slow")
+    return [*(Hides((), variant) for variant in NULLS), last]
 
 
 def first_seed(commit: str) -> int:
@@ -132,12 +127,12 @@ def cases(
     domain: str,
     arm: str,
     *,
-    seeds: Iterable[int],
-    strengths: Iterable[str] = ("medium",),
-    noises: Iterable[float | None] = (None,),
-    sizes: Iterable[int] = (20,),
-    effects: Iterable[str] | None = None,
-    variants: Iterable[str] | None = None,
+    seeds: Collection[int],
+    strengths: Collection[str] = ("medium",),
+    noises: Collection[float | None] = (None,),
+    sizes: Collection[int] = (20,),
+    effects: Collection[str] | None = None,
+    variants: Collection[str] | None = None,
 ) -> list[Case]:
     """Every case of an arm: what it hides × strengths × noise × number of sequences × seeds.
 
@@ -153,30 +148,26 @@ def cases(
     Raises:
         ConfigError: an unknown domain, arm or strength.
     """
-    wanted = None if effects is None else set(effects)
-    kept = None if variants is None else set(variants)
     found = []
-    seeds, noises, sizes, strengths = list(seeds), list(noises), list(sizes), list(strengths)
     for item in hides(domain, arm):
-        if wanted is not None and not wanted & set(item.effects):
+        if effects is not None and not set(effects) & set(item.effects):
             continue
-        if kept is not None and item.variant not in kept:
+        if variants is not None and item.variant not in variants:
             continue
         idle = not item.effects or arm == "no_excitation"
-        for strength in ["full"] if idle else strengths:
-            for noise in noises:
-                for size in [item.runs] if item.runs else sizes:
-                    found += [
-                        Case(
-                            domain=domain,
-                            arm=arm,
-                            effects=item.effects,
-                            variant=item.variant,
-                            strength=strength,
-                            noise=noise,
-                            n_sequences=size,
-                            seed=seed,
-                        )
-                        for seed in seeds
-                    ]
+        found += [
+            Case(
+                domain=domain,
+                arm=arm,
+                effects=item.effects,
+                variant=item.variant,
+                strength=strength,
+                noise=noise,
+                n_sequences=size,
+                seed=seed,
+            )
+            for strength, noise, size, seed in product(
+                ["full"] if idle else strengths, noises, [item.runs] if item.runs else sizes, seeds
+            )
+        ]
     return found

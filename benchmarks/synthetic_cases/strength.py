@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -140,19 +140,69 @@ def scaled(misfits: dict[str, float], factor: float) -> dict[str, float]:
     return found
 
 
-class Subject(Protocol):
-    """A case whose strength is to be set, such as ``traffic.case.TrafficCase``."""
+class Subject:
+    """A case whose strength is set: platoons or crowds with what is hidden in them.
+
+    Attributes:
+        case: what was asked for.
+        truth: coefficients of all acting effects (``effects``), the noise of drivers or walkers
+            (``amplitude``), and the shape of effects.
+        amplitude: how the noise was chosen.
+        catalogue: module with the domain's effects.
+        unit: of the noise.
+        clocks: ``(S,)`` time of the first samples, s.
+        correlation: correlation time of the noise, s.
+        walls: ``(W, 4)`` m; empty without walls.
+    """
 
     case: Case
     truth: Any
+    amplitude: Amplitude
+    catalogue: Any
+    unit: str
+    clocks: np.ndarray
+    correlation: float
+    walls: np.ndarray = np.empty((0, 4))
 
-    def misfit(self, names: list[str]) -> float: ...
+    def measured(self, truth: Any) -> np.ndarray:
+        """Measured positions, m."""
+        raise NotImplementedError
 
-    def spread(self, probe: float) -> float: ...
+    def misfit(self, names: list[str]) -> float:
+        """Mean squared misfit (m²) of the recalibrated base law to some of the effects alone."""
+        raise NotImplementedError
 
-    def costs(self, truth: Any) -> Costs: ...
+    def spread(self, probe: float) -> float:
+        """Mean squared displacement (m²) by noise of amplitude 1, probed with a smaller one."""
+        raise NotImplementedError
 
-    def rescale(self, factors: dict[str, float]) -> bool: ...
+    def costs(self, truth: Any) -> Costs:
+        """Costs on measured data."""
+        raise NotImplementedError
+
+    def columns(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        """The columns of the table, from measured positions."""
+        raise NotImplementedError
+
+    def base(self) -> dict[str, Any]:
+        """What the diagnosis is told of the base ``model``, and its true parameters, ``base``."""
+        raise NotImplementedError
+
+    def more(self) -> dict[str, Any]:
+        """Further entries of the truth."""
+        raise NotImplementedError
+
+    def rescaled(self, name: str, values: dict[str, float], factor: float) -> dict[str, float]:
+        """An effect's coefficients with its size times a factor, as far as its range goes."""
+        raise NotImplementedError
+
+    def rescale(self, factors: dict[str, float]) -> bool:
+        """Scale effects as far as their ranges go; whether anything changed."""
+        effects = self.truth.effects
+        scaled = {name: self.rescaled(name, effects[name], f) for name, f in factors.items()}
+        changed = {**effects, **scaled}
+        self.truth = replace(self.truth, effects=changed)
+        return bool(changed != effects)
 
 
 def set_strength(subject: Subject, rng: np.random.Generator, limits: Range) -> Amplitude:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from benchmarks.synthetic_cases.case import STRENGTHS, Case, check_effects
+from benchmarks.synthetic_cases.crowd import catalogue
 from benchmarks.synthetic_cases.crowd.catalogue import EFFECTS, Coefficients
 from benchmarks.synthetic_cases.crowd.motion import Base, Hidden, simulate
 from benchmarks.synthetic_cases.crowd.replay import Windows, cost_by_sequence
 from benchmarks.synthetic_cases.crowd.scene import BURN_IN, SUBSTEPS, Scene, set_scene
-from benchmarks.synthetic_cases.strength import Amplitude, Costs, Range, set_strength
+from benchmarks.synthetic_cases.strength import Amplitude, Costs, Range, Subject, set_strength
 
 #: Standard deviation of people's accelerations, m/s².
 AMPLITUDES = Range(preferred=(0.02, 0.15), extreme=(0.005, 0.35), idle=(0.04, 0.15), probe=0.02)
@@ -51,7 +53,7 @@ class Truth:
         return self.effects.get("walker_heterogeneity", {}).get("sigma", 0.0)
 
 
-class CrowdCase:
+class CrowdCase(Subject):
     """A case of crowds: draws what is hidden, sets its strength, and measures.
 
     Args:
@@ -59,10 +61,7 @@ class CrowdCase:
         truth: what acts, where it is known already; None draws it.
 
     Attributes:
-        case: what was asked for.
-        truth: what acts.
-        scene: where it acts.
-        amplitude: how people's noise was chosen.
+        scene: the people and the corridor.
 
     Raises:
         ConfigError: an effect that crowds do not know.
@@ -70,8 +69,10 @@ class CrowdCase:
 
     def __init__(self, case: Case, truth: Truth | None = None) -> None:
         check_effects(case, EFFECTS)
-        self.case = case
+        self.case, self.catalogue, self.unit = case, catalogue, "m/s²"
         self.scene: Scene = set_scene(case)
+        self.clocks, self.correlation = self.scene.clocks, self.scene.correlation
+        self.walls = self.scene.segments
         self._some = list(range(min(_SOME, case.n_sequences)))
         if truth is not None:
             self.truth = truth
@@ -112,21 +113,34 @@ class CrowdCase:
         )
         return x[:, burn:], v[:, burn:]
 
-    def measured(self, x: np.ndarray) -> np.ndarray:
-        """Positions with the error of their measurement, m."""
-        return np.asarray(x + self.case.sigma * self.scene.error)
+    def measured(self, truth: Truth) -> np.ndarray:
+        """``(S, K + 1, N, 2)`` positions with the error of their measurement, m."""
+        return np.asarray(self.simulate(truth)[0] + self.case.sigma * self.scene.error)
 
-    def rescale(self, factors: dict[str, float]) -> bool:
-        """Scale effects as far as their ranges go; whether anything changed."""
-        changed = dict(self.truth.effects)
-        for name, factor in factors.items():
-            changed[name] = EFFECTS[name].rescaled(changed[name], factor)
-        same = changed == self.truth.effects
-        self.truth = replace(self.truth, effects=changed)
-        return not same
+    def columns(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        scene, runs = self.scene, np.array(self.case.runs)[:, None]
+        group = np.char.add(runs, np.char.add("g", scene.group.astype(str)))
+        return {
+            "x": np.round(x[..., 0], 5),
+            "y": np.round(x[..., 1], 5),
+            "group": np.where(scene.group < 0, "", group),
+            "dest_x": np.round(scene.goal[..., 0], 4),
+            "dest_y": np.round(scene.goal[..., 1], 4),
+        }
+
+    def base(self) -> dict[str, Any]:
+        base = self.scene.base
+        options = {"B": base.B, "r": base.r, "tau": base.tau}
+        parameters = {"A": base.A, "k": base.k, "kappa": base.kappa}
+        return {"model": {"name": "sf", "options": options}, "base": parameters}
+
+    def more(self) -> dict[str, Any]:
+        return {"eta": np.round(self.scene.eta, 6).tolist() if self.truth.eta else []}
+
+    def rescaled(self, name: str, values: Coefficients, factor: float) -> Coefficients:
+        return EFFECTS[name].rescaled(values, factor)
 
     def misfit(self, names: list[str]) -> float:
-        """Mean squared misfit (m²) of the recalibrated base law to some of the effects alone."""
         kept = {k: v for k, v in self.truth.effects.items() if k in names}
         some = self.scene.only(self._some)
         x, v = self.simulate(replace(self.truth, effects=kept, amplitude=0.0), some)
@@ -135,16 +149,14 @@ class CrowdCase:
         return float(cost_by_sequence(error).mean())
 
     def spread(self, probe: float) -> float:
-        """Mean squared displacement (m²) by noise of 1 m/s², probed with a smaller one."""
         truth, some = replace(self.truth, amplitude=probe), self.scene.only(self._some)
         x, v = self.simulate(truth, some)
         windows = Windows(some, x, v, x, self.case.dt)
         return float(self._oracle(windows, truth).mean()) / probe**2
 
     def costs(self, truth: Truth) -> Costs:
-        """Costs on measured data."""
         x, v = self.simulate(truth)
-        measured = self.measured(x)
+        measured = x + self.case.sigma * self.scene.error
         windows = Windows(self.scene, x, v, measured, self.case.dt)
         base: Base = windows.recalibrated(self.scene.base)
         floor = float(((measured - x) ** 2).sum(-1).mean())

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from benchmarks.synthetic_cases.case import Case, check_effects
-from benchmarks.synthetic_cases.strength import Amplitude, Costs, Range, set_strength
+from benchmarks.synthetic_cases.strength import Costs, Range, Subject, set_strength
+from benchmarks.synthetic_cases.traffic import catalogue
 from benchmarks.synthetic_cases.traffic.catalogue import (
     EFFECTS,
     SMOOTH_EDGE,
@@ -67,14 +69,11 @@ class Motion:
     past: tuple[np.ndarray, np.ndarray]
 
 
-class TrafficCase:
+class TrafficCase(Subject):
     """A case of traffic: draws what is hidden, sets its strength, and measures.
 
     Attributes:
-        case: what was asked for.
-        truth: what acts.
-        road: where it acts.
-        amplitude: how the drivers' noise was chosen.
+        road: the vehicles and their leaders.
 
     Raises:
         ConfigError: an effect that traffic does not know.
@@ -82,7 +81,7 @@ class TrafficCase:
 
     def __init__(self, case: Case) -> None:
         check_effects(case, EFFECTS)
-        self.case = case
+        self.case, self.catalogue, self.unit = case, catalogue, "m/s"
         rng = case.generator("effects")
         around = surroundings(case, late=0.0)
         effects = {name: EFFECTS[name].draw(rng, around) for name in case.effects}
@@ -95,13 +94,27 @@ class TrafficCase:
         if case.variant == "smooth":
             edge = float(rng.uniform(*SMOOTH_EDGE[case.effects[0]]))
         self.road: Road = lay_out(case, around)
+        self.clocks, self.correlation = around.clocks, self.road.correlation
         self.truth = Truth(effects, edge=edge)
         self._keep_stable()
-        self.amplitude: Amplitude = set_strength(self, rng, AMPLITUDES)
+        self.amplitude = set_strength(self, rng, AMPLITUDES)
 
-    def measured(self, motion: Motion) -> np.ndarray:
+    def measured(self, truth: Truth) -> np.ndarray:
         """``(S, K + 1, N)`` positions with the error of their measurement, m."""
-        return motion.x + self.case.sigma * self.road.error
+        return self.simulate(truth).x + self.case.sigma * self.road.error
+
+    def columns(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        length, kind = np.round(self.road.length, 2), np.where(self.road.truck, "truck", "car")
+        return {"x": np.round(x, 4), "length": length, "kind": kind}
+
+    def base(self) -> dict[str, Any]:
+        around = self.road.around
+        leader = "constant" if "leader_speed" in self.case.effects else "measured"
+        model = {"name": around.law, "leader": leader, "options": {}}
+        return {"model": model, "base": {"v0": around.v0, "L": around.L}}
+
+    def more(self) -> dict[str, Any]:
+        return {"edge": self.truth.edge}
 
     def own(self, truth: Truth) -> np.ndarray:
         """``(S, N)`` factor on W of each vehicle."""
@@ -186,38 +199,28 @@ class TrafficCase:
         if factor < 1:
             self.rescale({name: factor for name, _ in late})
 
-    def rescale(self, factors: dict[str, float]) -> bool:
-        """Scale effects as far as their ranges go; whether anything changed."""
-        changed = dict(self.truth.effects)
-        for name, factor in factors.items():
-            rescaled = EFFECTS[name].rescaled
-            if factor == 1.0:
-                continue
-            if name in dict(_LATE):
-                # it is as large as stability lets it be
-                factor = min(factor, 1.0)
-            if rescaled is not None:
-                changed[name] = rescaled(changed[name], factor, self.road.around)
-        same = changed == self.truth.effects
-        self.truth = replace(self.truth, effects=changed)
-        return not same
+    def rescaled(self, name: str, values: Coefficients, factor: float) -> Coefficients:
+        rescaled = EFFECTS[name].rescaled
+        if name in dict(_LATE):
+            # it is as large as stability allows
+            factor = min(factor, 1.0)
+        if rescaled is None or factor == 1.0:
+            return values
+        return rescaled(values, factor, self.road.around)
 
     def misfit(self, names: list[str]) -> float:
-        """Mean squared misfit (m²) of the recalibrated base law to some of the effects alone."""
         kept = {k: v for k, v in self.truth.effects.items() if k in names}
         motion = self.simulate(replace(self.truth, effects=kept, amplitude=0.0))
         return float(self.base_cost(motion.x)[0].mean())
 
     def spread(self, probe: float) -> float:
-        """Mean squared displacement (m²) by noise of 1 m/s, probed with a smaller one."""
         truth = replace(self.truth, amplitude=probe)
         motion = self.simulate(truth)
         return float(self.oracle_cost(motion.x, motion, truth).mean()) / probe**2
 
     def costs(self, truth: Truth) -> Costs:
-        """Costs on measured data."""
         motion = self.simulate(truth)
-        x = self.measured(motion)
+        x = motion.x + self.case.sigma * self.road.error
         base, (v0, L) = self.base_cost(x)
         oracle = self.oracle_cost(x, motion, truth)
         floor = float(np.mean((x - motion.x)[:, :, :-1] ** 2))

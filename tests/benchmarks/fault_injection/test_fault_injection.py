@@ -76,7 +76,9 @@ def test_a_reader_that_misbehaves_is_a_loss(
     assert "KeyError" in words
     assert f"did open {outside}" in words
     assert "MemoryError" in words
-    assert len(found.losses) == 16 - found.read + sum("did open" in w for w in found.losses)
+    assert len(found.losses) == 16 - found.facts["read"] + sum(
+        "did open" in w for w in found.losses
+    )
 
 
 def test_the_jobs_are_asked_for_in_words_that_the_scripts_know(tmp_path: Path) -> None:
