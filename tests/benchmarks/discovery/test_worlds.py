@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from benchmarks.discovery.tables import share
 from benchmarks.discovery.worlds import Answer, allowed, criteria
 from benchmarks.programs.sumo import STEP
 from benchmarks.synthetic_cases.laws import RANGES
+from nnode.app import discover
 from nnode.app.nearest_law import LAWS
 from nnode.model.effects import CATALOGUE
 
@@ -105,6 +107,16 @@ def test_shares_are_counted_by_program() -> None:
     assert table.loc["laws", "false name"].startswith("3 of 7")
     assert table.loc["sumo", "right law ranks first"].startswith("0 of 1")
     assert len(worlds.blocks(rows)) == 3
+
+
+def test_a_world_of_a_law_is_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = {**report(("memory",)), "laws_again": None}
+    said["laws"] = {"ranking": [{"name": "lin", "behind": 0.0, "p_value": None}]}
+    answer = SimpleNamespace(plain=lambda: said, nearest=None)
+    monkeypatch.setattr(discover, "diagnose_table", lambda *given, **options: answer)
+    row = worlds.evaluate("laws", "lin", 5, "lin")
+    assert (row["law_right"], row["false"], row["asked_false"]) == (True, ["memory"], ["memory"])
+    assert (row["behind"], row["p"]) == (0.0, None)
 
 
 def test_shares_have_exact_intervals() -> None:
