@@ -41,14 +41,7 @@ def cases(kind: str, options: DiscoveryBenchmarkOptions, first: int) -> dict[str
                 f"{', '.join(sorted(known))}"
             )
     baselines = range(first, first + options.baseline_seeds)
-    missing = [name for name in ("pysindy", "sklearn") if find_spec(name) is None]
-    if baselines and missing:
-        raise ConfigError(
-            f"benchmark_discovery.baseline_seeds={options.baseline_seeds} needs "
-            f"{' and '.join(missing)}: install pysindy and scikit-learn (the extra bench), or give "
-            "0 for no baselines"
-        )
-    return {
+    found = {
         case.key: {
             "case": case.to_dict(),
             "baselines": case.seed in baselines,
@@ -68,6 +61,14 @@ def cases(kind: str, options: DiscoveryBenchmarkOptions, first: int) -> dict[str
             variants=options.variants,
         )
     }
+    missing = [name for name in ("pysindy", "sklearn") if find_spec(name) is None]
+    if missing and any(arguments["baselines"] for arguments in found.values()):
+        raise ConfigError(
+            f"benchmark_discovery.baseline_seeds={options.baseline_seeds} needs "
+            f"{' and '.join(missing)}: install pysindy and scikit-learn (the extra bench), or give "
+            "0 for no baselines"
+        )
+    return found
 
 
 def _number_of_seeds(arm: str) -> str:
