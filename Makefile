@@ -22,7 +22,7 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-# What takes long beside it: runs that are stopped and gone on with, compiled twice, shared, tortured.
+# What takes long beside it: runs that are stopped and gone on with, compiled twice, shared, or interrupted by injected faults.
 thorough: setup
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 -m thorough
 

@@ -50,8 +50,16 @@ class BenchmarkConfig:
 
 @dataclass
 class DiscoveryBenchmarkOptions:
-    """Which truths ``scripts/benchmark_discovery.py`` hides, how strongly, in how much data."""
+    """The cases of ``scripts/benchmark_discovery.py``, see :mod:`benchmarks.discovery.run`."""
 
+    # synthetic | rules (synthetic cases under changed rules) | advice | laws | sumo | jupedsim
+    # | recovery (parameters that are typed into programs, one case each)
+    kinds: list[str] = field(default_factory=lambda: ["synthetic"])
+    seeds: int = 10  # per effect, pair or fault, per law or scene
+    first_seed: int = 0  # of the cases, while rules may still change
+    # full hash of the commit that froze the rules; seeds follow from it
+    seeds_of: str | None = None
+    # of synthetic cases
     domains: list[str] = field(default_factory=lambda: ["traffic", "crowd"])  # or one of them
     # what is hidden: single | pair | nothing | outside | near_miss | no_excitation | fault;
     # null: all
@@ -59,17 +67,13 @@ class DiscoveryBenchmarkOptions:
     effects: list[str] | None = None  # null: all; else only cases that hide one of these
     # null: all; of nothing: white | autocorrelated | windows | heterogeneous | recording
     variants: list[str] | None = None
-    seeds: int = 10  # per effect, pair or fault
     nothing_seeds: int = 400  # per variant of nothing
-    first_seed: int = 0  # of the cases, while rules may still change
-    # full hash of the commit that froze the rules; seeds follow from it
-    seeds_of: str | None = None
     strengths: list[str] = field(default_factory=lambda: ["medium"])  # weak medium strong full
     noises: list[float] | None = None  # m; null: 0.05 in traffic, 0.01 in crowds
     sizes: list[int] = field(default_factory=lambda: [20])  # numbers of platoons or crowds
-    structure: bool = True  # look for what has no name too; without, nothing is unknown
-    fresh: int = 0  # sequences of the same truth that are kept back, to try what was named on them
-    peer_seeds: int = 3  # per effect, pair, ...: regressions on the diagnosis's library beside it
+    structure: bool = True  # search for structure without a name too; else nothing is unknown
+    fresh: int = 0  # further sequences of the same truth, on which the named effects are tested
+    baseline_seeds: int = 3  # per effect, pair, ...: regressions on the same columns
     workers: int | None = None  # processes; null: one per core
     # address of a Dask scheduler, such as tcp://host:8786, whose workers do the work instead
     cluster: str | None = None
@@ -77,7 +81,7 @@ class DiscoveryBenchmarkOptions:
 
 @dataclass
 class DiscoveryBenchmarkConfig:
-    """``scripts/benchmark_discovery.py``: the diagnosis against hidden truths."""
+    """``scripts/benchmark_discovery.py``: the diagnosis on cases with a known truth."""
 
     benchmark_discovery: DiscoveryBenchmarkOptions = field(
         default_factory=DiscoveryBenchmarkOptions
@@ -85,13 +89,13 @@ class DiscoveryBenchmarkConfig:
 
 
 @dataclass
-class TortureConfig:
-    """``scripts/torture.py``: misuse on purpose."""
+class FaultInjectionConfig:
+    """``scripts/fault_injection.py``: misuse on purpose."""
 
     # what is tried: kills | disk | folder | fuzz
     campaigns: list[str] = field(default_factory=lambda: ["kills", "disk", "folder", "fuzz"])
     kills: int = 200  # over all jobs
-    jobs: list[str] | None = None  # scripts that are tortured; null: all that keep results
+    jobs: list[str] | None = None  # scripts that are tested; null: all that keep results
     repeats: int = 4  # second runs in a folder, per job
     inputs: int = 104000  # malformed files over all targets
     targets: list[str] | None = None  # what is given them; null: every reader and loader
@@ -101,7 +105,7 @@ class TortureConfig:
 SCHEMAS = {
     "benchmark_schema": BenchmarkConfig,
     "benchmark_discovery_schema": DiscoveryBenchmarkConfig,
-    "torture_schema": TortureConfig,
+    "fault_injection_schema": FaultInjectionConfig,
 }
 
 

@@ -12,7 +12,6 @@ last counts them.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import time
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,10 @@ import numpy as np
 import pandas as pd
 
 import nnode
+from benchmarks.discovery.run import sources
 from nnode.discover.options import DiscoverOptions
+from nnode.files import write_text
+from studies.runner import Task, run_tasks
 
 #: s, step and sampling interval, s.
 SECONDS, STEP, DT = 30.0, 0.02, 0.2
@@ -223,8 +225,8 @@ def cases(
     return found
 
 
-def diagnosed(case: dict[str, Any]) -> dict[str, Any]:
-    """The case with what was said of it."""
+def diagnosed(**case: Any) -> dict[str, Any]:
+    """The case with its diagnosis."""
     begun, table = time.monotonic(), platoons(**case)
     found = nnode.diagnose(
         table,
@@ -301,7 +303,6 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--table", type=Path, default=Path("runs/benchmark_drivers.csv"))
     given = parser.parse_args()
-    given.table.parent.mkdir(parents=True, exist_ok=True)
     chosen = cases(
         given.seed,
         given.cases,
@@ -313,17 +314,23 @@ def main() -> None:
         pairs=given.pairs,
         nature=given.nature,
     )
-    rows: list[dict[str, Any]] = []
-    with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
-        for row in pool.imap(diagnosed, chosen):
-            rows.append(row)
-            pd.DataFrame(rows).to_csv(given.table, index=False)
-            print(" ".join(f"{k}={v}" for k, v in row.items()), flush=True)
-    table = pd.DataFrame(rows)
+    tasks = [
+        Task(f"{case['law']}-{case['effect']}-s{case['seed']}", diagnosed, case) for case in chosen
+    ]
+    folder = given.table.with_suffix("")
+    results = run_tasks(
+        tasks, folder, workers=given.processes, fingerprint=sources(), title="cases"
+    )
+    table = pd.DataFrame(list(results.values()))
+    print(table.to_string(index=False))
+    write_text(given.table, str(table.to_csv(index=False)))
     counts = table.groupby(["law", table.effect != "none"])[["exact", "among", "false"]]
     print(counts.agg(["sum", "count"]).to_string())
     print(f"table: {given.table}")
 
 
 if __name__ == "__main__":
-    main()
+    # worker processes import the functions by the name of this module
+    from benchmarks import drivers
+
+    drivers.main()

@@ -1,4 +1,4 @@
-"""Hide effects in synthetic data, diagnose, and score against the truth.
+"""Diagnose cases with a known truth, and score the diagnosis.
 
 Examples:
   # everything: hours
@@ -15,8 +15,13 @@ Examples:
       'benchmark_discovery.variants=[white,windows]' benchmark_discovery.nothing_seeds=400 \\
       benchmark_discovery.seeds_of=0000000000000000000000000000000000000000
 
-Results: a page with tables of what was found, missed and invented, over all cases that the folder
-holds. The same command goes on where it was stopped.
+  # laws written by hand and scenes of SUMO and JuPedSim; advice; parameters typed into programs
+  python scripts/benchmark_discovery.py 'benchmark_discovery.kinds=[laws,sumo,jupedsim]' \\
+      benchmark_discovery.seeds=2
+  python scripts/benchmark_discovery.py 'benchmark_discovery.kinds=[advice,recovery]'
+
+Results: a page with tables over all cases that the folder holds. The same command continues a
+stopped run.
 """
 
 import sys

@@ -7,13 +7,16 @@ share agents or time, and are resampled together.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from nnode.calibrate.resampling import DRAWS, group_weights, paired
-from studies.runner import Task
+from nnode.data.store import Store
+from studies.options import StudyOptions
+from studies.runner import Task, hash_of, run_tasks
 
 
 def tidy(tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
@@ -24,6 +27,27 @@ def tidy(tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]]) -> pd.
             for t in tasks
         ]
     )
+
+
+def computed(
+    tasks: list[Task], folder: Path, options: StudyOptions, stores: Mapping[str, Store], title: str
+) -> pd.DataFrame:
+    """The :func:`tidy` results of all tasks, which read some prepared data.
+
+    Raises:
+        Interrupted, StudyError: as :func:`studies.runner.run_tasks`.
+    """
+    results = run_tasks(
+        tasks, folder, workers=options.workers or 1, fingerprint=hash_of(stores), title=title
+    )
+    return tidy(tasks, results)
+
+
+def labelled(rows: Mapping[tuple[Any, ...], Mapping[str, Any]], *names: str) -> pd.DataFrame:
+    """A table of rows by labels of several levels."""
+    found = pd.DataFrame.from_dict(dict(rows), orient="index")
+    found.index = pd.MultiIndex.from_tuples(list(rows), names=names)
+    return found
 
 
 def by_unit(
@@ -71,9 +95,8 @@ def differences(costs: pd.DataFrame, pairs: Iterable[tuple[str, str]], seed: int
                 "difference": a.mean() - b.mean(),
                 "better": float((a < b).mean()),
             }
-    found = pd.DataFrame.from_dict(rows, orient="index")
-    found.index = pd.MultiIndex.from_tuples(list(rows), names=["first", "second"])
-    return found.reindex(columns=["difference", "low", "high", "p", "better"])
+    columns = ["difference", "low", "high", "p", "better"]
+    return labelled(rows, "first", "second").reindex(columns=columns)
 
 
 def versus(costs: pd.DataFrame, reference: str, seed: int) -> pd.DataFrame:

@@ -57,8 +57,13 @@ def with_line(file: str, line: str, folder: Path) -> subprocess.CompletedProcess
         ),
         ("nnode/simulation/base.py", "from nnode import load", "nnode.simulation", "nnode.app"),
         ("nnode/errors.py", "import nnode.files", "nnode.errors", "nnode.files"),
-        ("nnode/errors.py", "import benchmarks.truths", "nnode", "benchmarks"),
-        ("benchmarks/truths/case.py", "import nnode.model", "benchmarks.truths", "nnode.model"),
+        ("nnode/errors.py", "import benchmarks.synthetic_cases", "nnode", "benchmarks"),
+        (
+            "benchmarks/synthetic_cases/case.py",
+            "import nnode.model",
+            "benchmarks.synthetic_cases",
+            "nnode.model",
+        ),
         (
             "benchmarks/config.py",
             "import benchmarks.speed",
@@ -79,7 +84,11 @@ def test_a_wrong_import_is_found(
     ("file", "line", "folder"),
     [
         ("nnode/data/sequence.py", "import nnode.data.store", "nnode.data"),
-        ("benchmarks/torture/child.py", "import benchmarks.torture.jobs", "benchmarks.torture"),
+        (
+            "benchmarks/fault_injection/child.py",
+            "import benchmarks.fault_injection.jobs",
+            "benchmarks.fault_injection",
+        ),
     ],
 )
 def test_a_circle_is_found(file: str, line: str, folder: str, tmp_path: Path) -> None:

@@ -17,13 +17,15 @@ ROOT = Path(__file__).parents[1]
     ("name", "typed"),
     [
         ("train", "nnode train model=lin 'data.path=my file.csv'"),
-        ("torture", "python scripts/torture.py model=lin 'data.path=my file.csv'"),
-        ("", "python scripts/torture.py model=lin 'data.path=my file.csv'"),
+        ("fault_injection", "python scripts/fault_injection.py model=lin 'data.path=my file.csv'"),
+        ("", "python scripts/fault_injection.py model=lin 'data.path=my file.csv'"),
     ],
 )
 def test_the_command_that_runs(monkeypatch: pytest.MonkeyPatch, name: str, typed: str) -> None:
     monkeypatch.setattr(program, "_running", name)
-    monkeypatch.setattr(sys, "argv", ["scripts/torture.py", "model=lin", "data.path=my file.csv"])
+    monkeypatch.setattr(
+        sys, "argv", ["scripts/fault_injection.py", "model=lin", "data.path=my file.csv"]
+    )
     assert program.command_line() == typed
 
 
@@ -40,7 +42,7 @@ def test_the_program_lists_its_commands(
     said = capsys.readouterr().out
     commands = {line.split()[0] for line in said.splitlines() if line.startswith("  ")} & scripts
     assert commands == {path.stem for path in program.COMMANDS.glob("[a-z]*.py")}
-    assert scripts - commands == {"benchmark", "benchmark_discovery", "torture"}
+    assert scripts - commands == {"benchmark", "benchmark_discovery", "fault_injection"}
     assert max(len(line) for line in said.splitlines()) <= 100
     monkeypatch.setattr(sys, "argv", ["nnode", "discovr"])
     with pytest.raises(SystemExit) as left:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.torture.child import Child
+from benchmarks.fault_injection.child import Child
 from nnode import progress
 from nnode.calibrate.progress import Reporter
 from nnode.progress import Stages

@@ -152,10 +152,10 @@ def test_an_index_can_show_what_the_wheel_says_of_itself(wheel: Path) -> None:
     targets = re.findall(r"\]\(([^)]+)\)", page)
     assert [target for target in targets if not target.startswith(("https://", "#"))] == []
     assert not [n for n in names if n.startswith(("benchmarks", "scripts", "tests", "setup"))]
-    assert not [n for n in names if "benchmark" in n or "torture" in n]
+    assert not [n for n in names if "benchmark" in n or "fault_injection" in n]
     shipped = {n for n in names if n.startswith("nnode/conf/")}
     ours = {f"nnode/conf/{p.relative_to(ROOT / 'conf')}" for p in (ROOT / "conf").rglob("*.yaml")}
-    assert {n for n in ours if "benchmark" not in n and "torture" not in n} == shipped
+    assert {n for n in ours if "benchmark" not in n and "fault_injection" not in n} == shipped
     laws = {f"nnode/model/laws/{p.name}" for p in (ROOT / "nnode/model/laws").glob("*.yaml")}
     assert laws
     assert laws <= set(names)

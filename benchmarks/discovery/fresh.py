@@ -1,4 +1,4 @@
-"""Sequences of the same truth that a diagnosis never had: does what it named predict them?"""
+"""Sequences of the same truth that a diagnosis did not have: do the named effects predict them?"""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from benchmarks.truths.measure import closure
+from benchmarks.synthetic_cases.score import closure
 from nnode.app.python.report import Report
 from nnode.data.options import Faults
 from nnode.data.readers.table import TableOptions
@@ -34,9 +34,13 @@ def kept_back(table: Path, number: int) -> pd.DataFrame:
 def on_fresh(
     fresh: pd.DataFrame, report: Report, truth: dict[str, Any], domain: str, walls: Path | None
 ) -> dict[str, Any]:
-    """``fresh_before`` and ``fresh_after``, mean square errors of positions by the base model and
-    with what was named, m²; ``fresh_worse``; ``fresh_closure``: of what the truth removes. None
-    where nothing was named, or numbers of agents, whom nobody has seen before."""
+    """The base model and the extended model on further sequences.
+
+    Returns:
+        ``fresh_before`` and ``fresh_after``, mean square errors of positions of both, m²;
+        ``fresh_worse``; ``fresh_closure``, relative to the truth. None where nothing was named, or
+        an effect with a number per agent, because these agents are new.
+    """
     nothing = dict.fromkeys(("fresh_before", "fresh_after", "fresh_worse", "fresh_closure"))
     names = [effect.name for effect in report.diagnosis.effects]
     if not names or any(CATALOGUE.effects[name].individual for name in names):

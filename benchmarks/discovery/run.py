@@ -1,146 +1,163 @@
-"""The diagnosis against hidden truths: ``scripts/benchmark_discovery.py``."""
+"""Cases with a known truth, diagnosed or calibrated: ``scripts/benchmark_discovery.py``.
+
+A kind of cases is a module with ``cases``, the arguments of the cases that the options ask for,
+with ``evaluate``, which computes one case, and with ``blocks``, the part of the page about
+finished cases. All kinds share the runner, the seeds and the page.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import time
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
-from typing import cast
+from typing import Any, Protocol, cast
 
 from omegaconf import DictConfig, OmegaConf
 
+import nnode
 from benchmarks.config import DiscoveryBenchmarkOptions
-from benchmarks.discovery.page import SUBTITLE, TITLE, blocks_of
-from benchmarks.discovery.task import diagnose_case, sources, task_of
-from benchmarks.truths import ARMS, Case
-from benchmarks.truths.arms import cases, first_seed, hides
+from benchmarks.synthetic_cases.arms import first_seed
 from nnode.errors import ConfigError
-from nnode.machine import cores
-from nnode.pages.page import write_page
+from nnode.machine import cores, how_made
+from nnode.pages.page import Block, Provenance, write_page
 from studies.cluster import on_cluster
-from studies.runner import kept_results, run_tasks
+from studies.runner import Task, kept_results, run_tasks
 
-#: The arm that needs many cases: it shows how often something is named where nothing is hidden.
-_NOTHING = "nothing"
+#: Modules of this folder by the kinds of cases.
+KINDS = {
+    "synthetic": "synthetic",
+    "rules": "rules",
+    "advice": "advice",
+    "laws": "worlds",
+    "sumo": "worlds",
+    "jupedsim": "worlds",
+    "recovery": "recovery",
+}
+#: Folders on which a result depends: it is computed again when they have changed.
+_FOLDERS = (
+    "benchmarks/discovery",
+    "benchmarks/programs",
+    "benchmarks/synthetic_cases",
+    *(f"nnode/{name}" for name in ("app", "calibrate", "data", "discover", "model")),
+    *(f"nnode/{name}" for name in ("population", "simulation")),
+)
+_PACKAGES = ("torch", "numba", "numpy", "scipy", "scikit-learn", "pysindy")
+
+
+class Kind(Protocol):
+    """A module of :data:`KINDS`."""
+
+    @staticmethod
+    def cases(kind: str, options: DiscoveryBenchmarkOptions, first: int) -> dict[str, Any]:
+        """Arguments by the case's unique key; ``first`` is the first seed."""
+        ...
+
+    @staticmethod
+    def evaluate(**arguments: Any) -> dict[str, Any]:
+        """The row of one case, plain JSON."""
+        ...
+
+    @staticmethod
+    def blocks(rows: list[dict[str, Any]]) -> list[Block]:
+        """The part of the page about some rows."""
+        ...
+
+
+def module_of(kind: str) -> Kind:
+    """The module of a kind.
+
+    Raises:
+        ConfigError: an unknown kind.
+    """
+    if kind not in KINDS:
+        raise ConfigError(f"benchmark_discovery.kinds: expected some of {', '.join(KINDS)}")
+    return cast(Kind, import_module(f"benchmarks.discovery.{KINDS[kind]}"))
 
 
 def benchmark_discovery(config: DictConfig, folder: Path) -> None:
-    """Generate, diagnose and score all cases, write the page, and print where it is.
+    """Compute all cases, write the page, and print where it is.
 
     The page shows all cases of the same origin of seeds (a commit, or none) that the folder holds,
     those of earlier runs of the same code too.
 
     Raises:
-        ConfigError: unknown domains, arms, variants or effects, no hash of a commit, no case, or
-            the peers' packages are not installed.
+        ConfigError: unknown names, an invalid hash of a commit, no case, or packages are missing.
         StudyError: tasks failed.
-        Interrupted: a signal asked to stop; what is done is kept.
+        Interrupted: a signal asked to stop; finished cases are kept.
     """
     options = cast(DiscoveryBenchmarkOptions, OmegaConf.to_object(config.benchmark_discovery))
-    start = time.monotonic()
-    chosen = cases_of(options)
+    start, first, code = time.monotonic(), _first(options), sources()
     workers = cores() if options.workers is None else options.workers
-    if workers < 1:
-        raise ConfigError(f"benchmark_discovery.workers={workers} must be at least 1")
-    code = sources()
-    last_of_peers = _first(options) + options.peer_seeds
-    if any(case.seed < last_of_peers for case in chosen):
-        _need_peers(options.peer_seeds)
+    if min(options.seeds, options.nothing_seeds, workers) < 1:
+        raise ConfigError("seeds, nothing_seeds and workers must be at least 1")
+    tasks = [
+        Task(key, evaluate, {"kind": kind, "seeds_of": options.seeds_of, "arguments": arguments})
+        for kind in options.kinds
+        for key, arguments in module_of(kind).cases(kind, options, first).items()
+    ]
+    if not tasks:
+        raise ConfigError("the benchmark has no case: check its domains, arms, variants, effects")
     with on_cluster(options.cluster):
-        run_tasks(
-            [
-                task_of(
-                    case,
-                    case.seed < last_of_peers,
-                    options.seeds_of,
-                    options.structure,
-                    options.fresh,
-                )
-                for case in chosen
-            ],
-            folder,
-            workers=workers,
-            fingerprint=code,
-            title="diagnoses",
-        )
+        run_tasks(tasks, folder, workers=workers, fingerprint=code, title="cases")
     rows = [
         row
-        for row in kept_results(folder, diagnose_case, code).values()
+        for row in kept_results(folder, evaluate, code).values()
         if row["seeds_of"] == options.seeds_of
     ]
-    paths = write_page(
-        blocks_of(rows, time.monotonic() - start, workers, code),
+    blocks: list[Block] = []
+    for name in dict.fromkeys(KINDS.values()):
+        part = [row for row in rows if KINDS[row["kind"]] == name]
+        if part:
+            blocks += module_of(part[0]["kind"]).blocks(part)
+    origin = "development: rules may have changed after these cases were seen"
+    if options.seeds_of is not None:
+        origin = f"from the hash of the commit that froze the rules, {options.seeds_of}"
+    seconds = time.monotonic() - start
+    facts = {
+        "Cases": f"{len(rows)}, {origin}",
+        "Code": f"digest {code}",
+        "Time": f"{seconds:.0f} s in this run with {workers} worker process(es)",
+        **how_made(_PACKAGES),
+    }
+    page, *_ = paths = write_page(
+        [*blocks, Provenance(facts)],
         folder,
-        title=TITLE,
-        subtitle=SUBTITLE,
+        title="The diagnosis on cases with a known truth",
         stem="benchmark",
     )
-    for path, what in zip(paths, ("page", "as Markdown"), strict=False):
-        print(f"{what}: {path}")
+    print(f"page: {page}")
     print(f"tables: {sum(p.suffix == '.csv' for p in paths)} CSV files in {folder}")
 
 
-def cases_of(options: DiscoveryBenchmarkOptions) -> list[Case]:
-    """The cases that the options ask for.
-
-    Raises:
-        ConfigError: unknown names, numbers that make no sense, or no case.
-    """
-    for name in ("seeds", "nothing_seeds"):
-        if getattr(options, name) < 1:
-            raise ConfigError(f"benchmark_discovery.{name} must be at least 1")
-    items = [item for domain in options.domains for arm in ARMS for item in hides(domain, arm)]
-    known = {
-        "effects": {name for item in items for name in item.effects},
-        "variants": {item.variant for item in items},
-    }
-    for name, words in known.items():
-        strange = sorted(set(getattr(options, name) or ()) - words)
-        if strange:
-            raise ConfigError(
-                f"benchmark_discovery.{name}: {strange[0]} is hidden nowhere, expected some of "
-                f"{', '.join(sorted(words))}"
-            )
-    first, found = _first(options), []
-    for domain in options.domains:
-        for arm in options.arms or list(ARMS):
-            number = options.nothing_seeds if arm == _NOTHING else options.seeds
-            found += cases(
-                domain,
-                arm,
-                seeds=range(first, first + number),
-                strengths=options.strengths,
-                noises=[None] if options.noises is None else options.noises,
-                sizes=options.sizes,
-                effects=options.effects,
-                variants=options.variants,
-            )
-    if not found:
-        raise ConfigError("the benchmark has no case: check its domains, arms, variants, effects")
-    return found
+def evaluate(kind: str, seeds_of: str | None, arguments: dict[str, Any]) -> dict[str, Any]:
+    """The row of one case of a kind."""
+    return {"kind": kind, "seeds_of": seeds_of, **module_of(kind).evaluate(**arguments)}
 
 
-def _need_peers(seeds: int) -> None:
-    """Said before the first diagnosis, not after it."""
-    missing = [name for name in ("pysindy", "sklearn") if find_spec(name) is None]
-    if missing:
-        raise ConfigError(
-            f"benchmark_discovery.peer_seeds={seeds} needs {' and '.join(missing)}: install "
-            "pysindy and scikit-learn (the extra bench), or give 0 for no peers"
-        )
+def sources() -> str:
+    """A digest of all code that takes part: kept results of other code do not hold."""
+    # the package may be installed elsewhere, the benchmarks never are
+    root = {"nnode": Path(nnode.__file__).parents[1], "benchmarks": Path(__file__).parents[2]}
+    digest = hashlib.sha256()
+    for folder in _FOLDERS:
+        top = root[folder.partition("/")[0]]
+        for path in sorted((top / folder).rglob("*.py")):
+            digest.update(path.relative_to(top).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _first(options: DiscoveryBenchmarkOptions) -> int:
     """The first seed.
 
     Raises:
-        ConfigError: given by hand beside a commit, or no full hash.
+        ConfigError: given together with a commit, or an invalid hash.
     """
     if options.seeds_of is None:
         return options.first_seed
     if options.first_seed:
         raise ConfigError(
             f"benchmark_discovery.first_seed={options.first_seed} beside seeds_of: expected one of "
-            "them, as a commit tells where its seeds begin"
+            "them, because the seeds follow from the commit"
         )
     return first_seed(options.seeds_of)

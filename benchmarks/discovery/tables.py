@@ -1,158 +1,224 @@
-"""Tables of the benchmark of the diagnosis, from one row per case."""
+"""Tables of scores, from one row per case."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from benchmarks.discovery.criteria import OTHER, headline
-from benchmarks.truths.score import UNKNOWN
+from benchmarks.synthetic_cases.score import EQUALS, ERROR, LEVEL, UNKNOWN
+
+#: Label, arms, column, bound, and whether the bound is a lower one. Values are means of a column,
+#: or medians of those in :data:`_MEDIANS`; weak effects are an arm here.
+CRITERIA: tuple[tuple[str, str, str, float, bool], ...] = (
+    ("one effect: exact name", "single", "exact", 0.92, True),
+    ("one effect: right class", "single", "class_right", 0.97, True),
+    ("two effects: both named, and nothing else", "pair", "exact", 0.85, True),
+    ("indistinguishable: the right one is listed", "single pair", "listed", 0.95, True),
+    ("one weak effect: exact name", "weak", "exact", 0.75, True),
+    ("one weak effect: any wrong name", "weak", "wrong", 0.10, False),
+    ("near misses: exact name", "near_miss", "exact", 0.92, True),
+    ("near misses: any wrong name", "near_miss", "wrong", 0.05, False),
+    ("outside the catalogue: unknown", "outside", "unknown", 0.85, True),
+    ("outside the catalogue: a wrong name", "outside", "wrong", 0.05, False),
+    ("no excitation: not testable recognised", "no_excitation", "right", 0.90, True),
+    ("faults of the data: located", "fault", "located", 0.95, True),
+    ("sequences without faults: blamed", "", "blamed", 0.05, False),
+    ("coefficients: median relative error", "single pair", "relative", 0.05, False),
+    ("intervals of 95 %: cover", "single pair", "covered", 0.90, True),
+    ("zones and periods: median overlap", "single pair", "overlap", 0.7, True),
+    ("closure on confirmation sequences, median", "single pair", "closure", 0.95, True),
+    ("higher cost on confirmation sequences", "", "worse", 0.02, False),
+    ("closure on further sequences, median", "single pair", "fresh_closure", 0.95, True),
+    ("higher cost on further sequences", "single pair", "fresh_worse", 0.02, False),
+)
+_MEDIANS = ("relative", "overlap", "closure", "fresh_closure")
+#: A test keeps its level where the one-sided test against it is not rejected at this probability.
+REJECTED = 0.025
+
+
+def share(which: pd.Series) -> str:
+    """A proportion with its exact interval of 95 % (Clopper & Pearson 1934)."""
+    number, of = int(which.sum()), len(which)
+    if not of:
+        return "–"
+    low, high = binomtest(number, of).proportion_ci()
+    return f"{number} of {of} ({100 * number / of:.0f} %, {100 * low:.0f}–{100 * high:.0f} %)"
 
 
 def frame_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """One line per case; lists and rows of coefficients are left out."""
-    plain = [{k: v for k, v in row.items() if not isinstance(v, list | dict)} for row in rows]
-    frame = pd.DataFrame(plain)
+    """One row per case without lists, with the columns that the tables need."""
+    frame = pd.DataFrame(
+        [{k: v for k, v in row.items() if not isinstance(v, list | dict)} for row in rows]
+    )
     frame["false_names"] = ["+".join(row["false_names"]) for row in rows]
-    return frame
+    named = frame["named"].str.split("+").str[0]
+    return frame.assign(
+        wrong=frame["false_names"] != "",
+        hypothesis=frame["leads"] != "",
+        blamed=frame["faults_false"] > 0,
+        failed=frame["verdict"] == ERROR,
+        nothing=frame["named"] == "nothing",
+        listed=frame["among_equals"].where(frame["verdict"] == EQUALS),
+        located=frame["faults_located"] / frame["faults_hidden"].where(frame["faults_hidden"] > 0),
+        first=named.where((named != "nothing") | (frame["verdict"] == "none"), frame["verdict"]),
+    )
 
 
 def coefficients_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """One line per estimated coefficient of a hidden effect, with its case's key."""
-    found = [
-        {"key": row["key"], "domain": row["domain"], "arm": row["arm"], **item}
-        for row in rows
-        for item in row["coefficients"]
-    ]
-    columns = ["key", "domain", "arm", "effect", "coefficient", "true", "value", "low", "high"]
-    columns += ["absolute", "relative", "of_size", "covered"]
-    return pd.DataFrame(found, columns=columns)
+    """One row per estimated coefficient of a hidden effect, with its case's columns."""
+    kept = ("key", "domain", "arm", "strength", "noise", "n_sequences")
+    found = [{**{k: row[k] for k in kept}, **item} for row in rows for item in row["coefficients"]]
+    columns = [*kept, "effect", "coefficient", "true", "value", "low", "high"]
+    return pd.DataFrame(found, columns=[*columns, "absolute", "relative", "of_size", "covered"])
 
 
-def interval(right: pd.Series) -> str:
-    """Interval of 95 % of a share, after Clopper and Pearson (1934), in percent."""
-    limits = binomtest(int(right.sum()), len(right)).proportion_ci()
-    return f"{100 * limits.low:.0f}–{100 * limits.high:.0f}"
+def summary(
+    frame: pd.DataFrame,
+    by: list[str],
+    shares: Mapping[str, str],
+    medians: Mapping[str, str] = {},
+) -> pd.DataFrame:
+    """Numbers of cases by group, means of columns in percent, and medians of columns.
 
-
-def by_arm(frame: pd.DataFrame) -> pd.DataFrame:
-    """Cases and shares by domain, arm, variant and strength, in percent."""
-    found = []
-    for key, part in frame.groupby(["domain", "arm", "variant", "strength"], sort=False):
-        found.append(
-            {
-                **dict(zip(("domain", "arm", "variant", "strength"), key, strict=True)),
-                "cases": len(part),
-                "right": 100 * part["right"].mean(),
-                "95 %": interval(part["right"]),
-                "any false name": 100 * (part["false_names"] != "").mean(),
-                "hypotheses": 100 * (part["leads"] != "").mean(),
-                "unknown": 100 * part["unknown"].mean(),
-                "false faults": 100 * (part["faults_false"] > 0).mean(),
-                "failed": 100 * (part["failure"] != "").mean(),
-            }
-        )
-    return pd.DataFrame(found)
-
-
-def by_effect(frame: pd.DataFrame) -> pd.DataFrame:
-    """Naming of each hidden effect or pair, in percent."""
-    asked = frame[frame["exact"].notna()]
-    found = []
-    for key, part in asked.groupby(["domain", "arm", "strength", "hidden"], sort=False):
-        found.append(
-            {
-                **dict(zip(("domain", "arm", "strength", "hidden"), key, strict=True)),
-                "cases": len(part),
-                "exact": 100 * part["exact"].astype(float).mean(),
-                "among equals": 100 * part["among_equals"].astype(float).mean(),
-                "right class": 100 * part["class_right"].astype(float).mean(),
-                "hypothesis, exact": 100 * part["lead_exact"].astype(float).mean(),
-                "any false name": 100 * (part["false_names"] != "").mean(),
-                "unknown": 100 * part["unknown"].mean(),
-                "nothing named": 100 * (part["named"] == "nothing").mean(),
-                "closure (median)": part["closure"].astype(float).median(),
-                "s (median)": part["seconds"].median(),
-            }
-        )
-    return pd.DataFrame(found)
-
-
-def by_coefficient(coefficients: pd.DataFrame) -> pd.DataFrame:
-    """Errors and coverage of each coefficient, in percent."""
-    found = []
-    for key, part in coefficients.groupby(["domain", "effect", "coefficient"], sort=False):
-        found.append(
-            {
-                **dict(zip(("domain", "effect", "coefficient"), key, strict=True)),
-                "estimates": len(part),
-                "relative error (median)": 100 * part["relative"].astype(float).median(),
-                "of its size (median)": 100 * part["of_size"].astype(float).median(),
-                "absolute (median)": part["absolute"].median(),
-                "covered": 100 * part["covered"].astype(float).mean(),
-            }
-        )
-    return pd.DataFrame(found)
-
-
-def confusion(frame: pd.DataFrame, domain: str) -> pd.DataFrame:
-    """Shares of what was named first (columns) where one effect was hidden (rows).
-
-    Nothing hidden is a row as well; verdicts of unknown and unconfirmed without a name are columns.
+    Args:
+        shares, medians: columns by the heading that the table gives them.
     """
-    part = headline(frame[frame["domain"] == domain])
-    part = part[part["arm"].isin(["single", "nothing", "outside"]) & ~part["strength"].isin(OTHER)]
-    first = part["named"].str.split("+").str[0]
-    first = first.where((first != "nothing") | ~(part["verdict"] != UNKNOWN), part["verdict"])
-    hidden = part["hidden"].where(part["arm"] != "outside", "(" + part["hidden"] + ")")
-    table = pd.crosstab(hidden, first, normalize="index")
-    rows = list(dict.fromkeys(hidden))
-    columns = [name for name in rows if name in table.columns]
-    columns += [name for name in table.columns if name not in columns]
-    return table.loc[rows, columns]
+    columns = [*shares.values(), *medians.values()]
+    numbers = frame[columns].astype(float).groupby([frame[name] for name in by], sort=False)
+    return pd.DataFrame(
+        {
+            "cases": numbers.size(),
+            **{head: 100 * numbers[column].mean() for head, column in shares.items()},
+            **{head: numbers[column].median() for head, column in medians.items()},
+        }
+    ).reset_index()
 
 
-def over_noise_and_size(frame: pd.DataFrame, domain: str) -> pd.DataFrame:
-    """Share of exact names by measurement noise (rows) and number of sequences (columns)."""
-    part = frame[(frame["domain"] == domain) & (frame["arm"] == "single")]
-    part = part.assign(exact=part["exact"].astype(float))
-    return part.pivot_table(index="noise", columns="n_sequences", values="exact", aggfunc="mean")
-
-
-def by_method(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    """The diagnosis beside its peers on the same cases, by domain; empty where there are none.
-
-    Cases that hide heterogeneity are left out: it is not among the peers' columns.
-    """
-    lines = []
-    for row in rows:
-        if (
-            not row["peers"]
-            or "heterogeneity" in row["hidden"]
-            or row["variant"] == "heterogeneous"
-        ):
-            continue
-        for method, scored in {"diagnosis": row, **row["peers"]}.items():
-            lines.append({"domain": row["domain"], "arm": row["arm"], "method": method, **scored})
-    frame = pd.DataFrame(lines)
+def headline(frame: pd.DataFrame) -> pd.DataFrame:
+    """The cases with the most frequent noise and number of sequences; weak effects are an arm."""
     if frame.empty:
         return frame
-    found = []
-    for (domain, method), part in frame.groupby(["domain", "method"], sort=False):
-        asked, idle = part[part["exact"].notna()], part[part["arm"] == "nothing"]
-        closure = asked["closure"].astype(float)
+    noise, number = frame[["noise", "n_sequences"]].value_counts().index[0]
+    frame = frame[(frame["noise"] == noise) & (frame["n_sequences"] == number)]
+    weak = (frame["arm"] == "single") & (frame["strength"] == "weak")
+    shown = weak | ~frame["strength"].isin(["weak", "strong"])
+    return frame.assign(arm=frame["arm"].mask(weak, "weak"))[shown]
+
+
+def criteria(frame: pd.DataFrame, coefficients: pd.DataFrame) -> pd.DataFrame:
+    """What is required and what was reached, by domain; arms that were not run are left out."""
+    found: list[dict[str, Any]] = []
+
+    def add(measure: str, cases: int, reached: float, bound: float, at_least: bool) -> None:
         found.append(
             {
                 "domain": domain,
-                "method": method,
+                "measure": measure,
+                "required": f"{'≥' if at_least else '≤'} {bound:g}",
+                "reached": reached,
+                "cases": cases,
+                "met": bool(reached >= bound if at_least else reached <= bound),
+            }
+        )
+
+    for domain, part in frame.groupby("domain", sort=False):
+        cases, numbers = headline(part), headline(coefficients[coefficients["domain"] == domain])
+        for label, arms, column, bound, at_least in CRITERIA:
+            source = numbers if column in numbers else cases
+            if column in source:
+                chosen = source[source["arm"].isin(arms.split())] if arms else source
+                values = chosen[column].dropna().astype(float)
+                value = values.median() if column in _MEDIANS else values.mean()
+                if len(values):
+                    add(label, len(values), float(value), bound, at_least)
+        gates = level(part)
+        if len(gates):
+            gates = gates.loc[gates.groupby("variant", sort=False)["cases"].idxmax()]
+        for row in gates.to_dict("records"):
+            for gate, number in (("first screen", "screened"), ("final names", "cases")):
+                if row[number]:
+                    measure = f"nothing hidden, {row['variant']}: p of {gate} above 5 %"
+                    add(measure, row[number], row[f"{gate}, p"], REJECTED, True)
+    return pd.DataFrame(found)
+
+
+def nothing_hidden(frame: pd.DataFrame) -> pd.DataFrame:
+    """The cases with nothing hidden whose diagnosis ended."""
+    return frame[(frame["arm"] == "nothing") & (frame["verdict"] != ERROR)]
+
+
+def level(frame: pd.DataFrame) -> pd.DataFrame:
+    """Rejections by the first screen and names, by kind of nothing hidden.
+
+    Heterogeneity is no rejection and no name where agents do differ. Cases without a p-value of the
+    screen, because clusters were too few, are not screened.
+    """
+    found = []
+    keys = ["domain", "variant", "noise", "n_sequences"]
+    for key, part in nothing_hidden(frame).groupby(keys, sort=False):
+        screened, names = part["screen_false"].dropna().astype(bool), part["false_names"] != ""
+        found.append(
+            {
+                **dict(zip(("domain", "variant", "noise, m", "runs"), key, strict=True)),
+                "clusters (median)": part["clusters_open"].astype(float).median(),
                 "cases": len(part),
-                "exact": 100 * asked["exact"].astype(float).mean(),
-                "right class": 100 * asked["class_right"].astype(float).mean(),
-                "named where nothing is hidden": 100 * (idle["named"] != "nothing").mean(),
-                "closure (median)": closure.median(),
-                "worse than the base": 100 * asked["worse"].astype(float).mean(),
+                "screened": len(screened),
+                "first screen": int(screened.sum()),
+                "first screen, p": above(screened),
+                "final names": int(names.sum()),
+                "final names, p": above(names),
+                "hypotheses": int((part["leads"] != "").sum()),
+                "unknown": int((part["verdict"] == UNKNOWN).sum()),
+                "not testable": int((part["verdict"] == "not_testable").sum()),
             }
         )
     return pd.DataFrame(found)
+
+
+def above(rejected: pd.Series) -> float:
+    """The probability of so many rejections or more at :data:`LEVEL`; NaN without a case."""
+    if rejected.empty:
+        return float("nan")
+    test = binomtest(int(rejected.sum()), len(rejected), LEVEL, alternative="greater")
+    return float(test.pvalue)
+
+
+def screens(frame: pd.DataFrame, domain: str) -> dict[str, np.ndarray]:
+    """The first screen's p-values in their order, by kind of nothing hidden."""
+    part = nothing_hidden(frame)
+    part = part[(part["domain"] == domain) & part["screen_p"].notna()]
+    return {
+        str(name): np.sort(values.to_numpy(dtype=float))
+        for name, values in part.groupby("variant", sort=False)["screen_p"]
+    }
+
+
+def by_method(rows: list[dict[str, Any]]) -> pd.DataFrame:
+    """The diagnosis and the baselines on the same cases.
+
+    Cases that hide heterogeneity are left out: the baselines have no columns for it.
+    """
+    frame = pd.DataFrame(
+        [
+            {"domain": row["domain"], "method": method, **scored}
+            for row in rows
+            if row["baselines"]
+            and "heterogeneity" not in row["hidden"]
+            and row["variant"] != "heterogeneous"
+            for method, scored in {"diagnosis": row, **row["baselines"]}.items()
+        ]
+    )
+    if frame.empty:
+        return frame
+    idle = (frame["named"] != "nothing").where(frame["exact"].isna())
+    shares = {"exact": "exact", "right class": "class_right", "worse than the base": "worse"}
+    return summary(
+        frame.assign(idle=idle),
+        ["domain", "method"],
+        {**shares, "named without a hidden effect": "idle"},
+        {"closure (median)": "closure"},
+    )

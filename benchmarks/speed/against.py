@@ -1,22 +1,24 @@
-"""This checkout's compiled code and another one's: ``python -m benchmarks.speed.against``.
+"""This checkout and another one: ``python -m benchmarks.speed.against --against CHECKOUT``.
 
-Each has a process of its own that waits for its turn, so that a busy moment hits both; what is
-compared is CPU time on one thread, and the numbers must be the same up to rounding.
+Compiled code: each checkout has a process of its own that waits for its turn, so that other load
+hits both equally. CPU time on one thread is compared, and the results must be the same up to
+rounding. ``--cases diagnosis_N``: a diagnosis of N platoons of 5 vehicles over 20 s; verdicts and
+effects must be the same.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-HERE = Path(__file__).parents[2]
-#: What can be timed: shape and model, and what of it; a gradient, or tangents beside states alone.
+from benchmarks.speed.diagnosis import HERE, diagnosed, environment
+
+#: What is timed: shape, model, and a gradient, or tangents and states alone.
 CASES = {
     "sf": ("crowd", "sf", "gradient"),
     "nn": ("crowd", "nn", "gradient"),
@@ -27,7 +29,9 @@ CASES = {
     "idm_zone": ("tangents", "idm_zone", "tangents"),
     "lin_ahead": ("tangents", "lin_ahead", "tangents"),
 }
-#: Answers each line with CPU seconds and two numbers that must agree between checkouts.
+#: Prefix of the cases that are diagnoses.
+_DIAGNOSIS = "diagnosis_"
+#: Answers each line with CPU seconds, and first with two numbers that must agree.
 _SCRIPT = """
 import sys, time
 import torch
@@ -59,16 +63,15 @@ class Worker:
     """A process of one checkout."""
 
     def __init__(self, checkout: Path, case: str) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
             [sys.executable, "-c", _SCRIPT, *CASES[case]],
             cwd=checkout,
-            env=environment,
+            env=environment(checkout),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
-        self.found = [float(number) for number in self._read().split()]
+        self.results = [float(number) for number in self._read().split()]
 
     def _read(self) -> str:
         assert self._process.stdout is not None
@@ -91,10 +94,17 @@ class Worker:
 
 
 def compared(case: str, other: Path, rounds: int) -> dict[str, Any]:
-    """One problem by both checkouts, in turns."""
+    """One problem by both checkouts: times, and medians of their ratios."""
+    if case.startswith(_DIAGNOSIS):
+        number = int(case.removeprefix(_DIAGNOSIS))
+        pair = [diagnosed(number, checkout, vehicles=5, seconds=20.0) for checkout in (HERE, other)]
+        keys = ("wall_s", "cpu_s", "peak_memory_MB")
+        same = all(pair[0][key] == pair[1][key] for key in ("verdict", "effects"))
+        ratios = {f"{key} here / other": pair[0][key] / pair[1][key] for key in keys}
+        return {"case": case, "here": pair[0], "other": pair[1], "same": same, **ratios}
     workers = {"here": Worker(HERE, case), "other": Worker(other, case)}
     what = ["forward", "tangents"] if CASES[case][2] == "tangents" else ["gradient"]
-    taken: dict[str, list[float]] = {f"{w} {key}": [] for w in workers for key in what}
+    taken: dict[str, list[float]] = {f"{name} {key}": [] for name in workers for key in what}
     for key in what:
         times = max(1, round(0.2 / max(1e-4, workers["here"].seconds(key, 1))))
         for _ in range(rounds):
@@ -102,23 +112,25 @@ def compared(case: str, other: Path, rounds: int) -> dict[str, Any]:
                 taken[f"{name} {key}"].append(worker.seconds(key, times))
     for worker in workers.values():
         worker.close()
-    here, there = workers["here"].found, workers["other"].found
-    found: dict[str, Any] = {"case": case, **{k: median(v) for k, v in taken.items()}}
-    found["difference"] = max(abs(a - b) / abs(b) for a, b in zip(here, there, strict=True))
-    for key in what:
-        pairs = zip(taken[f"here {key}"], taken[f"other {key}"], strict=True)
-        found[f"{key} here / other"] = median(a / b for a, b in pairs)
+
+    def ratio(a: str, b: str) -> float:
+        return median(x / y for x, y in zip(taken[a], taken[b], strict=True))
+
+    row: dict[str, Any] = {"case": case, **{k: median(v) for k, v in taken.items()}}
+    pairs = zip(workers["here"].results, workers["other"].results, strict=True)
+    row["difference"] = max(abs(a - b) / abs(b) for a, b in pairs)
+    row |= {f"{key} here / other": ratio(f"here {key}", f"other {key}") for key in what}
     if len(what) > 1:
         for name in workers:
-            pairs = zip(taken[f"{name} tangents"], taken[f"{name} forward"], strict=True)
-            found[f"{name}: tangents / forward"] = median(a / b for a, b in pairs)
-    return found
+            row[f"{name}: tangents / forward"] = ratio(f"{name} tangents", f"{name} forward")
+    return row
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--against", type=Path, required=True, help="another checkout")
-    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
+    names = f"{', '.join(CASES)}, {_DIAGNOSIS}20, ..."
+    parser.add_argument("--cases", nargs="+", default=list(CASES), help=names)
     parser.add_argument("--rounds", type=int, default=15)
     given = parser.parse_args(arguments)
     for case in given.cases:

@@ -1,17 +1,7 @@
-"""How long a diagnosis of lanes takes, in this checkout and in another one, side by side.
-
-Examples:
-  python -m benchmarks.speed.diagnosis
-  python -m benchmarks.speed.diagnosis --against /path/to/checkout --sequences 20 100 400
-
-Both are given the same platoons, in which drivers react to the speed ahead and the model does not
-know it, and each runs in a process of its own with one thread. Verdicts and named effects must be
-the same, or the comparison says so.
-"""
+"""Time and memory of a diagnosis of lanes in a process of its own."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -22,19 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from nnode.files import write_json
+from benchmarks.synthetic_cases.platoons import DT, platoons, waves
+from benchmarks.synthetic_cases.traffic.motion import Hidden
 
 #: This checkout.
 HERE = Path(__file__).parents[2]
-#: Of the hidden law, v0 (m/s) and L (m), the reaction that its model lacks, and the standard
-#: deviation (m/s) and the time (s) of the drivers' disturbances.
-V0, LENGTH, KAPPA, PUSH, LASTS = 28.0, 6.0, 0.4, 0.2, 3.0
-#: Vehicles of a platoon, its duration and sampling interval, s, and noise of positions, m.
-VEHICLES, SECONDS, DT, NOISE = 5, 20.0, 0.2, 0.02
-#: Steps in a sampling interval, and seconds before the first sample.
-STEPS, BEFORE = 10, 15.0
-
-#: Run with the other checkout's package: nothing but what both have may be used.
+#: Of the hidden law, v0 (m/s) and L (m), and the response to the speed ahead that its model lacks.
+V0, LENGTH, KAPPA = 28.0, 6.0, 0.4
+#: Seconds before the first sample.
+BEFORE = 15.0
+#: Is run with the package of any checkout, and uses only what old versions have as well.
 _SCRIPT = """
 import json, resource, sys, time
 import numpy as np, torch
@@ -58,107 +45,42 @@ print(json.dumps({
     "peak_memory_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     "verdict": found.verdict,
     "effects": [effect.name for effect in found.effects],
-    "stages_s": found.seconds,
 }))
 """
 
 
-def platoons(
-    number: int, seed: int = 0, vehicles: int = VEHICLES, seconds: float = SECONDS
-) -> tuple[np.ndarray, np.ndarray]:
-    """Clock times ``(S, K)``, s, and places ``(S, K, N)``, m, by Euler's method."""
-    rng = np.random.default_rng(seed)
-    step, samples = DT / STEPS, round(seconds / DT) + 1
-    time = step * np.arange(round((seconds + BEFORE) / step) + 1)
-    ends = ((0.8, 2.0), (8.0, 30.0), (0.0, 6.0))
-    size, period, turn = (rng.uniform(low, high, (4, number)) for low, high in ends)
-    angle = 2 * np.pi * time[:, None, None] / period + turn
-    lead = 17 + (size * np.sin(angle)).sum(1)
-    gap = LENGTH * V0 / (V0 - lead[0])
-    x = gap[:, None] * np.arange(vehicles, dtype=float)
-    push = PUSH * rng.normal(size=(number, vehicles - 1))
-    keep, places = np.exp(-step / LASTS), []
-    for ahead in lead:
-        places.append(x.copy())
-        speed = np.empty_like(x)
-        speed[:, -1] = ahead
-        law = V0 * (1 - LENGTH / np.diff(x, axis=1))
-        for i in range(vehicles - 2, -1, -1):
-            speed[:, i] = law[:, i] + KAPPA * (speed[:, i + 1] - law[:, i]) + push[:, i]
-        x = x + step * speed
-        push = keep * push + PUSH * np.sqrt(1 - keep**2) * rng.normal(size=push.shape)
-    seen = np.array(places)[-(samples - 1) * STEPS - 1 :: STEPS].swapaxes(0, 1)
-    clock = (seconds + 80) * np.arange(number)[:, None] + DT * np.arange(samples)
-    return clock, seen + NOISE * rng.normal(size=seen.shape)
+def environment(checkout: Path) -> dict[str, str]:
+    """Of a process that uses a checkout's package with one thread."""
+    return {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
 
 
-def diagnosis_of(data: Path, checkout: Path = HERE) -> dict[str, Any]:
-    """What a checkout's diagnosis said, and what it took."""
-    environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", _SCRIPT, str(data), str(V0), str(LENGTH)],
-        cwd=checkout,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def data(number: int, vehicles: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Clock times ``(S, K)``, s, and positions ``(S, K, N)``, m."""
+    rng = np.random.default_rng(0)
+    speed = waves(rng, number, BEFORE + seconds, 17.0)
+    hidden = Hidden(kappa_open=KAPPA, kappa_close=KAPPA)
+    noise = {"push": 0.2, "correlation": 3.0, "error": 0.02}
+    x = platoons(rng, speed, V0, LENGTH, hidden, vehicles=vehicles, before=BEFORE, **noise)
+    return (seconds + 80) * np.arange(number)[:, None] + DT * np.arange(x.shape[1]), x
+
+
+def diagnosed(
+    sequences: int, checkout: Path = HERE, *, vehicles: int = 8, seconds: float = 30.0
+) -> dict[str, Any]:
+    """A diagnosis of platoons: wall time and CPU time, s, peak memory, MB, verdict and effects."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "platoons.npz"
+        time, x = data(sequences, vehicles, seconds)
+        np.savez(path, time=time, x=x)
+        done = subprocess.run(
+            [sys.executable, "-c", _SCRIPT, str(path), str(V0), str(LENGTH)],
+            cwd=checkout,
+            env=environment(checkout),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     if done.returncode:
         raise RuntimeError(f"the diagnosis by {checkout} failed:\n{done.stderr}")
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
-
-
-def compared(sequences: int, other: Path | None, here: Path = HERE) -> dict[str, Any]:
-    """One number of sequences: both checkouts, and how they compare."""
-    with tempfile.TemporaryDirectory() as folder:
-        data = Path(folder) / "platoons.npz"
-        time, x = platoons(sequences)
-        np.savez(data, time=time, x=x)
-        found: dict[str, Any] = {"sequences": sequences, "here": diagnosis_of(data, here)}
-        if other is not None:
-            found["other"] = diagnosis_of(data, other)
-            found["same"] = all(
-                found["here"][key] == found["other"][key] for key in ("verdict", "effects")
-            )
-            found["ratios"] = {
-                key: found["here"][key] / found["other"][key]
-                for key in ("wall_s", "cpu_s", "peak_memory_MB")
-            }
-    return found
-
-
-def _print(found: dict[str, Any]) -> None:
-    print(f"{found['sequences']} sequences", flush=True)
-    for name in ("other", "here"):
-        if name in found:
-            one = found[name]
-            print(
-                f"  {name:6} {one['wall_s']:8.1f} s  CPU {one['cpu_s']:8.1f} s  "
-                f"{one['peak_memory_MB']:7.0f} MB  {one['verdict']}: {', '.join(one['effects'])}"
-            )
-    if "ratios" in found:
-        said = "the same verdict and effects" if found["same"] else "ANOTHER VERDICT OR EFFECT"
-        wall, cpu, memory = found["ratios"].values()
-        print(f"  ratio  {wall:8.2f}    CPU {cpu:8.2f}    {memory:7.2f}     {said}", flush=True)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Returns 1 where verdicts or effects differ."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0] if __doc__ else "")
-    parser.add_argument("--against", type=Path, help="another checkout, such as one of before")
-    parser.add_argument("--sequences", type=int, nargs="+", default=[20, 100])
-    parser.add_argument("--json", type=Path, help="where the numbers are written")
-    given = parser.parse_args(arguments)
-    other = None if given.against is None else given.against.resolve()
-    found: list[dict[str, Any]] = []
-    for number in given.sequences:
-        found.append(compared(number, other))
-        _print(found[-1])
-        if given.json is not None:
-            write_json(given.json, {"compared": found})
-    return int(not all(one.get("same", True) for one in found))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    measured = json.loads(done.stdout.splitlines()[-1])
+    return {"shape": "diagnosis", "sequences": sequences, "agents": vehicles, **measured}

@@ -11,17 +11,16 @@ Beside it the same vehicles with SUMO's own IDM, which nobody drives. The best o
 from __future__ import annotations
 
 import argparse
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from benchmarks.programs.sumo import network, sumo_home
 from nnode.exchange.drive import drive
 from nnode.exchange.running_sumo import RunningSumo
 from nnode.files import write_json
@@ -47,10 +46,8 @@ LAWS = ("idm", "chained")
 
 def scene(folder: Path, number: int) -> Path:
     """Roads with platoons, ``number`` followers in all."""
-    home = Path(import_module("sumo").SUMO_HOME)
-    roads = -(-number // PLATOON)
     nodes, edges, routes, cars = "", "", "", ""
-    for k in range(roads):
+    for k in range(-(-number // PLATOON)):
         nodes += f'<node id="a{k}" x="0" y="{20 * k}"/><node id="b{k}" x="3000" y="{20 * k}"/>'
         edges += f'<edge id="e{k}" from="a{k}" to="b{k}" numLanes="1" speed="14"/>'
         routes += f'<route id="r{k}" edges="e{k}"/>'
@@ -64,12 +61,8 @@ def scene(folder: Path, number: int) -> Path:
         '<vType id="lead" speedDev="0" sigma="0"/>'
         '<vType id="own" carFollowModel="IDM" minGap="2" tau="1.2" accel="1.3" decel="1.7"/>'
     )
-    (folder / "a.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
-    (folder / "a.edg.xml").write_text(f"<edges>{edges}</edges>")
     (folder / "a.rou.xml").write_text(f"<routes>{types}{routes}{cars}</routes>")
-    files = {"-n": "a.nod.xml", "-e": "a.edg.xml", "-o": "a.net.xml"}
-    options = [part for option, file in files.items() for part in (option, str(folder / file))]
-    subprocess.run([home / "bin" / "netconvert", *options], check=True, capture_output=True)
+    network(sumo_home(), folder, nodes, edges)
     found = folder / "a.sumocfg"
     found.write_text(
         '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'

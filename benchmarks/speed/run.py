@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 import time
 from functools import partial
 from pathlib import Path
@@ -13,21 +14,15 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
+from benchmarks.speed.diagnosis import diagnosed
 from benchmarks.speed.engines import ENGINES, Call, Engine, by_method, method_errors, torch_call
 from benchmarks.speed.figure import performance_figure
 from benchmarks.speed.floor import evaluations, floor_call
-from benchmarks.speed.growth import diagnosed, print_growth
 from benchmarks.speed.memory import peak_memory
 from benchmarks.speed.problems import SHAPES, Problem, pose
-from benchmarks.speed.report import (
-    per_person,
-    print_methods,
-    print_per_person,
-    print_problem,
-    print_tangents,
-)
-from benchmarks.speed.start import warm_start
-from benchmarks.speed.tangents import calls, check, starts
+from benchmarks.speed.report import per_person, show, show_problem
+from benchmarks.speed.start import first_call
+from benchmarks.speed.tangents import calls, check
 from nnode.calibrate.cost import squared_error
 from nnode.errors import ConfigError, SimulationError
 from nnode.files import write_json
@@ -50,42 +45,41 @@ def benchmark(config: DictConfig, folder: Path) -> None:
     """Time the engines, print tables, and write ``benchmark.json`` and ``benchmark.png``.
 
     The results are written again after every problem. The figure needs two problems that differ
-    in the number of steps, of people, or of sequences that are diagnosed. With
-    ``redraw`` nothing is timed.
+    in the number of steps, of people, or of diagnosed sequences. With ``redraw`` nothing is timed.
 
     Raises:
         ConfigError: unknown shapes or engines, no repeat, or results that cannot be drawn.
-        SimulationError: an engine disagrees with the exact solution of a problem; it is not
-            timed, nor is any later one.
+        SimulationError: an engine disagrees with the exact solution of a problem; neither this
+            problem nor any later one is timed.
     """
     options = config.benchmark
     if options.redraw is not None:
         _redraw(Path(options.redraw), folder)
         return
     _check_options(options)
-    # one thread for all; fused_2 brings its own second one
+    # one thread for all; fused_2 has a second one of its own
     torch.set_num_threads(1)
     dtype = getattr(torch, options.dtype.value)
-    found: list[dict[str, Any]] = []
-    results = {
-        "machine": machine(PACKAGES),
-        "dtype": options.dtype.value,
-        "problems": found,
-        "scale": per_person(found),
-    }
+    rows: list[dict[str, Any]] = []
+    results = {"machine": machine(PACKAGES), "dtype": options.dtype.value, "problems": rows}
+
+    def add(row: dict[str, Any]) -> None:
+        rows.append(row)
+        results["scale"] = per_person([row for row in rows if row["shape"] == "scale"])
+        write_json(folder / "benchmark.json", results)
+
     for name in options.shapes:
         for number in options.sequences if name == _DIAGNOSIS else []:
-            found.append(diagnosed(number))
-            write_json(folder / "benchmark.json", results)
+            add(diagnosed(number))
         for shape in SHAPES.get(name, []):
             for model in shape.models:
-                found.append({"shape": name, **_timed(name, pose(shape, model, dtype), options)})
-                results["scale"] = per_person([r for r in found if r["shape"] == "scale"])
-                write_json(folder / "benchmark.json", results)
-    print_methods([row for row in found if row["shape"] == "methods"])
-    print_tangents([row for row in found if row["shape"] == "tangents"])
-    print_per_person(results["scale"])
-    print_growth([row for row in found if row["shape"] == _DIAGNOSIS])
+                row = {"shape": name, **_timed(name, pose(shape, model, dtype), options)}
+                show_problem(row)
+                add(row)
+    for engine, scale in results.get("scale", {}).items():
+        seconds = dict(zip(map(str, scale["people"]), scale["seconds"], strict=True))
+        show(f"{engine}: one step of one person takes (s)", [seconds | {"ratio": scale["ratio"]}])
+    show("diagnosis", [row for row in rows if row["shape"] == _DIAGNOSIS])
     print(f"results: {folder / 'benchmark.json'}")
     _draw(results, folder)
 
@@ -108,21 +102,44 @@ def _check_options(options: DictConfig) -> None:
 
 def _timed(name: str, problem: Problem, options: DictConfig) -> dict[str, Any]:
     """What is measured of one problem of the shapes ``name``."""
-    if name in ("tangents", "methods"):
-        return (_tangents if name == "tangents" else _methods)(problem, options.repeats)
+    shape = problem.shape
+    row = {"problem": problem.label, "model": problem.model, "sequences": shape.sequences}
+    row |= {"agents": shape.agents, "steps": shape.steps}
+    if name == "methods":
+        return {
+            **row,
+            "errors": method_errors(problem),
+            "engines": _rounds(by_method(problem), options.repeats, compile_first=True),
+        }
+    if name == "tangents":
+        return {
+            **row,
+            "parameters": len(list(problem.system.parameters())),
+            "difference": check(problem),
+            "engines": _rounds(calls(problem), options.repeats, compile_first=True),
+            "starts": _starts(problem),
+        }
     chosen = {
         key: engine
         for key, engine in ENGINES.items()
         if key in (options.engines or ENGINES) and engine.covers(problem)
     }
-    row = _measure(problem, chosen, options.repeats)
+    row |= _measure(problem, chosen, options.repeats)
     # the problems of ``steps`` are those of ``paper`` with another number of steps
-    if problem.shape.domain == "traffic" and name != "steps":
+    if shape.domain == "traffic" and name != "steps":
         row["ensemble"] = _ensemble(problem, options.restarts, options.repeats)
     if name in ("paper", "crowd") and "fused_1" in chosen:
-        row["warm_start"] = warm_start(problem)
-    print_problem({"shape": name, **row})
+        row["warm_start"] = first_call(problem, "gradient")
     return row
+
+
+def _starts(problem: Problem) -> dict[str, dict[str, float]]:
+    """Seconds of first calls of new processes, ``cold`` with nothing compiled, then ``warm``."""
+    found = {}
+    for what in ("forward", "tangents"):
+        with tempfile.TemporaryDirectory() as cache:
+            found[what] = {at: first_call(problem, what, cache) for at in ("cold", "warm")}
+    return found
 
 
 def _draw(results: dict[str, Any], folder: Path) -> bool:
@@ -185,20 +202,24 @@ def _once(call: Any, times: int) -> float:
     return (time.perf_counter() - start) / times
 
 
-def _rounds(calls: dict[str, Any], repeats: int) -> dict[str, dict[str, Any]]:
-    """Seconds per call, all engines in turn, so that a busy moment hits all of them; memory."""
-    times, found = {}, {}
+def _rounds(
+    timed: dict[str, Any], repeats: int, *, compile_first: bool = False
+) -> dict[str, dict[str, Any]]:
+    """Seconds per call, all engines in turn, so that other load hits all of them; memory."""
+    times, memory = {}, {}
     taken: dict[str, list[float]] = {}
-    for name, call in calls.items():
-        trial, found[name] = peak_memory(partial(_once, call, 1))
+    for name, call in timed.items():
+        if compile_first:
+            call()
+        trial, memory[name] = peak_memory(partial(_once, call, 1))
         times[name] = max(1, round(_LEAST / trial))
         # a long call needs no second one to be a measurement
         taken[name] = [trial] if trial >= _LEAST else []
     for number in range(1, repeats + 1):
-        for name, call in calls.items():
+        for name, call in timed.items():
             if len(taken[name]) < number:
                 taken[name].append(_once(call, times[name]))
-    return {name: {**_summary(taken[name]), **found[name]} for name in calls}
+    return {name: {**_summary(taken[name]), **memory[name]} for name in timed}
 
 
 def _summary(taken: list[float]) -> dict[str, Any]:
@@ -221,11 +242,6 @@ def _measure(problem: Problem, engines: dict[str, Engine], repeats: int) -> dict
     taken = _rounds(timed, repeats)
     peaks = [taken[name]["peak_memory_MB"] for name in engines]
     row = {
-        "problem": problem.label,
-        "model": problem.model,
-        "sequences": problem.shape.sequences,
-        "agents": problem.shape.agents,
-        "steps": problem.shape.steps,
         "engines": {
             name: {**taken[name], **checks[name], "exact": engines[name].exact} for name in engines
         },
@@ -234,41 +250,6 @@ def _measure(problem: Problem, engines: dict[str, Engine], repeats: int) -> dict
     if floor is not None:
         row["floor"] = {"evaluations": evaluations(problem), **taken[_FLOOR]}
     return row
-
-
-def _methods(problem: Problem, repeats: int) -> dict[str, Any]:
-    """Methods of stepping in turn, and how far each is from the solution."""
-    own = by_method(problem)
-    for call in own.values():
-        call()  # compiles
-    return {
-        "problem": problem.label,
-        "model": problem.model,
-        "sequences": problem.shape.sequences,
-        "agents": problem.shape.agents,
-        "steps": problem.shape.steps,
-        "errors": method_errors(problem),
-        "engines": _rounds(own, repeats),
-    }
-
-
-def _tangents(problem: Problem, repeats: int) -> dict[str, Any]:
-    """Tangents beside the simulation alone, in turn; and the first calls of new processes."""
-    agree = check(problem)
-    own = calls(problem)
-    for call in own.values():
-        call()  # compiles
-    return {
-        "problem": problem.label,
-        "model": problem.model,
-        "sequences": problem.shape.sequences,
-        "agents": problem.shape.agents,
-        "steps": problem.shape.steps,
-        "parameters": len(list(problem.system.parameters())),
-        "difference": agree,
-        "engines": _rounds(own, repeats),
-        "starts": starts(problem),
-    }
 
 
 def _ensemble(problem: Problem, restarts: int, repeats: int) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Levels and thresholds of the decisions of a diagnosis, each with its reason.
 
 They apply to a whole diagnosis; :func:`applied` sets them. The sensitivity of true and false
-positives to halving and doubling each: ``python -m benchmarks.discovery.sensitivity``.
+positives to halving and doubling each: ``benchmark_discovery.kinds=[rules]``.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -28,10 +27,9 @@ from studies.crowd.data import (
 )
 from studies.crowd.fit import NAMES, named, system_of
 from studies.crowd.tasks import KINDS
-from studies.frame import by_unit, differences, means, numbers, tidy
+from studies.frame import by_unit, differences, labelled, means, numbers
 from studies.options import CrowdStudyOptions
 from studies.replay import player, scenes, spread
-from studies.runner import Task
 
 #: How the page calls what was simulated.
 LABELS = {
@@ -60,9 +58,9 @@ class Crowd:
     stores: dict[tuple[str, float], Store]
     found: pd.DataFrame = field(default_factory=pd.DataFrame)
 
-    def add(self, horizon: float, every: list[Task], results: Mapping[str, Any]) -> None:
+    def add(self, horizon: float, results: pd.DataFrame) -> None:
         """The results of tasks at a horizon."""
-        more = tidy(every, results).assign(horizon=horizon)
+        more = results.assign(horizon=horizon)
         self.found = pd.concat([self.found, more], ignore_index=True)
 
     @property
@@ -161,7 +159,7 @@ class Crowd:
                 "people, mean": float(np.mean(people)),
                 "people, most": max(people),
             }
-        return _labelled(rows, "recording", "length")
+        return labelled(rows, "recording", "length")
 
     def _parameters(self) -> pd.DataFrame:
         """A, k, kappa by horizon with 95 % intervals, printed ones first."""
@@ -223,7 +221,7 @@ class Crowd:
                     "speed": mean_speed(every[name] for name in names),
                     **mean,
                 }
-        return _labelled(rows, "horizon", "block")
+        return labelled(rows, "horizon", "block")
 
     def _other_runs(self) -> pd.DataFrame:
         """Mean cost of a sequence in other runs, m² s."""
@@ -240,7 +238,7 @@ class Crowd:
                         for m in list(LABELS)[:-1]
                     },
                 }
-        return _labelled(rows, "horizon", "run")
+        return labelled(rows, "horizon", "run")
 
     def _every_parameter(self) -> pd.DataFrame:
         """All calibrations, one row per number: what is needed to compute their costs again."""
@@ -283,7 +281,7 @@ class Crowd:
                     row[f"size, {part}"] = forces.size(parts[part])
                     row[f"likeness, {part}"] = forces.likeness(parts[part], every[0][2][part])
                 rows[LABELS[kind], one["seed"]] = row
-        return _labelled(rows, "model", "start")
+        return labelled(rows, "model", "start")
 
     def _pull(self) -> pd.DataFrame:
         rows = {LABELS[kind]: forces.slope(every[0][2]) for kind, every in self.starts.items()}
@@ -310,7 +308,7 @@ class Crowd:
             for i, setting in enumerate(settings)
             for person in ("blue", "red")
         }
-        return figure, _labelled(rows, "setting", "person")
+        return figure, labelled(rows, "setting", "person")
 
     # -- figures -----------------------------------------------------------------------------
 
@@ -382,9 +380,3 @@ class Crowd:
             "fast": 100 * float((dv >= 1.0).mean()),
             "wide": float(dx.max()),
         }
-
-
-def _labelled(rows: dict[Any, dict[str, Any]], *names: str) -> pd.DataFrame:
-    found = pd.DataFrame.from_dict(rows, orient="index")
-    found.index = pd.MultiIndex.from_tuples(list(rows), names=names)
-    return found

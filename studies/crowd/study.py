@@ -9,9 +9,10 @@ from nnode.pages.page import Block
 from studies.crowd import tasks
 from studies.crowd.data import ALL, prepare_horizon
 from studies.crowd.results import Crowd
+from studies.frame import computed
 from studies.options import CrowdStudyOptions
 from studies.page import page
-from studies.runner import Task, hash_of, run_tasks
+from studies.runner import Task
 
 TITLE = "Crowd: social force and networks in a two-way corridor"
 SUBTITLE = (
@@ -42,20 +43,12 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
         for h in options.horizons
         for kind in ("main", "others")
     }
-    fingerprint = hash_of({f"{kind}-{h:g}": store for (kind, h), store in stores.items()})
+    named = {f"{kind}-{horizon:g}": store for (kind, horizon), store in stores.items()}
     study = Crowd(options, stores)
-    assert options.workers is not None
     for number, horizon in enumerate(options.horizons):
         for what, make in (("calibration", calibrations), ("intervals, other runs", evaluations)):
-            every = make(study, number)
-            found = run_tasks(
-                every,
-                folder,
-                workers=options.workers,
-                fingerprint=fingerprint,
-                title=f"crowd study, {horizon:g} s: {what}",
-            )
-            study.add(horizon, every, found)
+            title = f"crowd study, {horizon:g} s: {what}"
+            study.add(horizon, computed(make(study, number), folder, options, named, title))
     return page("crowd", study.tables(), study.figures(), stores.values(), **study.values())
 
 

@@ -21,7 +21,7 @@ from studies.following import data, figures, leaders, platoons, printed, stabili
 from studies.following.candidates import DECAY, EVERY, REFERENCE, key
 from studies.following.data import gap_of
 from studies.following.fit import OBJECTIVES
-from studies.frame import by_unit, differences, versus
+from studies.frame import by_unit, differences, labelled, versus
 from studies.options import FollowingStudyOptions
 from studies.replay import player, scenes, spread
 
@@ -137,7 +137,7 @@ class Study:
             for law, errors in printed.ERRORS.items()
             for objective, told in zip(printed.OBJECTIVES, errors, strict=True)
         }
-        table = _labelled(rows, "law", "minimised")
+        table = labelled(rows, "law", "minimised")
         return table.assign(difference=table["here"] - table["printed"])
 
     def _candidates(self) -> pd.DataFrame:
@@ -497,9 +497,3 @@ def _rises(profile: dict[str, list[float]], best: float, side: int) -> bool:
     """Whether the error rises beyond doubt on a side of the best value within the profile."""
     values, low = np.array(profile["values"]), np.array(profile["low"])
     return bool((low[side * (values - best) > 0] > 0).any())
-
-
-def _labelled(rows: dict[Any, dict[str, Any]], *names: str) -> Any:
-    found = pd.DataFrame.from_dict(rows, orient="index")
-    found.index = pd.MultiIndex.from_tuples(list(rows), names=names)
-    return found

@@ -11,12 +11,12 @@ import pandas as pd
 from nnode.calibrate.resampling import group_weights
 from nnode.errors import ConfigError
 from nnode.pages.page import Block
-from studies.frame import tidy
+from studies.frame import computed
 from studies.options import PredictionStudyOptions
 from studies.page import page
 from studies.prediction import printed, tasks
 from studies.prediction.data import AHEAD, SCENES, SEEN, STEP, stores
-from studies.runner import Task, hash_of, run_tasks
+from studies.runner import Task
 from studies.walking import tasks as walking
 
 TITLE = "Prediction: laws and published results"
@@ -46,7 +46,6 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
             "study.source is not set; expected a folder with waymo_pairs and eth_ucy, whose files "
             "have no addresses of their own (NNODE_DATA in the environment sets it)"
         )
-    assert options.workers is not None
     prepared = stores(options.source, folder / "data")
     folders = [str(prepared[name].folder) for name in SCENES]
     pairs = {"folder": str(prepared["waymo_pairs"].folder), "seed": options.seed}
@@ -60,16 +59,7 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
         for law in list(PEOPLE)[: 1 if options.quick else None]:
             one = {"law": law, "desired": "direction", **where}
             every.append(Task(f"{law}-{name}", walking.fit, one, cost=10.0))
-    found = tidy(
-        every,
-        run_tasks(
-            every,
-            folder,
-            workers=options.workers,
-            fingerprint=hash_of(prepared),
-            title="prediction study",
-        ),
-    )
+    found = computed(every, folder, options, prepared, "prediction study")
     distances = _distances(found)
     tables = {"following": _following(found, options.seed)}
     tables |= {what: _by_scene(distances, what) for what in ("ade", "fde")}

@@ -18,7 +18,7 @@ from nnode.data.store import Store
 from nnode.pages.replay import ReplayBlock
 from nnode.plots.traffic import measured_gaps
 from nnode.simulation.fused import FusedSolver
-from studies.frame import by_unit, differences, numbers
+from studies.frame import by_unit, differences, labelled, numbers
 from studies.options import TrafficStudyOptions
 from studies.replay import player, scenes, spread
 from studies.traffic import figures, printed
@@ -198,11 +198,10 @@ class Study:
                 row["first search"] = self.take("before").loc[model, name]
             rows[model, name] = row
         columns = ["printed", "here", "first search", "best tenth of starts"]
-        found = pd.DataFrame.from_dict(rows, orient="index")
-        found = found.reindex(columns=[*columns, "grid", "grid, printed L"])
-        if rows:
-            found.index = pd.MultiIndex.from_tuples(list(rows), names=["model", "recording"])
-        return found
+        columns += ["grid", "grid, printed L"]
+        if not rows:
+            return pd.DataFrame(columns=columns)
+        return labelled(rows, "model", "recording").reindex(columns=columns)
 
     def _speeds_by_gap(self, box: bool) -> dict[str, pd.DataFrame]:
         """By recording, a column of speeds (m/s) per model."""

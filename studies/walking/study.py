@@ -13,11 +13,11 @@ from nnode.errors import ConfigError
 from nnode.pages.page import Block
 from nnode.pages.replay import ReplayBlock
 from studies.crowd.figures import horizon_costs
-from studies.frame import by_unit, differences, numbers, tidy
+from studies.frame import by_unit, computed, differences, numbers
 from studies.options import WalkingStudyOptions
 from studies.page import page
 from studies.replay import player, scenes, spread
-from studies.runner import Task, hash_of, run_tasks
+from studies.runner import Task
 from studies.walking import tasks
 from studies.walking.data import RUNS, prepare_runs, sequences
 from studies.walking.laws import DESIRED, LABELS, LAWS, SIMPLE, filled, new_system
@@ -49,7 +49,6 @@ def run(options: WalkingStudyOptions, folder: Path) -> list[Block]:
     """
     if options.folds > sum(map(len, RUNS.values())):
         raise ConfigError(f"study.folds={options.folds}: expected 2 to 7 groups of runs")
-    assert options.workers is not None
     download = options.download or str(folder / "data" / "raw")
     parts = []
     for horizon in options.horizons:
@@ -59,15 +58,9 @@ def run(options: WalkingStudyOptions, folder: Path) -> list[Block]:
             where = folder / "data" / name
             stores[name] = prepare_runs(kind, options.source, download, horizon, where)
         folders = [str(store.folder) for store in stores.values()]
-        every = _tasks(options, horizon, folders)
-        found = run_tasks(
-            every,
-            folder,
-            workers=options.workers,
-            fingerprint=hash_of(stores),
-            title=f"walking study, {horizon:g} s",
-        )
-        parts.append(tidy(every, found).assign(horizon=horizon))
+        every, title = _tasks(options, horizon, folders), f"walking study, {horizon:g} s"
+        found = computed(every, folder, options, stores, title)
+        parts.append(found.assign(horizon=horizon))
     study = Walking(options, pd.concat(parts, ignore_index=True))
     figures = {f"walking_{desired}": study.figure(desired) for desired in DESIRED}
     return page(

@@ -24,7 +24,7 @@ CONF = ROOT / "conf"
 #: What stands behind ``nnode`` or ``python``.
 COMMANDS = {
     *(path.stem for path in (ROOT / "nnode" / "app" / "commands").glob("[a-z]*.py")),
-    *(f"scripts/{name}.py" for name in ("benchmark", "benchmark_discovery", "torture")),
+    *(f"scripts/{name}.py" for name in ("benchmark", "benchmark_discovery", "fault_injection")),
 }
 
 Script = Callable[..., subprocess.CompletedProcess[str]]

@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.torture.child import Child, script
+from benchmarks.fault_injection.child import Child, script
 
 ROOT = Path(__file__).resolve().parents[2]
 #: What scripts use of the libraries and of the package.

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import nnode
-from benchmarks.recovery import by_sumo
+from benchmarks.programs import sumo as by_sumo
 from nnode.app.drive import _has_lengths, steps_of
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint

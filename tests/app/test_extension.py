@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.recovery import by_sumo
+from benchmarks.programs import sumo as by_sumo
 from nnode.data.readers.sumo import SumoOptions, read_sumo
 from nnode.data.sequence import Sequence
 from tests.app.conftest import ROOT, Script, start_script

@@ -11,7 +11,7 @@ from types import ModuleType
 
 import numpy as np
 
-from benchmarks.recovery.by_sumo import call, network
+from benchmarks.programs.sumo import call, network
 
 #: Of SUMO's passenger car: its own length and gap at rest, m, the time that drivers keep, s, and
 #: their comfortable braking, m/s².

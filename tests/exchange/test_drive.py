@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.recovery import by_sumo, laws
-from benchmarks.recovery.cases import SLOWLY
+from benchmarks.programs import laws
+from benchmarks.programs import sumo as by_sumo
+from benchmarks.programs.sumo import SLOWLY
 from nnode.app.python.inputs import model_options
 from nnode.data.readers.sumo import SumoOptions, read_sumo
 from nnode.data.sequence import Sequence, collate

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.recovery.by_sumo import network
+from benchmarks.programs.sumo import network
 from nnode.model.effects.lane import EDGE
 from tests.app.following import LONG, STEP, TRUE, idm
 from tests.app.test_replay import held, tracks

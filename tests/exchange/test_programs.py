@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.recovery.by_sumo import call, network
+from benchmarks.programs.sumo import call, network
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import Faults
 from nnode.data.prepare import prepare

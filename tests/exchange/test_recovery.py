@@ -15,8 +15,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from benchmarks.recovery.cases import CASES
-from benchmarks.recovery.recover import Recovered
+from benchmarks.discovery.recover import Recovered
+from benchmarks.discovery.recovery import CASES
 
 pytestmark = pytest.mark.slow
 

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.recovery import by_jupedsim, by_sumo
-from benchmarks.recovery.cases import SLOWLY
+from benchmarks.programs import jupedsim as by_jupedsim
+from benchmarks.programs import sumo as by_sumo
+from benchmarks.programs.sumo import SLOWLY
 from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.readers.sumo import SumoOptions, read_sumo
 from nnode.data.sequence import Sequence, collate

@@ -138,7 +138,7 @@ WRONG = [
     ("check none.csv", r"error: there is no file none.csv"),
     ("discover discover.alpha=2", "error: .*must lie between 0 and 1"),
     ("discover 'discover.effects=[inerta]'", r"did you mean inertia\?"),
-    ("torture 'campaigns=[kill]'", "expected some of kills, disk, folder, fuzz"),
+    ("fault_injection 'campaigns=[kill]'", "expected some of kills, disk, folder, fuzz"),
     ("benchmark_discovery 'benchmark_discovery.arms=[foo]'", "expected one of single, pair"),
     (
         "train data=table data.domain=traffic data.path=none.csv trainer.drivers=atuo",

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from benchmarks.discovery.fresh import kept_back, on_fresh
-from benchmarks.truths import TABLE, Case, generate
+from benchmarks.synthetic_cases import TABLE, Case, generate
 from nnode.app.python.report import Report
 from nnode.model.build import build_model
 from nnode.model.effects import CATALOGUE

@@ -1,24 +1,25 @@
-"""The diagnosis of two checkouts side by side."""
+"""A diagnosis that is timed, and the comparison of two checkouts."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import json
 
 import numpy as np
 import pytest
 
-from benchmarks.speed import diagnosis
+from benchmarks.speed import against, diagnosis
 
 
 def test_platoons_follow_each_other() -> None:
-    time, x = diagnosis.platoons(3)
-    assert x.shape == (*time.shape, diagnosis.VEHICLES)
+    time, x = diagnosis.data(3, vehicles=5, seconds=20.0)
+    assert x.shape == (*time.shape, 5)
     assert (np.diff(x, axis=2) > diagnosis.LENGTH).all()
     assert (np.diff(x[..., -1], axis=1) > 0).all()
 
 
 @pytest.mark.thorough
-def test_a_checkout_is_timed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert diagnosis.main(["--sequences", "4", "--json", str(tmp_path / "found.json")]) == 0
-    assert (tmp_path / "found.json").exists()
-    assert "4 sequences\n  here" in capfd.readouterr().out
+def test_a_checkout_is_compared_with_itself(capfd: pytest.CaptureFixture[str]) -> None:
+    against.main(["--against", str(diagnosis.HERE), "--cases", "diagnosis_4"])
+    row = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert row["same"]
+    assert row["cpu_s here / other"] > 0

@@ -139,7 +139,7 @@ def test_an_encoding_of_xml_that_is_not_read(tmp_path: Path, encoding: str) -> N
 
 
 def test_clocks_of_ngsim_out_of_range(tmp_path: Path) -> None:
-    from benchmarks.torture.formats import ngsim
+    from benchmarks.fault_injection.formats import ngsim
 
     path = tmp_path / "a.csv"
     path.write_bytes(ngsim().replace(b",1113433135100,", b",1e308,", 1))

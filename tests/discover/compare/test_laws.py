@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.truths.laws.case import LawCase, measured
+from benchmarks.synthetic_cases.laws import measured
 from nnode.app.nearest_law import LAWS, candidates
 from nnode.app.python.inputs import model_options, table_options
 from nnode.calibrate.parameters import ParameterVector
@@ -34,7 +34,7 @@ def law(name: str) -> System:
 
 @pytest.mark.parametrize("true", ["idm", "lin"])
 def test_the_true_law_comes_first(true: str, tmp_path: Path) -> None:
-    table, parameters = measured(LawCase(true, 5, sequences=12, vehicles=4, seconds=20.0))
+    table, parameters = measured(true, 5, sequences=12, vehicles=4, seconds=20.0)
     path = tmp_path / "table.csv"
     table.to_csv(path, index=False)
     sequences = read_table(path, table_options(path, "traffic", None, tmp_path)[1])
@@ -107,7 +107,7 @@ def test_effects_go_to_the_laws_that_have_a_place_for_them() -> None:
 def test_what_a_nearer_law_does_without_is_no_finding(tmp_path: Path) -> None:
     """Behind ``ovm`` a law of the gap alone answers late, which it imitates by looking two ahead;
     what laws have in themselves, such as an inertia, is right to be missed."""
-    table, _ = measured(LawCase("ovm", 3, sequences=12, vehicles=4, seconds=20.0))
+    table, _ = measured("ovm", 3, sequences=12, vehicles=4, seconds=20.0)
     path = tmp_path / "table.csv"
     table.to_csv(path, index=False)
     sequences = read_table(path, table_options(path, "traffic", None, tmp_path)[1])

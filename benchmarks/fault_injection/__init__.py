@@ -1,0 +1,1 @@
+"""Misuse on purpose: ``scripts/fault_injection.py``."""

@@ -1,1 +1,0 @@
-"""The diagnosis where the base law is wrong: worlds that neither it nor its catalogue made."""

@@ -1,0 +1,1 @@
+"""SUMO and JuPedSim as independent sources of trajectories."""

@@ -1,1 +1,0 @@
-"""Parameters that are typed into other programs, recovered from what these simulate."""

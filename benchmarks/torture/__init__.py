@@ -1,1 +1,0 @@
-"""Misuse on purpose: ``scripts/torture.py``."""

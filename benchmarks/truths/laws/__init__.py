@@ -1,1 +1,0 @@
-"""Platoons that follow a law of the literature, written out by hand."""

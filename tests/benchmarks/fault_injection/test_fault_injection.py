@@ -1,0 +1,85 @@
+"""Misuse on purpose, shortly; the whole of it with -m slow."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.fault_injection.fuzz import fuzz
+from benchmarks.fault_injection.jobs import jobs
+from benchmarks.fault_injection.targets import Target
+from tests.app.conftest import Script, composed
+
+
+def report(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
+    script("fault_injection", *overrides, f"hydra.run.dir={folder}")
+    found: dict[str, Any] = json.loads((folder / "report.json").read_text())
+    assert found["losses"] == 0
+    return found
+
+
+@pytest.mark.thorough
+def test_every_campaign_shortly(script: Script, tmp_path: Path) -> None:
+    found = report(script, tmp_path, "jobs=[prepare_data]", "kills=6", "repeats=2", "inputs=1150")
+    assert found["tried"]["kills"] == 6
+    assert found["tried"]["fuzz"] == 1150
+    assert found["tried"]["disk"] >= 6
+    assert found["tried"]["folder"] >= 2
+    rows = {(row["campaign"], row["what"]): row for row in found["rows"]}
+    assert rows["kills", "prepare_data"]["facts"]["ends compared"] >= 1
+    assert rows["disk", "prepare_data, size of files"]["facts"]["refused"] >= 3
+    for (campaign, _), row in rows.items():
+        if campaign == "fuzz":
+            assert row["tried"] == 50
+            assert row["facts"]["read"] + row["facts"]["refused"] == 50
+    # nothing of the campaigns is left beside the report
+    assert not [p.name for p in tmp_path.iterdir() if p.name in ("kills", "disk", "fuzz")]
+
+
+@pytest.mark.slow
+def test_all_jobs(script: Script, tmp_path: Path) -> None:
+    found = report(script, tmp_path, "campaigns=[kills,disk,folder]", "kills=50")
+    assert found["tried"]["kills"] >= 50
+
+
+@pytest.mark.slow
+def test_many_inputs(script: Script, tmp_path: Path) -> None:
+    found = report(script, tmp_path, "campaigns=[fuzz]", "inputs=104000")
+    assert found["tried"]["fuzz"] >= 100_000
+
+
+def test_a_reader_that_misbehaves_is_a_loss(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outside = tmp_path / "elsewhere"
+
+    def read(path: Path) -> None:
+        match path.read_bytes()[0] % 4:
+            case 0:
+                raise KeyError("not an error of the package")
+            case 1:
+                outside.write_text("written outside")
+            case 2:
+                bytearray(1 << 40)
+
+    from benchmarks.fault_injection import fuzz as campaign
+
+    bad = Target("bad", "bad.bin", [bytes(8)], lambda data, rng: rng.randbytes(8), read)
+    monkeypatch.setattr(campaign, "targets", lambda *_: [bad])
+    found = fuzz(tmp_path, 16, 0)[0]
+    words = " ".join(found.losses)
+    assert found.tried == 16
+    assert "KeyError" in words
+    assert f"did open {outside}" in words
+    assert "MemoryError" in words
+    assert len(found.losses) == 16 - found.facts["read"] + sum(
+        "did open" in w for w in found.losses
+    )
+
+
+def test_the_jobs_are_asked_for_in_words_that_the_scripts_know(tmp_path: Path) -> None:
+    for job in jobs(tmp_path / "raw"):
+        composed(job.name, *job.first)

@@ -1,0 +1,138 @@
+"""The platoons move as the formulas say: closed forms, and another integrator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from benchmarks.synthetic_cases.traffic.motion import LAWS, Hidden, inside, simulate
+
+V0 = {"lin": 30.0, "log": 12.0}
+L = 8.0
+
+
+def drive(
+    law: str,
+    hidden: Hidden,
+    *,
+    speed=lambda t: 15.0 + 0 * t,
+    place=lambda t: 15.0 * t,
+    vehicles: int = 4,
+    gap: float = 20.0,
+    duration: float = 60.0,
+    step: float = 0.05,
+    own: float = 1.0,
+    clock: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """``(M + 1, N)`` positions and velocities of one platoon, followers 20 m apart at first."""
+    half = np.arange(2 * round(duration / step) + 1) * step / 2
+    x = place(half)[0] - gap * np.arange(vehicles)[::-1].astype(float)
+    v = np.full(vehicles, float(speed(half)[0]))
+    moved, rates = simulate(
+        LAWS[law],
+        V0[law],
+        L,
+        hidden,
+        np.full((1, vehicles), own),
+        place(half)[None],
+        speed(half)[None],
+        x[None, None],
+        v[None, None],
+        np.zeros((1, 1, vehicles)),
+        np.array([clock]),
+        0.0,
+        step,
+        1,
+    )
+    return moved[0], rates[0]
+
+
+def sine(t):
+    return 15 + 3 * np.sin(0.5 * t)
+
+
+def sine_place(t):
+    return 15 * t - 6 * np.cos(0.5 * t)
+
+
+# the factor or length that acts in equilibrium behind a leader of 15 m/s
+@pytest.mark.parametrize(
+    ("hidden", "own", "factor", "length"),
+    [
+        (Hidden(), 1.0, 1.0, L),
+        (Hidden(), 0.8, 0.8, L),
+        (Hidden(kappa_open=0.4, kappa_close=0.2, c=0.3), 1.0, 1.0, L),
+        (Hidden(T=0.4), 1.0, 1.0, L),
+        (Hidden(tau_v=0.5), 1.0, 1.0, L),
+        (Hidden(zone_alpha=0.7, zone_a=-1e4, zone_b=1e4), 1.0, 0.7, L),
+        (Hidden(period_alpha=0.7, period_a=-1e4, period_b=1e4), 1.0, 0.7, L),
+        (Hidden(h=0.2), 1.0, 1.0, L + 0.2 * 15),
+    ],
+)
+@pytest.mark.parametrize("law", ["lin", "log"])
+def test_platoons_settle_at_the_gap_at_which_the_law_gives_the_leaders_speed(
+    law, hidden, own, factor, length
+):
+    x, v = drive(law, hidden, own=own, duration=200.0)
+    wanted = 15.0 / (V0[law] * factor)
+    gap = length / (1 - wanted) if law == "lin" else length * np.exp(wanted)
+    np.testing.assert_allclose(np.diff(x[-1]), gap, rtol=1e-6)
+    np.testing.assert_allclose(v[-1], 15.0, rtol=1e-6)
+
+
+def test_a_top_speed_binds():
+    _, v = drive("lin", Hidden(v_max=12.0))
+    assert v[:, :-1].max() == 12.0
+
+
+@pytest.mark.parametrize("T", [0.0, 0.4])
+def test_halving_the_step_lowers_the_error_sixteenfold(T):
+    hidden = Hidden(kappa_open=0.3, kappa_close=0.3, c=0.3, T=T, tau_v=0.3)
+    ends = [
+        drive("lin", hidden, speed=sine, place=sine_place, duration=8.0, step=step)[0][-1, :-1]
+        for step in (0.1, 0.05, 0.025)
+    ]
+    ratio = np.abs(ends[0] - ends[1]).max() / np.abs(ends[1] - ends[2]).max()
+    assert 11 < ratio < 22
+
+
+def test_another_integrator_finds_the_same_motion():
+    hidden = Hidden(kappa_open=0.3, kappa_close=0.3, c=0.25, tau_v=0.6, h=0.1)
+    law = np.vectorize(lambda gap, length: V0["lin"] * (1 - length / gap))
+
+    def rates(t: float, y: np.ndarray) -> np.ndarray:
+        x = np.append(y[:3], sine_place(t))
+        v = np.append(y[3:], sine(t))
+        gap = np.diff(x)
+        speed = law(gap, L + 0.1 * v[1:])
+        speed[:-1] += 0.25 * (law(gap[1:], L + 0.1 * v[1:-1]) - speed[:-1])
+        speed += 0.3 * (v[1:] - speed)
+        return np.concatenate([y[3:], (speed - y[3:]) / 0.6])
+
+    start = np.concatenate([sine_place(0.0) - 20.0 * np.array([3, 2, 1]), np.full(3, 15.0)])
+    found = solve_ivp(rates, (0, 20), start, method="DOP853", rtol=1e-10, atol=1e-10)
+    x, v = drive("lin", hidden, speed=sine, place=sine_place, duration=20.0, step=0.02)
+    np.testing.assert_allclose(x[-1, :3], found.y[:3, -1], atol=1e-6)
+    np.testing.assert_allclose(v[-1, :3], found.y[3:, -1], atol=1e-6)
+
+
+def test_a_delayed_driver_goes_by_the_gap_of_before():
+    x, v = drive("log", Hidden(T=0.4), speed=sine, place=sine_place, duration=20.0, step=0.05)
+    before = np.diff(x, axis=1)[:-8]
+    np.testing.assert_allclose(v[8:, :-1], V0["log"] * np.log(before / L), rtol=1e-12)
+
+
+def test_responses_to_an_opening_and_a_closing_gap_differ():
+    x, v = drive("lin", Hidden(kappa_open=0.6), speed=sine, place=sine_place, duration=20.0)
+    base = V0["lin"] * (1 - L / np.diff(x, axis=1))
+    away = v[:, 1:] - base
+    np.testing.assert_allclose(v[:, :-1], base + 0.6 * np.maximum(away, 0), rtol=1e-12)
+    assert (away > 0.1).any()
+    assert (away < -0.1).any()
+
+
+def test_smeared_edges_are_halfway_at_the_edge():
+    assert inside(10.0, 10.0, 90.0, 20.0) == pytest.approx(0.5)
+    assert [inside(p, 10.0, 90.0, 20.0) for p in (0.0, 20.0, 80.0, 100.0)] == [0.0, 1.0, 1.0, 0.0]
+    assert [inside(p, 10.0, 90.0, 0.0) for p in (9.9, 10.0, 90.0, 90.1)] == [0.0, 1.0, 1.0, 0.0]

@@ -1,0 +1,38 @@
+"""Cases with drivers who differ, with a quick substitute for the diagnosis."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pandas as pd
+import pytest
+
+import nnode
+from benchmarks import drivers
+
+
+def test_rows_are_scored_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def zone(table: pd.DataFrame, *given: Any, **options: Any) -> SimpleNamespace:
+        calls.append(table)
+        alpha = {"alpha": {"value": 0.88}}
+        effect = {"name": "speed_zone", "alternatives": [], "coefficients": alpha}
+        report = {"effects": [effect], "verdict": "named", "drivers": []}
+        return SimpleNamespace(plain=lambda: report)
+
+    monkeypatch.setattr(nnode, "diagnose", zone)
+    path = tmp_path / "table.csv"
+    size = ["--platoons", "3", "--vehicles", "3", "--processes", "1", "--table", str(path)]
+    monkeypatch.setattr(sys, "argv", ["drivers", "--seed", "5", "--cases", "2", *size])
+    for _ in range(2):
+        drivers.main()
+    assert len(calls) == 2
+    assert calls[0].groupby("sequence")["agent"].nunique().tolist() == [3, 3, 3]
+    rows = pd.read_csv(path, keep_default_na=False)
+    assert rows["effect"].tolist() == ["none", "speed_zone"]
+    assert rows[["exact", "false"]].to_numpy().tolist() == [[False, True], [True, False]]
+    assert rows["estimate"].tolist() == ["", "0.88"]
