@@ -29,7 +29,7 @@ from nnode.data.options import DataOptions
 from nnode.data.prepare import open_data
 from nnode.data.sequences import Sequences
 from nnode.errors import CheckpointError, ConfigError
-from nnode.files import csv_text, write_json, write_text
+from nnode.files import write_csv, write_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -119,7 +119,7 @@ class Predictions:
         from nnode.plots.style import save
 
         table, scores = folder / "prediction.csv", folder / "prediction.json"
-        write_text(table, csv_text(self.table))
+        write_csv(table, self.table)
         write_json(scores, self.plain())
         return [save(self.plot(), folder / "prediction.png"), table, scores]
 

@@ -19,7 +19,7 @@ def test_rows_are_scored_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     def zone(table: pd.DataFrame, *given: Any, **options: Any) -> SimpleNamespace:
         calls.append(table)
-        alpha = {"alpha": {"value": 0.88}}
+        alpha = {"alpha": {"value": 0.88, "low": 0.85, "high": 0.91}}
         effect = {"name": "speed_zone", "alternatives": [], "coefficients": alpha}
         report = {"effects": [effect], "verdict": "named", "drivers": []}
         return SimpleNamespace(plain=lambda: report)
@@ -36,3 +36,5 @@ def test_rows_are_scored_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert rows["effect"].tolist() == ["none", "speed_zone"]
     assert rows[["exact", "false"]].to_numpy().tolist() == [[False, True], [True, False]]
     assert rows["estimate"].tolist() == ["", "0.88"]
+    assert rows["covered"].tolist() == ["", "yes"]
+    assert set(rows["v0 covered"]) == {"-"}

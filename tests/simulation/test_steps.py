@@ -133,7 +133,7 @@ def test_a_single_sample_has_no_sampling_interval(platoon) -> None:  # type: ign
     ("options", "words"),
     [
         ({"method": "eular"}, r"solver\.method=eular.*euler"),
-        ({"gradient": "exact"}, r"solver\.gradient=exact.*adjoint or discrete"),
+        ({"gradient": "exact"}, r"solver\.gradient=exact.*adjoint, discrete"),
         ({"method": "scipy_solver", "gradient": "discrete"}, "leaves no graph"),
     ],
 )
