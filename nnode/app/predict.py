@@ -112,7 +112,7 @@ class Predictions:
                     bands={LEVEL: (gap["high"], gap["low"])},
                 )
             )
-        return band_panels(shown, median="predicted", band="band")
+        return band_panels(shown, median="predicted", band="band", begins=self.seconds)
 
     def write(self, folder: Path) -> list[Path]:
         """Write ``prediction.csv``, ``prediction.json`` and ``prediction.png``."""

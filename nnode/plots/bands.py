@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from nnode.plots.style import OKABE_ITO, dress, legend_above, new_figure
+from nnode.plots.style import GREY, OKABE_ITO, dress, legend_above, new_figure
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,14 @@ def band_panels(
     *,
     median: str = "median of samples",
     band: str = "of samples",
+    begins: float | None = None,
 ) -> Figure:
     """A panel per vehicle or person, two side by side.
 
     Args:
         what: label of the vertical axis.
         median, band: labels of the medians, and of the bands after their level.
+        begins: s, where the prediction begins; a dotted line marks it.
     """
     rows = -(-len(vehicles) // 2)
     figure = new_figure(7.2, 1.9 * rows + 0.5)
@@ -59,6 +61,8 @@ def band_panels(
             )
         ax.plot(vehicle.time, vehicle.median, color=blue, linewidth=1.0, label=median)
         ax.plot(vehicle.time, vehicle.measured, color="black", linewidth=1.2, label="measured")
+        if begins is not None:
+            ax.axvline(begins, color=GREY, linestyle=":", linewidth=1.0)
         dress(ax, x="time (s)", y=what, title=vehicle.name)
         if what.startswith("gap"):
             ax.set_ylim(bottom=min(0.0, float(vehicle.measured.min())))
