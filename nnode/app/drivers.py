@@ -148,12 +148,20 @@ class Drivers:
             if np.isfinite(row["lower"]):
                 texts[name] += f" [{row['lower']:.3g}, {row['upper']:.3g}]"
         differ = ", ".join(f"{name} by {texts[name]}" for name in self.differ)
-        return [
+        lines = [
             f"{len(self.table)} drivers; parameters that differ between them (standard deviation): "
-            f"{differ or 'none that the data tell'}; the parameters of the table are the medians",
+            f"{differ or 'none'}; the parameters of the table are the medians",
             f"pushes of {texts['push']} that last {texts['push_time']}; errors of measurement of "
             f"{texts['measurement']}",
         ]
+        for name, bound in self.variability["at_bound"].items():
+            if bound:
+                size = "smallest" if bound == "low" else "largest"
+                lines.append(
+                    f"the variation of {name} is estimated at its {size} allowed value: these data "
+                    "do not determine it"
+                )
+        return lines
 
     def plain(self) -> dict[str, Any]:
         """The content of ``result.json`` on drivers."""

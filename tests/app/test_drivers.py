@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -218,3 +219,17 @@ def test_drivers_of_noisy_positions_are_told_apart() -> None:
         assert values[f"idm.{name}"] == pytest.approx(TRUE[name], rel=0.05)
         assert 12 < found.drivers.variability.estimate[name] < 18
     assert values["idm.s0"] == pytest.approx(TRUE["s0"], abs=0.5)
+
+
+def test_the_summary_says_what_is_at_a_bound(fitted: nnode.Calibrator) -> None:
+    drivers = fitted.result_.drivers
+    assert drivers is not None
+    assert not [line for line in drivers.summary() if "allowed value" in line]
+    variability = drivers.variability.copy()
+    variability.loc["T", "at_bound"] = "low"
+    (line,) = [
+        line
+        for line in replace(drivers, variability=variability).summary()
+        if "allowed value" in line
+    ]
+    assert "variation of T is estimated at its smallest allowed value" in line
