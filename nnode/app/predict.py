@@ -242,7 +242,7 @@ def _predicted(
             f"seconds={seconds:g}: none of the {len(indices)} sequences is longer; give fewer"
         )
     sequences = [store[i] for i in long]
-    if reason := obstacle(model, sequences, least=1):
+    if reason := obstacle(model, sequences, needed=1):
         raise ConfigError(f"followers cannot be predicted: {reason}")
     variances = dict(variances)
     paths = replace(paths_of(sequences, STEP), error=variances.pop("measurement"))

@@ -170,11 +170,11 @@ def fit_drivers(
     )
 
 
-def obstacle(system: System, sequences: list[Sequence], least: int = LEAST_DRIVERS) -> str | None:
+def obstacle(system: System, sequences: list[Sequence], needed: int = LEAST_DRIVERS) -> str | None:
     """Why drivers who differ cannot be estimated for a model or its data; None if they can.
 
     Args:
-        least: number of followers that are needed.
+        needed: number of followers.
     """
     physical = sum(value.numel() for value, _ in system.physical().values())
     if system.domain != "traffic":
@@ -189,8 +189,8 @@ def obstacle(system: System, sequences: list[Sequence], least: int = LEAST_DRIVE
     if "dt" in getattr(system.formula, "symbols", ()):
         return "the law is a map from step to step"
     n_followers = sum(s.n_agents - 1 for s in sequences)
-    if n_followers < least:
-        return f"there are {n_followers} followers behind measured leaders, fewer than {least}"
+    if n_followers < needed:
+        return f"there are {n_followers} followers behind measured leaders, fewer than {needed}"
     if not np.ptp([s.dt for s in sequences]) < 1e-6:
         return "the sequences have different sampling intervals"
     return None

@@ -63,12 +63,12 @@ def predict(
     given = (times <= seconds + 1e-9) | (np.arange(len(times)) < 2)
     names = [name for name in variances if name not in ("push", "push_time")]
     law = Followers(system, paths)
-    known = replace(
+    past = replace(
         paths.starting_from(given),
         observed=paths.observed & given,
         agent=np.arange(len(paths.agent)),
     )
-    model = Followers(system, known, full_names(names, law.may_differ))
+    model = Followers(system, past, full_names(names, law.may_differ))
     initial = initial_variances(model)
     fixed = replace(
         initial,
@@ -80,7 +80,7 @@ def predict(
     mean, deviation = np.empty_like(data.residual), np.empty_like(data.residual)
     for f in range(len(mean)):
         covariance = _covariance(data, f, fixed.noise, fixed.spread, fixed.start)
-        at = known.observed[f]
+        at = past.observed[f]
         inner = covariance[np.ix_(at, at)] + paths.error**2 * np.eye(at.sum())
         gain = np.linalg.solve(inner, covariance[at]).T
         mean[f] = paths.x[f] - data.residual[f] + gain @ data.residual[f, at]

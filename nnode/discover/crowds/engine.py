@@ -64,7 +64,7 @@ class CrowdEngine:
         window: float = 1.5,
         clusters: np.ndarray | None = None,
     ) -> None:
-        self.sequences, self.least = list(sequences), rules().least
+        self.sequences, self.smallest_share = list(sequences), rules().least
         self.batch = collate(sequences)
         self.windows = Windows(sequences, window)
         window_of, place_of = self.windows.person.T

@@ -76,7 +76,7 @@ class TrafficEngine:
         clusters: np.ndarray | None = None,
         large: float = LARGE,
     ) -> None:
-        self.sequences, self.large, self.least = sequences, large, rules().least
+        self.sequences, self.large, self.smallest_share = sequences, large, rules().least
         self.names = [sequence.name for sequence in sequences]
         parts = [_windows(sequence, window) for sequence in sequences]
         self.batch = collate(part[0] for each in parts for part in each)

@@ -91,7 +91,7 @@ class FollowersEngine(TrafficEngine):
         like: FollowersEngine | None = None,
     ) -> None:
         super().__init__(sequences, np.inf, clusters, large)
-        self.least = -np.inf
+        self.smallest_share = -np.inf
         self._paths_by_step, self._like = dict[tuple[int, int], Paths](), like
         self._label = np.arange(len(sequences)) if clusters is None else np.asarray(clusters)
         self.population: Population | None = None

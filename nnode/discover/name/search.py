@@ -235,7 +235,7 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
     eligible = [
         c
         for c in candidates
-        if c.removed >= engine.least
+        if c.removed >= engine.smallest_share
         and c.gain.gain > 0
         and c.presence_pvalue < rules().level
         and c.strength_excludes_neutral(screen.label(c.name))

@@ -58,7 +58,7 @@ class Engine(Protocol):
         unit: ``(n,)`` number of the unit: agents whose parameters are estimated jointly.
         people: of each unit, per direction the sequence and the place of its agent; one entry if
             all directions belong to one agent.
-        least: smallest share of the squared errors that is worth naming; -inf if the tests
+        smallest_share: of the squared errors, from which an effect is named; -inf if the tests
             themselves require a minimum effect size.
     """
 
@@ -71,7 +71,7 @@ class Engine(Protocol):
     component: np.ndarray
     unit: np.ndarray
     people: list[list[tuple[int, int]]]
-    least: float
+    smallest_share: float
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` residuals of R runs of one model; NaN if a run diverges.

@@ -151,7 +151,7 @@ class Screen:
         self._signs = signs(int(cluster.max()) + 1, flips, self._rng)
         #: by an effect's name, the largest statistic of its probes under each flip
         self._null_statistics: dict[str, np.ndarray] = {}
-        self._least = np.ones(len(self._signs))
+        self._smallest_shares = np.ones(len(self._signs))
         self._adjusted_residuals: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def adjusted(self, columns: np.ndarray) -> np.ndarray:
@@ -214,18 +214,18 @@ class Screen:
             [np.append(largest[name], self._null_statistics[name][1:]) for name in best]
         )
         share = np.stack([at_least(row) for row in statistics])
-        self._least = share.min(0)
+        self._smallest_shares = share.min(0)
         for score, p_value in zip(best.values(), share[:, 0], strict=True):
-            score.p_value = float((self._least <= p_value + 1e-12).mean())
+            score.p_value = float((self._smallest_shares <= p_value + 1e-12).mean())
 
     def p_values(self, name: str, statistics: np.ndarray) -> np.ndarray:
         """``(R,)`` p-values, corrected for all effects, that an effect would have with these
         statistics."""
         null = np.sort(self._null_statistics[name])
         share = 1 - np.searchsorted(null, statistics, side="left") / len(null)
-        least = np.sort(self._least)
-        corrected = np.searchsorted(least, share + 1e-12, side="right") / len(least)
-        return np.asarray(np.maximum(corrected, 1 / len(least)))
+        shares = np.sort(self._smallest_shares)
+        corrected = np.searchsorted(shares, share + 1e-12, side="right") / len(shares)
+        return np.asarray(np.maximum(corrected, 1 / len(shares)))
 
     def statistic(self, evidence: Evidence, parts: np.ndarray) -> np.ndarray:
         """``(R,)`` the statistic of a direction if its scores were ``parts`` ``(G, R)``."""
