@@ -201,17 +201,20 @@ class FollowersEngine(TrafficEngine):
         start = previous
         if start is None and self._like is not None:
             start = self._like.population
-        populations = []
-        if start is not None:
-            populations.append(refit(start, fixed, paths, fixed=self._like is not None))
-        if start is None or (self._like is None and not start.plausible):
-            # an implausible estimate can be a local maximum, from which others are not reached
-            populations.append(fit_drivers(fixed, paths, pairs=0))
-        self.set_likeliest(populations)
+        if start is None:
+            self._set_population(fit_drivers(fixed, paths, pairs=0))
+        else:
+            self._set_population(refit(start, fixed, paths, fixed=self._like is not None))
 
-    def population_of(self, system: System) -> Population:
-        """The estimate with a model, starting from the present one; the engine keeps its own."""
+    def population_of(self, system: System, *, anew: bool = False) -> Population:
+        """The estimate with a model; the engine keeps its own.
+
+        Args:
+            anew: whether to start from the usual variances instead of the present estimate.
+        """
         trial = copy.copy(self)
+        if anew:
+            trial.population = None
         trial.fit_whitening(system, ParameterVector(system).row)
         assert trial.population is not None
         return trial.population

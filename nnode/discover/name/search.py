@@ -297,7 +297,11 @@ def _with_refitted_variances(
     model without a strong effect would attribute it to autocorrelated pushes."""
     assert selection.screen is not None
     likeliest = sorted(candidates, key=lambda c: c.fit.cost)[:LIKELY]
-    engine.set_likeliest([engine.population_of(candidate.fit.system) for candidate in likeliest])
+    populations = [engine.population_of(candidate.fit.system) for candidate in likeliest]
+    best = max(populations, key=lambda population: population.criterion)
+    if not best.plausible:  # it can be a local maximum
+        populations.append(engine.population_of(best.model.system, anew=True))
+    engine.set_likeliest(populations)
     selection.fit = refine(engine, selection.fit.system)
     refitted = []
     for candidate in candidates:
