@@ -49,6 +49,15 @@ KRAUSS_BALLISTIC: dict[str, Any] = {
     "source": "SUMO's Krauss with --step-method.ballistic",
 }
 
+#: JuPedSim's laws: the way to the goal, and relative positions, both ``lookahead`` seconds later.
+_LOOKAHEAD = {
+    "to_x": "goal_x - x - lookahead*vx",
+    "to_y": "goal_y - y - lookahead*vy",
+    "way": "sqrt(to_x**2 + to_y**2)",
+    "then_x": "dx + lookahead*dvx",
+    "then_y": "dy + lookahead*dvy",
+}
+
 #: JuPedSim's social force, by mass: with a desired speed, and nobody farther away than 2.5 m. Its
 #: steps place people with their new velocity, Euler's here with the old one. A place that is meant
 #: one step earlier turns one into the other, if forces act from where people are a step later.
@@ -65,11 +74,7 @@ SOCIAL_FORCE: dict[str, Any] = {
         "lookahead": "0 s",
     },
     "where": {
-        "to_x": "goal_x - x - lookahead*vx",
-        "to_y": "goal_y - y - lookahead*vy",
-        "way": "sqrt(to_x**2 + to_y**2)",
-        "then_x": "dx + lookahead*dvx",
-        "then_y": "dy + lookahead*dvy",
+        **_LOOKAHEAD,
         "far": "sqrt(then_x**2 + then_y**2)",
         "contact": "max(2*radius - far, 0)",
         "push": "choose(reach - far, A*exp((2*radius - far)/B) + k*contact, 0)/far",
@@ -126,11 +131,7 @@ CENTRIFUGAL: dict[str, Any] = {
         "lookahead": "0 s",
     },
     "where": {
-        "to_x": "goal_x - x - lookahead*vx",
-        "to_y": "goal_y - y - lookahead*vy",
-        "way": "sqrt(to_x**2 + to_y**2)",
-        "then_x": "dx + lookahead*dvx",
-        "then_y": "dy + lookahead*dvy",
+        **_LOOKAHEAD,
         "away": "sqrt(then_x**2 + then_y**2)",
         "m_x": "then_x/away",
         "m_y": "then_y/away",

@@ -18,7 +18,7 @@ from nnode.app.evaluate import SavedRun
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError, unknown_value
+from nnode.errors import CheckpointError, ConfigError, unknown_value
 from nnode.exchange.counterpart import Counterpart, Intervals
 from nnode.exchange.jupedsim import has_parameters, jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import has_type, sumo_type, traffic_of
@@ -50,12 +50,29 @@ def checkpoint_of(run: str) -> Path:
     return place if place.suffix == ".pt" else place / BEST
 
 
-def intervals_of(run: str) -> Intervals:
-    """The parameters in a run's ``result.json``; empty without the file."""
+def result_of(run: str) -> dict[str, Any]:
+    """The content of a run's ``result.json``.
+
+    Raises:
+        CheckpointError: the file is missing or damaged.
+    """
     path = checkpoint_of(run).parent.parent / RESULT
     try:
-        parameters = json.loads(path.read_text(encoding="utf-8"))["parameters"]
-    except (OSError, ValueError, KeyError):
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CheckpointError(
+            f"{path} cannot be read; give the folder of a complete training"
+        ) from error
+    if not isinstance(content, dict):
+        raise CheckpointError(f"{path} has no entries; give the folder of a complete training")
+    return content
+
+
+def intervals_of(run: str) -> Intervals:
+    """The parameters in a run's ``result.json``; empty without the file."""
+    try:
+        parameters = result_of(run)["parameters"]
+    except (CheckpointError, KeyError):
         return {}
     return parameters if isinstance(parameters, dict) else {}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,10 +14,9 @@ from scipy.stats import norm
 
 from nnode.app.calibration import Calibration
 from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.runs import RESULT
 from nnode.app.cli.saved import merge_saved, options_of
 from nnode.app.evaluate import choose
-from nnode.app.export import checkpoint_of
+from nnode.app.export import checkpoint_of, result_of
 from nnode.app.python.inputs import Table, data_used
 from nnode.app.training import started
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
@@ -34,8 +32,8 @@ from nnode.files import write_csv, write_json
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Shortest known beginning, s. With 1 s, the linearisation at the driver's parameters failed for
-#: one of 32 simulated drivers: his 95 % band had errors of up to 40 of its standard deviations.
+#: Shortest known beginning, s. With 1 s, the linearisation failed for one of 96 simulated drivers,
+#: whose error reached 13 standard deviations of its band; with 2 s, the largest was 3.3.
 SHORTEST = 2.0
 #: Level of the bands.
 LEVEL = 0.95
@@ -153,7 +151,8 @@ def predict_run(
         checkpoint = run.checkpoint
         drivers = None if run.drivers is None else run.drivers.plain()
     else:
-        checkpoint, drivers = load_checkpoint(checkpoint_of(str(run))), _drivers(str(run))
+        checkpoint = load_checkpoint(checkpoint_of(str(run)))
+        drivers = result_of(str(run)).get("drivers")
     variances = _variances(drivers)
     store = data_used(checkpoint) if data is None else Sequences.of(data)
     return _predicted(checkpoint, store, variances, seconds, part)
@@ -165,10 +164,8 @@ def predict(config: DictConfig, folder: Path) -> None:
     Raises:
         NNodeError: see :func:`predict_run`.
     """
-    checkpoint, variances = (
-        load_checkpoint(checkpoint_of(config.run)),
-        _variances(_drivers(config.run)),
-    )
+    checkpoint = load_checkpoint(checkpoint_of(config.run))
+    variances = _variances(result_of(config.run).get("drivers"))
     config = with_prepared(merge_saved(config, checkpoint.config, ("data",)))
     data: DataOptions = options_of(config.data)
     store = open_data(data, folder / "data")
@@ -176,22 +173,6 @@ def predict(config: DictConfig, folder: Path) -> None:
     print(predictions)
     for path in predictions.write(folder):
         print(f"{'plot' if path.suffix == '.png' else path.name.partition('.')[0]}: {path}")
-
-
-def _drivers(run: str) -> Any:
-    """The differences between drivers in a run's ``result.json``; None if there are none.
-
-    Raises:
-        CheckpointError: the file is missing or damaged.
-    """
-    path = checkpoint_of(run).parent.parent / RESULT
-    try:
-        return json.loads(path.read_text(encoding="utf-8")).get("drivers")
-    except (OSError, ValueError, AttributeError) as error:
-        raise CheckpointError(
-            f"{path} cannot be read, which holds the differences between drivers; give the folder "
-            "of a complete training"
-        ) from error
 
 
 def _variances(drivers: Any) -> dict[str, float]:
@@ -236,12 +217,13 @@ def _predicted(
     model = checkpoint.build().double()
     store = started(checkpoint, store)
     _, indices, _ = choose(store, checkpoint, part)
-    long = [i for i in indices if store[i].time[-1] - store[i].time[0] > seconds + store[i].dt]
-    if not long:
+    chosen = {i: store[i] for i in indices}
+    chosen = {i: s for i, s in chosen.items() if s.time[-1] - s.time[0] > seconds + s.dt}
+    sequences = list(chosen.values())
+    if not sequences:
         raise ConfigError(
             f"seconds={seconds:g}: none of the {len(indices)} sequences is longer; give fewer"
         )
-    sequences = [store[i] for i in long]
     if reason := obstacle(model, sequences, needed=1):
         raise ConfigError(f"followers cannot be predicted: {reason}")
     variances = dict(variances)
@@ -278,7 +260,7 @@ def _predicted(
         }
     )
     means = squares.groupby("sequence", sort=False).mean()
-    _, label = np.unique(clusters(store.index)[long], return_inverse=True)
+    _, label = np.unique(clusters(store.index)[list(chosen)], return_inverse=True)
     return Predictions(
         table=table,
         seconds=seconds,

@@ -344,14 +344,14 @@ class Followers:
         fixed = self._constants(theta)
 
         def rate(t: float, y: np.ndarray) -> np.ndarray:
-            initial_values = round(t / paths.half)
+            at = round(t / paths.half)
             values = {**fixed, **dict(zip(self.lane.rates, y, strict=True)), "t": t}
             rate_values = np.empty_like(y)
-            rates = self._rates({**values, **_ahead_symbols(paths.ahead[initial_values])})
+            rates = self._rates({**values, **_ahead_symbols(paths.ahead[at])})
             for target, part in zip(rate_values, rates, strict=True):
                 target[...] = part
             if pushed is not None:
-                rate_values[order - 1] += pushed(initial_values, y, rate_values)
+                rate_values[order - 1] += pushed(at, y, rate_values)
             return rate_values
 
         shape = len(theta), len(paths.agent)
@@ -522,7 +522,7 @@ def score_bias(
 
 
 def antithetic_draws(seed: int) -> list[Draw]:
-    """An antithetic pair of draws: antithetic_draws signs, so that linear terms cancel."""
+    """An antithetic pair of draws: they have opposite signs, so that linear terms cancel."""
     return [partial(_signed, np.random.default_rng(seed), sign) for sign in (1.0, -1.0)]
 
 
