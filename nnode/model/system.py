@@ -128,8 +128,10 @@ class System(nn.Module):
         for term in terms:
             rule = term.rule_for(self.order)
             number = 0 if rule is None else rule.memory
-            term_memory = None if memory is None else memory[..., first : first + number]
-            first += number
+            term_memory = None
+            if memory is not None and number:
+                term_memory = memory[..., first : first + number]
+                first += number
             rate = term(replace(state, terms=terms, rate=total, memory=term_memory))
             if number:
                 added.append(rate[..., self.dim :])
@@ -172,6 +174,11 @@ class System(nn.Module):
         """Move every parameter into its admissible set."""
         for term in self.term_list:
             term.project_()
+
+
+def _joined(first: Tensor, added: Tensor) -> Tensor:
+    """States followed by those that terms add, which most models do not have."""
+    return torch.cat([first, added], -1) if added.shape[-1] else first
 
 
 class Traffic(System):
@@ -241,13 +248,8 @@ class Traffic(System):
         lead = scene.leader[..., None]
         if place is not None:
             measured = [place, scene.measured_rate_at(t)][: self.order]
-            y = torch.cat(
-                [
-                    torch.where(lead, torch.cat(measured, -1), y[..., : self.order]),
-                    y[..., self.order :],
-                ],
-                -1,
-            )
+            moved = torch.where(lead, torch.cat(measured, -1), y[..., : self.order])
+            y = _joined(moved, y[..., self.order :])
         law = self.terms[0]
         # a law of only the gap computes its speed without the lane's formula
         alone = len(self.terms) == 1 and isinstance(law, Law) and law.of_gap
@@ -259,8 +261,7 @@ class Traffic(System):
         if place is None:
             return rates
         # the leader's state is never read: its place is known at every time
-        rate = rates[..., :1].masked_fill(lead, 0.0)
-        return torch.cat([rate, rates[..., 1:]], -1)
+        return _joined(rates[..., :1].masked_fill(lead, 0.0), rates[..., 1:])
 
     def _imposed(self, rate: Tensor, state: State) -> Tensor:
         # effects depend on the speed of the vehicle ahead; laws of the gap alone do not

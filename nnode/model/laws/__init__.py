@@ -7,7 +7,7 @@ import copy
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from importlib.resources import files
 from operator import itemgetter
 from typing import Any, ClassVar
@@ -313,7 +313,7 @@ class Law(Term):
     def rule_for(self, order: int) -> Rule | None:
         return self.rule
 
-    @property
+    @cached_property
     def of_gap(self) -> bool:
         """Whether it is a speed that depends only on the gap."""
         if self.domain != "traffic" or self.order != 1 or self.formulas.memory:
