@@ -186,10 +186,10 @@ def _read_database(path: Path) -> tuple[pd.DataFrame, float, str | None]:
             for name in ("trajectory_data", "metadata"):
                 if kinds.get(name) != "table":
                     # a view would run whatever query the file has brought along
-                    held = ", ".join(n for n, kind in kinds.items() if kind == "table") or "none"
+                    held = [str(n) for n, kind in kinds.items() if kind == "table"]
                     raise DataError(
                         f"{path} has no table {name}, as JuPedSim's databases have; it has the "
-                        f"tables: {held}"
+                        f"tables: {', '.join(held) or 'none'}"
                     )
             rate = _rate(path, base)
             people = _people(path, base)

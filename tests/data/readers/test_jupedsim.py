@@ -176,6 +176,13 @@ def test_several_polygons() -> None:
         ({"areas": (ROOM, ROOM.replace("10", "12"))}, ["2 of them", "data.geometry"]),
         ({"areas": ("POINT (1 1)",)}, ["table geometry", "Point"]),
         ({"extra": "DROP TABLE metadata;"}, ["no table metadata", "trajectory_data"]),
+        (
+            {
+                "extra": "PRAGMA writable_schema=ON; "
+                "UPDATE sqlite_master SET name = x'66ff' WHERE name = 'metadata';"
+            },
+            ["no table metadata", "trajectory_data"],
+        ),
     ],
 )
 def test_one_clear_error(tmp_path: Path, change: dict, words: list[str]) -> None:
