@@ -179,9 +179,9 @@ def test_several_polygons() -> None:
         (
             {
                 "extra": "PRAGMA writable_schema=ON; "
-                "UPDATE sqlite_master SET name = x'66ff' WHERE name = 'metadata';"
+                "UPDATE sqlite_master SET name = CAST(name AS BLOB);"
             },
-            ["no table metadata", "trajectory_data"],
+            ["no table trajectory_data", "metadata"],
         ),
     ],
 )
