@@ -154,6 +154,11 @@ class Drivers:
             f"pushes of {texts['push']} that last {texts['push_time']}; errors of measurement of "
             f"{texts['measurement']}",
         ]
+        if "lasting_error" in texts:
+            lines.append(
+                f"further errors of {texts['lasting_error']} that last "
+                f"{texts['lasting_error_time']}"
+            )
         for name, bound in self.variability["at_bound"].items():
             if bound:
                 size = "smallest" if bound == "low" else "largest"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -177,15 +177,18 @@ def predict(config: DictConfig, folder: Path) -> None:
 
 def _variances(drivers: Any) -> dict[str, float]:
     """Standard deviations and times by name, as :func:`nnode.population.prediction.predict` takes
-    them, and ``measurement`` (m)."""
+    them."""
     if drivers is None:
         raise ConfigError(
             "the run has no differences between drivers, from which a driver's parameters are "
             "predicted; train with trainer.drivers=auto, in Python nnode.fit(..., drivers='auto')"
         )
+    from nnode.population.likelihood import NOISE  # compiled code takes a second
+
     try:
         rows = drivers["variability"]
-        names = ["push", "push_time", "measurement", *drivers["differ"]]
+        lasting = [name for name in NOISE[3:] if name in rows]
+        names = [*NOISE[:3], *lasting, *drivers["differ"]]
         values = {name: float(rows[name]["estimate"]) for name in names}
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
@@ -207,6 +210,7 @@ def _predicted(
 ) -> Predictions:
     from nnode.population.drivers import STEP, obstacle  # compiled code takes a second
     from nnode.population.followers import paths_of
+    from nnode.population.likelihood import NOISE
     from nnode.population.prediction import predict as predict_paths
 
     if not SHORTEST <= seconds < np.inf:
@@ -226,12 +230,12 @@ def _predicted(
         )
     if reason := obstacle(model, sequences, needed=1):
         raise ConfigError(f"followers cannot be predicted: {reason}")
-    variances = dict(variances)
-    paths = replace(paths_of(sequences, STEP), error=variances.pop("measurement"))
+    paths = paths_of(sequences, STEP)
     prediction = predict_paths(model, paths, variances, seconds)
-    alike = {name: variances[name] for name in ("push", "push_time")}
+    alike = {name: value for name, value in variances.items() if name in NOISE}
     typical = predict_paths(model, paths, alike, seconds).mean
-    half = norm.ppf(0.5 + LEVEL / 2) * np.hypot(prediction.deviation, paths.error)
+    error = np.hypot(variances["measurement"], variances.get("lasting_error", 0.0))
+    half = norm.ppf(0.5 + LEVEL / 2) * np.hypot(prediction.deviation, error)
     rows = []
     for f, (b, place) in enumerate(zip(paths.sequence, paths.place, strict=True)):
         s, k = sequences[b], slice(sequences[b].n_samples)

@@ -279,7 +279,8 @@ class Variation:
     Attributes:
         name: a parameter that differs between drivers, in % of the typical driver's; ``push``: of
             disturbances of the highest rate; ``push_time``: their correlation time;
-            ``measurement``: of errors of positions.
+            ``measurement``: of errors of positions; ``lasting_error``, ``lasting_error_time``: of
+            their autocorrelated part, if there is one.
         estimate: with its 95 % interval from ``lower`` to ``upper``, in ``unit``; NaN if it is not
             estimated.
         at_bound: ``low`` or ``high`` if it is at a bound.

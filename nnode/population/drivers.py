@@ -21,7 +21,7 @@ from nnode.population.estimate import (
     fit_variances,
 )
 from nnode.population.followers import Followers, Paths, score_bias
-from nnode.population.likelihood import Marginal, PushNoise, marginal
+from nnode.population.likelihood import Linearised, Marginal, PushNoise, marginal
 from nnode.simulation.rhs import formula_of
 
 #: Bounds of standard deviations of logarithms of parameters, and where searches start.
@@ -40,6 +40,9 @@ SHORT, LONG, LASTING = 1.0, 1 / 3, 3.0
 START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
 #: Largest step of a parameter's logarithm, and the tolerance of estimates.
 LONGEST, TOLERANCE = 0.3, 1e-2
+#: Bounds of standard deviations of errors of positions, m, and of the correlation time of
+#: autocorrelated ones, s. Searches for the latter start at 1 s.
+ERRORS, ERROR_TIMES = (1e-3, 1.0), (0.1, 5.0)
 #: At most so many candidate random effects are estimated before the best is chosen.
 RANKED = 2
 #: Linearisations of each of these before the best is chosen. Most estimates converge in fewer. If
@@ -69,14 +72,12 @@ class Population:
 
     Attributes:
         model: the law behind measured leaders.
-        noise: pushes and errors of measurement.
         estimate: parameters, deviations, variances.
         bias: ``(P,)`` the bias that was subtracted from the parameters, in the scales in which
             they are varied.
     """
 
     model: Followers
-    noise: PushNoise
     estimate: Estimate
     bias: np.ndarray
 
@@ -115,8 +116,9 @@ class Population:
     def criterion(self) -> float:
         """Log marginal likelihood minus half the number of parameters times the logarithm of the
         number of drivers (BIC); the larger the better."""
-        price = len(self.estimate.theta) * math.log(max(len(self.estimate.agents), 2)) / 2
-        return self.marginal.loglik - price
+        variances = self.estimate.variances
+        number = len(self.estimate.theta) + np.count_nonzero(variances.low < variances.high)
+        return self.marginal.loglik - number * _price(len(self.estimate.agents))
 
 
 def fit_drivers(
@@ -144,7 +146,7 @@ def fit_drivers(
         ConfigError: a name that the law does not have, a model without a formula, or simulations
             that blow up.
     """
-    plain, noise = Followers(system, paths), PushNoise(paths.error)
+    plain = Followers(system, paths)
     initial = plain(plain.start, np.zeros((0, 0)), np.zeros((0, 0)))
     if not np.isfinite(initial.columns).all():
         raise ConfigError(
@@ -157,11 +159,13 @@ def fit_drivers(
     starts = [plain.start] if first is None else [plain.start, plain.at(np.array(alternative))]
     law = plain.may_differ
     if drivers == "auto":
-        population = _with_random_effects(_most_likely(plain, noise, starts))
+        population = _with_random_effects(_with_lasting_errors(_most_likely(plain, starts)))
+        better = _with_lasting_errors(population)
+        population = population if better is population else _with_random_effects(better)
     else:
         names = [] if drivers == "none" else full_names(drivers, law)
         model = Followers(system, paths, names) if names else plain
-        population = _most_likely(model, noise, starts)
+        population = _with_lasting_errors(_most_likely(model, starts))
     correctable = pairs > 0 and population.estimate.converged
     return (
         _bias_corrected(population, np.random.default_rng(seed), pairs)
@@ -210,10 +214,10 @@ def refit(before: Population, system: System, paths: Paths, *, fixed: bool) -> P
     same_followers &= previous.start.shape == (len(paths.agent), model.starts)
     modes = (previous.agents, previous.start) if same_followers else (None, None)
     if not fixed:
-        return _with_random_effects(_estimated(model, before.noise, model.start, variances, *modes))
+        return _with_random_effects(_estimated(model, model.start, variances, *modes))
     agents, start = modes
     deviations = fit_deviations(
-        model, before.noise, model.start, variances, agents=agents, start=start
+        model, PushNoise(), model.start, variances, agents=agents, start=start
     )
     return replace(before, model=model, estimate=deviations, bias=np.zeros(len(model.start)))
 
@@ -249,22 +253,21 @@ def _bias_corrected(population: Population, rng: np.random.Generator, pairs: int
     The linearisation at the modes and the errors of smoothed leaders bias the estimates. Standard
     deviations are not corrected: their bias is smaller than the Monte Carlo error of a correction.
     """
-    model, noise, before = population.model, population.noise, population.estimate
+    model, before = population.model, population.estimate
     try:
-        bias = score_bias(model, noise, before, rng, pairs)
+        bias = score_bias(model, PushNoise(), before, rng, pairs)
     except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
         log.warning("parameters are not corrected for their bias: simulated drivers left the road")
         return population
     bias = np.clip(bias, -LONGEST, LONGEST)
     theta = np.clip(before.theta - bias, model.low, model.high)
-    deviations = fit_deviations(model, noise, theta, before.variances)
+    deviations = fit_deviations(model, PushNoise(), theta, before.variances)
     deviations = replace(deviations, converged=before.converged)
     return replace(population, estimate=deviations, bias=before.theta - theta)
 
 
 def _estimated(
     model: Followers,
-    noise: PushNoise,
     theta: np.ndarray,
     variances: Variances,
     agents: np.ndarray | None = None,
@@ -275,7 +278,7 @@ def _estimated(
     deviations of drivers and of starts."""
     result = estimate(
         model,
-        noise,
+        PushNoise(),
         theta,
         variances,
         low=model.low,
@@ -286,13 +289,40 @@ def _estimated(
         start=start,
         steps=steps,
     )
-    return Population(model=model, noise=noise, estimate=result, bias=np.zeros(len(result.theta)))
+    return Population(model=model, estimate=result, bias=np.zeros(len(result.theta)))
 
 
-def _most_likely(model: Followers, noise: PushNoise, starts: list[np.ndarray]) -> Population:
+def _most_likely(model: Followers, starts: list[np.ndarray]) -> Population:
     """The estimate with the largest likelihood from several starts."""
-    fits = [_estimated(model, noise, theta, initial_variances(model)) for theta in starts]
+    fits = [_estimated(model, theta, initial_variances(model)) for theta in starts]
     return max(fits, key=lambda fit: fit.marginal.loglik)
+
+
+def _price(agents: int) -> float:
+    """Increase of the log likelihood that one more parameter needs (Schwarz 1978)."""
+    return math.log(max(agents, 2)) / 2
+
+
+def _with_lasting_errors(best: Population) -> Population:
+    """The estimate with autocorrelated errors of measurement, if they raise the log likelihood by
+    more than two parameters need; otherwise the same."""
+    before, model = best.estimate, best.model
+    push, push_time, white, *known = before.variances.noise
+    if known:
+        return best
+    at, (low, high), (short, long) = 3, ERRORS, ERROR_TIMES
+    start = replace(
+        before.variances,
+        noise=np.array([push, push_time, white, white, 1.0]),
+        low=np.insert(before.variances.low, at, [low, short]),
+        high=np.insert(before.variances.high, at, [high, long]),
+    )
+    limit = best.marginal.loglik + 2 * _price(len(before.agents))
+    loglik, refitted = _refitted(best, before.data, start)
+    if loglik <= limit:
+        return best
+    extended = _estimated(model, before.theta, refitted, before.agents, before.start)
+    return extended if extended.marginal.loglik > limit else best
 
 
 def _with_random_effects(best: Population) -> Population:
@@ -303,7 +333,7 @@ def _with_random_effects(best: Population) -> Population:
     likelihood of the samples as linearised without them, with refitted variances; then the best two
     are estimated.
     """
-    price = math.log(max(len(best.model.paths.names), 2)) / 2
+    price = _price(len(best.model.paths.names))
     while (better := _next_random_effect(best, price)) is not None:
         best = better
     return best
@@ -320,7 +350,7 @@ def _next_random_effect(best: Population, price: float) -> Population | None:
         system, paths = best.model.system, best.model.paths
         model, before = Followers(system, paths, [*best.random, name]), best.estimate
         variances = _with_random_effect(before.variances)
-        fit = _estimated(model, best.noise, before.theta, variances, steps=RANKING_STEPS)
+        fit = _estimated(model, before.theta, variances, steps=RANKING_STEPS)
         if _identified(fit.estimate) and fit.marginal.loglik > limit:
             improved.append(fit)
         if len(improved) == RANKED:
@@ -330,7 +360,7 @@ def _next_random_effect(best: Population, price: float) -> Population | None:
         return chosen
     partial = chosen.estimate
     modes = partial.agents, partial.start
-    return _estimated(chosen.model, best.noise, partial.theta, partial.variances, *modes)
+    return _estimated(chosen.model, partial.theta, partial.variances, *modes)
 
 
 def _linearised_loglik(best: Population, name: str) -> float:
@@ -338,11 +368,17 @@ def _linearised_loglik(best: Population, name: str) -> float:
     model, previous = best.model, best.estimate
     random = [*model.random, model.names.index(name)]
     data = replace(previous.data, random=previous.data.fixed[..., random])
-    variances = fit_variances(
-        data, best.noise, _with_random_effect(previous.variances), tolerance=TOLERANCE
-    )
-    products = best.noise.products(data, variances.noise)
-    return marginal(data, products, variances.spread, variances.start).loglik
+    return _refitted(best, data, _with_random_effect(previous.variances))[0]
+
+
+def _refitted(best: Population, data: Linearised, variances: Variances) -> tuple[float, Variances]:
+    """The log marginal likelihood of linearised samples with refitted variances, and these."""
+    theta, model = best.estimate.theta, best.model
+    bounds = {"low": model.low - theta, "high": model.high - theta}
+    refitted = fit_variances(data, PushNoise(), variances, tolerance=TOLERANCE, **bounds)
+    products = PushNoise().products(data, refitted.noise)
+    result = marginal(data, products, refitted.spread, refitted.start, **bounds)
+    return result.loglik, refitted
 
 
 def _identified(fit: Estimate) -> bool:
@@ -363,11 +399,11 @@ def initial_variances(model: Followers) -> Variances:
     for _ in range(model.starts - 1):  # of speeds, and of what terms remember
         starts, lowest, highest = [*starts, speed], [*lowest, low_speed], [*highest, high_speed]
     return Variances(
-        noise=np.array([push, np.clip(LASTING, short, long)]),
+        noise=np.array([push, np.clip(LASTING, short, long), paths.error]),
         spread=np.full(number, SPREAD),
         start=np.array(starts),
-        low=np.array([low_push, short, *[LEAST_SPREAD] * number, *lowest]),
-        high=np.array([high_push, long, *[MOST_SPREAD] * number, *highest]),
+        low=np.array([low_push, short, ERRORS[0], *[LEAST_SPREAD] * number, *lowest]),
+        high=np.array([high_push, long, ERRORS[1], *[MOST_SPREAD] * number, *highest]),
     )
 
 
@@ -388,12 +424,12 @@ def _with_random_effect(variances: Variances) -> Variances:
     """Variances with one more random effect. If the correlation time of the pushes is at its bound,
     it stood in for this effect, and the search restarts with a shorter one."""
     at = len(variances.noise) + len(variances.spread)
-    push, push_time = variances.noise
+    push, push_time, *error = variances.noise
     if push_time >= (1 - NEAR) * variances.high[1]:
         push, push_time = push / 2, np.clip(LASTING, variances.low[1], variances.high[1])
     return replace(
         variances,
-        noise=np.array([push, push_time]),
+        noise=np.array([push, push_time, *error]),
         spread=np.append(variances.spread, SPREAD),
         low=np.insert(variances.low, at, LEAST_SPREAD),
         high=np.insert(variances.high, at, MOST_SPREAD),

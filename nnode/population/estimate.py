@@ -16,7 +16,7 @@ Source: Lindstrom & Bates 1990, Biometrics 46; Wolfinger & Lin 1997, Comput. Sta
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.optimize import minimize
@@ -145,12 +145,25 @@ def estimate(
     for _ in range(steps):
         before = variances
         variances = fit_variances(
-            data, noise, variances, restricted=restricted, tolerance=tolerance
+            data,
+            noise,
+            variances,
+            low=low - theta,
+            high=high - theta,
+            restricted=restricted,
+            tolerance=tolerance,
         )
         products = noise.products(data, variances.noise)
-        current = marginal(data, products, variances.spread, variances.start, restricted=restricted)
-        change = np.clip(current.change, -longest, longest)
-        change = np.clip(change, low - theta, high - theta)
+        current = marginal(
+            data,
+            products,
+            variances.spread,
+            variances.start,
+            low=np.maximum(low - theta, -longest),
+            high=np.minimum(high - theta, longest),
+            restricted=restricted,
+        )
+        change = current.change
         misfit = _misfit(data, products, variances, agents, start)
         reversed_step = previous_change @ current.information @ change < 0
         relaxation = max(relaxation / 2, LEAST) if reversed_step else min(1.25 * relaxation, 1.0)
@@ -183,9 +196,10 @@ def estimate(
         if largest_change < tolerance or accepted is None:
             converged = bool(largest_change < tolerance)
             break
-    variances = fit_variances(data, noise, variances, restricted=restricted, tolerance=tolerance)
+    bounds: dict[str, Any] = {"low": low - theta, "high": high - theta, "restricted": restricted}
+    variances = fit_variances(data, noise, variances, tolerance=tolerance, **bounds)
     products = noise.products(data, variances.noise)
-    final = marginal(data, products, variances.spread, variances.start, restricted=restricted)
+    final = marginal(data, products, variances.spread, variances.start, **bounds)
     return Estimate(
         theta=theta,
         agents=agents,
@@ -212,6 +226,9 @@ def fit_deviations(
     Args:
         response, noise, agents, start: see :func:`estimate`.
         theta: ``(P,)`` the parameters.
+
+    Returns:
+        An estimate whose marginal likelihood is that of free parameters, with their change.
     """
     fixed = replace(variances, low=variances.row, high=variances.row)
     modes = estimate(
@@ -225,7 +242,9 @@ def fit_deviations(
         agents=agents,
         start=start,
     )
-    return replace(modes, variances=variances)
+    products = noise.products(modes.data, variances.noise)
+    free = marginal(modes.data, products, variances.spread, variances.start)
+    return replace(modes, variances=variances, marginal=free)
 
 
 def fit_variances(
@@ -233,6 +252,8 @@ def fit_variances(
     noise: Noise,
     variances: Variances,
     *,
+    low: np.ndarray | None = None,
+    high: np.ndarray | None = None,
     restricted: bool = False,
     tolerance: float = 1e-3,
 ) -> Variances:
@@ -242,6 +263,8 @@ def fit_variances(
     approximates the information (Berndt et al. 1974).
 
     Args:
+        low, high: ``(P,)`` bounds of the change of the parameters, which have their most likely
+            values.
         tolerance: the search ends when a step raises the log likelihood by less.
     """
     logs_all, free = np.log(variances.row), np.flatnonzero(variances.low < variances.high)
@@ -259,7 +282,15 @@ def fit_variances(
             key = tuple(trial.noise)
             if key not in products:
                 products[key] = noise.products(data, trial.noise)
-            return marginal(data, products[key], trial.spread, trial.start, restricted=restricted)
+            return marginal(
+                data,
+                products[key],
+                trial.spread,
+                trial.start,
+                low=low,
+                high=high,
+                restricted=restricted,
+            )
 
         return likelihood(row), [likelihood(row + step) for step in DIFFERENCE * np.eye(len(row))]
 
@@ -272,13 +303,13 @@ def fit_variances(
         slope = np.array([up.loglik - centre.loglik for up in sides]) / DIFFERENCE
         return -centre.loglik, -slope * scale
 
-    low, high = np.log(variances.low[free]) / scale, np.log(variances.high[free]) / scale
+    lowest, highest = np.log(variances.low[free]) / scale, np.log(variances.high[free]) / scale
     best = minimize(
         value,
         logs_all[free] / scale,
         jac=True,
         method="L-BFGS-B",
-        bounds=list(zip(low, high, strict=True)),
+        bounds=list(zip(lowest, highest, strict=True)),
         options={"ftol": tolerance / max(abs(centre.loglik), 1.0), "gtol": tolerance},
     )
     logs_all[free] = best.x * scale

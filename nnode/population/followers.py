@@ -34,7 +34,8 @@ from nnode.simulation.linear import trapezoidal
 from nnode.simulation.numpy import simulated, strides
 from nnode.simulation.rhs import formula_of
 
-#: Smallest standard deviation of measurement errors, m: that of a camera.
+#: Smallest standard deviation of measurement errors where their estimation starts, m: that of a
+#: camera.
 FLOOR = 0.01
 #: Range of white measurement errors, m. Below it, positions were simulated, or they were smoothed:
 #: then their errors are autocorrelated, which the likelihood neglects. SUMO's paths at 5 Hz, which
@@ -70,7 +71,7 @@ class Paths:
         ahead_at_samples: ``(K, 4, F)`` the same at the sampling times.
         second: ``(F,)`` 1 where there is a second vehicle ahead.
         start: ``(2, F)`` smoothed position and speed at the first sample.
-        error: standard deviation of the errors of measurement, m.
+        error: standard deviation of the errors of measurement by fourth differences, m.
         batch: of each follower the sequence with himself and the one or two vehicles ahead.
     """
 
@@ -98,16 +99,16 @@ class Paths:
         ]
         return replace(self, start=np.stack(start, 1))
 
-    def remeasured(self, x: np.ndarray, draw: Draw) -> Paths:
+    def remeasured(self, x: np.ndarray, errors: Draw) -> Paths:
         """Simulated measurements: of other followers, and of leaders whose true paths are the
         smoothed ones.
 
         Args:
             x: ``(F, K)`` true positions of the followers, m.
-            draw: of the errors of measurement.
+            errors: draws the errors of measurement of paths ``(..., K)``, m.
         """
-        measured = x + self.error * draw(x.shape)
-        smoothed = [smooth(true + self.error * draw(true.shape)) for true in self.smoothed]
+        measured = x + errors(x.shape)
+        smoothed = [smooth(true + errors(true.shape[::-1]).T) for true in self.smoothed]
         which = smoothed, self.sequence, self.place, self.dt
         remeasured = replace(
             self,
@@ -474,27 +475,44 @@ class Followers:
         """Simulated measurements of the estimated model (parametric bootstrap).
 
         Args:
-            estimate: of this model, with pushes ``sigma``, ``tau``.
+            estimate: of this model.
             draw: of deviations of drivers, pushes and errors.
 
         Raises:
             SimulationError: drawn drivers blow up.
         """
-        paths, (sigma, tau) = self.paths, estimate.variances.noise
+        paths, (push, push_time, error, *lasting) = self.paths, estimate.variances.noise
         agents = estimate.variances.spread * draw(estimate.agents.shape)
-        keep = math.exp(-paths.half / tau)
         shape = len(paths.ahead), len(paths.agent)
-        innovations = sigma * draw(shape)
-        pushes = innovations.copy()
-        for k in range(1, shape[0]):
-            pushes[k] = keep * pushes[k - 1] + math.sqrt(1 - keep**2) * innovations[k]
+        pushes = push * _ornstein_uhlenbeck(draw(shape), paths.half / push_time)
+
+        def errors(shape: tuple[int, ...]) -> np.ndarray:
+            drawn = error * draw(shape)
+            if lasting:
+                deviation, time = lasting
+                drawn += deviation * _ornstein_uhlenbeck(draw(shape).T, paths.dt / time).T
+            return drawn
+
         parameters = self.spread(estimate.theta, agents)
         x = self.simulate(parameters[None], estimate.start.T[None], lambda at, *_: pushes[at])[
             :, 0, 0
         ].T
         if not np.isfinite(x[paths.observed]).all():
             raise SimulationError("followers with drawn parameters and disturbances blow up")
-        return paths.remeasured(x, draw)
+        return paths.remeasured(x, errors)
+
+
+def _ornstein_uhlenbeck(normal: np.ndarray, step: float) -> np.ndarray:
+    """A process of standard deviation 1 at times that are ``step`` correlation times apart, along
+    the first axis.
+
+    Args:
+        normal: independent standard normal numbers.
+    """
+    keep, process = math.exp(-step), normal.copy()
+    for k in range(1, len(normal)):
+        process[k] = keep * process[k - 1] + math.sqrt(1 - keep**2) * normal[k]
+    return process
 
 
 def score_bias(

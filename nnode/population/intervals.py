@@ -15,7 +15,7 @@ from scipy.stats import norm
 from nnode.calibrate.intervals import LEVEL, ClusterInfluence
 from nnode.model.term import short_names
 from nnode.population.drivers import Population
-from nnode.population.likelihood import Products, marginal
+from nnode.population.likelihood import NOISE, Products, PushNoise, marginal
 
 #: An estimate is at a bound if its logarithm, or the parameter itself, is closer to it than this.
 NEAR = 1e-3
@@ -59,7 +59,7 @@ def deviation_intervals(population: Population) -> np.ndarray:
         shifted = variances.filled(np.exp(row))
         key = tuple(shifted.noise)
         if key not in products:
-            products[key] = population.noise.products(data, shifted.noise)
+            products[key] = PushNoise().products(data, shifted.noise)
         return marginal(data, products[key], shifted.spread, shifted.start).loglik
 
     steps, size = DIFFERENCE * np.eye(len(free)), len(free)
@@ -81,40 +81,33 @@ def deviation_intervals(population: Population) -> np.ndarray:
 
 
 def variations(population: Population) -> dict[str, dict[str, Any]]:
-    """Standard deviations of drivers' parameters (%), of pushes and of errors, and the correlation
-    time of pushes, by name: ``estimate``, the interval from ``lower`` to ``upper``, ``unit``,
-    ``at_bound`` (``low``, ``high`` or empty), and the median ``shrinkage`` over drivers. NaN if
-    they are not estimated."""
+    """The parameters of the noise by the names of :data:`~nnode.population.likelihood.NOISE`, and
+    the standard deviations of drivers' parameters, %.
+
+    Returns:
+        By name the ``estimate``, the interval from ``lower`` to ``upper``, the ``unit``,
+        ``at_bound`` (``low``, ``high`` or empty), and the median ``shrinkage`` over drivers; NaN if
+        they are not estimated.
+    """
     variances, order = population.estimate.variances, population.model.lane.order
     short = short_names(population.model.names)
-    names = ["push", "push_time", *(short[name] for name in population.random)]
-    units = ["m/s" if order == 1 else "m/s²", "s", *["%"] * len(population.random)]
-    factor = np.array([1.0, 1.0, *[100.0] * len(population.random)])
-    number = len(names)  # the standard deviations of starts come after these
-    values, lowest, highest = (
-        row[:number] for row in (variances.row, variances.low, variances.high)
-    )
-    ends = deviation_intervals(population)[:number]
-    shrinkage = [np.nan, np.nan, *np.median(population.marginal.shrinkage, 0)]
+    noise, drivers = NOISE[: len(variances.noise)], [short[name] for name in population.random]
+    units = ["m/s" if order == 1 else "m/s²", "s", "m", "m", "s"][: len(noise)]
+    shrinkage = [np.nan] * len(noise) + list(np.median(population.marginal.shrinkage, 0))
+    ends = deviation_intervals(population)
     table: dict[str, dict[str, Any]] = {}
-    for k, name in enumerate(names):
-        bound = "low" if values[k] <= lowest[k] * (1 + NEAR) else ""
-        bound = "high" if values[k] >= highest[k] / (1 + NEAR) else bound
-        lower, upper = (float(factor[k] * end) for end in ends[k])
+    # the standard deviations of starts come after these
+    for k, name in enumerate([*noise, *drivers]):
+        value, lowest, highest = variances.row[k], variances.low[k], variances.high[k]
+        factor = 1.0 if k < len(noise) else 100.0
+        bound = "low" if value <= lowest * (1 + NEAR) else ""
+        bound = "high" if value >= highest / (1 + NEAR) else bound
         table[name] = {
-            "estimate": float(factor[k] * values[k]),
-            "lower": lower,
-            "upper": upper,
-            "unit": units[k],
+            "estimate": float(factor * value),
+            "lower": float(factor * ends[k, 0]),
+            "upper": float(factor * ends[k, 1]),
+            "unit": units[k] if k < len(noise) else "%",
             "at_bound": bound,
             "shrinkage": float(shrinkage[k]),
         }
-    table["measurement"] = {
-        "estimate": population.noise.error,
-        "lower": np.nan,
-        "upper": np.nan,
-        "unit": "m",
-        "at_bound": "",
-        "shrinkage": np.nan,
-    }
     return table

@@ -7,7 +7,8 @@ start, the samples y of a segment are
 
 where b* ~ N(0, Omega) and h* ~ N(0, S) with diagonal Omega and S, d is the response to a push e(t),
 an Ornstein-Uhlenbeck process of standard deviation sigma and correlation time tau, and eps are
-independent measurement errors. A Kalman filter whitens all columns by the covariance of d + eps;
+measurement errors: white noise, to which a second Ornstein-Uhlenbeck process is added where errors
+are autocorrelated. A Kalman filter whitens all columns by the covariance of d + eps;
 b* and h* are then integrated out with products of whitened columns (Woodbury's identity).
 
 Source:
@@ -24,9 +25,13 @@ from typing import Protocol
 
 import numpy as np
 from numba import njit
+from scipy.optimize import lsq_linear
 
 #: Share of the largest eigenvalue of the scaled information below which a direction is flat.
 FLAT = 1e-10
+#: Parameters of :class:`PushNoise`: standard deviations of pushes (m/s or m/s²), of white errors of
+#: positions and of autocorrelated ones (m), and correlation times (s).
+NOISE = ("push", "push_time", "measurement", "lasting_error", "lasting_error_time")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,27 +163,25 @@ class WhiteNoise(Noise):
 class PushNoise(Noise):
     """Pushes on the highest rate (an Ornstein-Uhlenbeck process), and measurement errors.
 
-    The parameters are the standard deviation of the pushes and their correlation time, s.
-
-    Attributes:
-        error: standard deviation of the errors of measurement, m.
+    The parameters are those of :data:`NOISE`. The last two, of errors that are autocorrelated, may
+    be absent.
     """
-
-    error: float
 
     def whitened(
         self, data: Linearised, columns: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         assert data.step is not None
         assert data.forced is not None
+        push, push_time, white, *autocorrelated = values
+        lasting, lasting_time = autocorrelated or (0.0, 1.0)
         whitened: tuple[np.ndarray, np.ndarray] = _filtered(
             np.ascontiguousarray(columns),
             data.observed,
             data.step,
             data.forced,
-            values[0],
-            np.exp(-data.dt / values[1]),
-            self.error**2,
+            np.array([push, lasting]),
+            np.exp(-data.dt / np.array([push_time, lasting_time])),
+            white**2,
         )
         return whitened
 
@@ -189,37 +192,72 @@ def _filtered(
     observed: np.ndarray,
     step: np.ndarray,
     forced: np.ndarray,
-    sigma: float,
-    keep: float,
+    sigma: np.ndarray,
+    keep: np.ndarray,
     variance: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Columns whitened by a Kalman filter, and log determinants.
 
-    The state is (d, e); the first element of d is measured. The arrays of a step are allocated
-    once, because allocations would take most of the time.
+    The state is (d, e), or (d, e, a) where errors a are autocorrelated; a is added to the first
+    element of d, so that this element is measured. The arrays of a step are allocated once,
+    because allocations would take most of the time.
+
+    Args:
+        sigma: ``(2,)`` standard deviations of e and a. keep: ``(2,)`` their autocorrelations over
+            a sampling interval. variance: of white errors.
     """
     number, samples, width = columns.shape
-    m = step.shape[-1]
-    n = m + 1
+    m, lasting = step.shape[-1], sigma[1] > 0
+    n = m + 2 if lasting else m + 1
+    fresh = sigma**2 * (1 - keep**2)
     white, logdet = np.zeros((number, samples, width)), np.zeros(number)
     mean, before = np.empty((n, width)), np.empty((n, width))
     spread, half = np.empty((n, n)), np.empty((n, n))
     forward, noise, gain = np.zeros((n, n)), np.empty(n), np.empty(n)
-    forward[m, m], noise[m] = keep, 1.0
+    noise[:] = 0.0
     for s in range(number):
         mean[:], spread[:] = 0.0, 0.0
-        spread[m, m] = sigma**2
+        spread[m, m] = sigma[0] ** 2
+        if lasting:
+            _add_error(spread, sigma[1] ** 2)
         for k in range(samples):
             if k:
-                for i in range(m):
-                    noise[i] = forced[s, k - 1, i]
-                    forward[i, m] = noise[i] * (1 + keep)
-                    for j in range(m):
-                        forward[i, j] = step[s, k - 1, i, j]
-                _predict(mean, spread, forward, noise, sigma**2 * (1 - keep**2), before, half)
+                _set_transition(step[s, k - 1], forced[s, k - 1], keep, forward, noise)
+                _predict(mean, spread, forward, noise, fresh[0], before, half)
+                if lasting:
+                    _add_error(spread, fresh[1])
             if observed[s, k]:
                 logdet[s] += _condition(mean, spread, columns[s, k], variance, white[s, k], gain)
     return white, logdet
+
+
+@njit(cache=True, nogil=True)
+def _set_transition(
+    step: np.ndarray, forced: np.ndarray, keep: np.ndarray, forward: np.ndarray, noise: np.ndarray
+) -> None:
+    """Fill the transition matrix ``forward`` of the state of :func:`_filtered`, and the derivatives
+    ``noise`` of the state by the innovation of e."""
+    m, last = len(step), len(forward) - 1
+    forward[m, m], noise[m] = keep[0], 1.0
+    for i in range(m):
+        noise[i] = forced[i]
+        forward[i, m] = forced[i] * (1 + keep[0])
+        for j in range(m):
+            forward[i, j] = step[i, j]
+        if last > m:
+            forward[i, last] = -step[i, 0]
+    if last > m:
+        forward[0, last] += keep[1]
+        forward[last, last] = keep[1]
+
+
+@njit(cache=True, nogil=True)
+def _add_error(spread: np.ndarray, variance: float) -> None:
+    """Add a variance to the error that is the last state, which the first state contains."""
+    last = len(spread) - 1
+    for i in (0, last):
+        for j in (0, last):
+            spread[i, j] += variance
 
 
 @njit(cache=True, nogil=True)
@@ -372,6 +410,8 @@ def marginal(
     spread: np.ndarray,
     start: np.ndarray,
     *,
+    low: np.ndarray | None = None,
+    high: np.ndarray | None = None,
     restricted: bool = False,
 ) -> Marginal:
     """The marginal likelihood and the quantities derived from it.
@@ -380,6 +420,7 @@ def marginal(
         data: the samples. segments: their columns' products by :class:`Noise`.
         spread: ``(Q,)`` standard deviations of the agents' deviations.
         start: ``(H,)`` of the starts' deviations.
+        low, high: ``(P,)`` bounds of the change of the parameters.
         restricted: whether to use the restricted likelihood (REML).
     """
     number = int(data.agent.max()) + 1
@@ -389,6 +430,8 @@ def marginal(
     total = without_agents.gram.sum(0)
     information, score = total[1:, 1:], total[1:, 0]
     change = flat_solve(information, score)
+    if low is not None and high is not None and ((change < low) | (change > high)).any():
+        change = _bounded_solve(information, score, low, high)
     weights = np.concatenate([[1.0], -change])
     square = np.einsum("i,dij,j->d", weights, without_agents.gram, weights)
     observed = np.bincount(data.agent, data.observed.sum(1), number)
@@ -410,6 +453,20 @@ def marginal(
         shrinkage=posterior_variances / spread**2,
         start=h,
     )
+
+
+def _bounded_solve(
+    matrix: np.ndarray, vector: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """The minimiser of x' A x / 2 - b' x within bounds, for a symmetric matrix A and a vector b.
+    Elements with equal bounds are fixed."""
+    x, free = np.where(low < high, 0.0, low), low < high
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))[free]
+    values, vectors = np.linalg.eigh(matrix[np.ix_(free, free)] / np.outer(scale, scale))
+    root = np.sqrt(np.maximum(values, FLAT * values.max(initial=0.0)))[:, None] * vectors.T
+    aim = np.linalg.solve(root.T, (vector - matrix @ x)[free] / scale)
+    x[free] = lsq_linear(root, aim, (low[free] * scale, high[free] * scale), "bvls").x / scale
+    return x
 
 
 def flat_solve(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:

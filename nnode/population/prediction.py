@@ -10,8 +10,8 @@ are jointly normal (see :mod:`nnode.population.likelihood`), with the covariance
     V = Z Omega Z' + H S H' + sigma^2 R C R'
 
 of true positions, where R is the linear response to pushes at the sampling times and C their
-correlation. The prediction is the normal distribution of x given the known samples, whose
-measurement errors have a standard deviation of their own. Vehicles ahead move as measured.
+correlation. The prediction is the normal distribution of x given the known samples, to whose
+covariance that of their errors is added. Vehicles ahead move as measured.
 
 Source: Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, section 2.2.
 """
@@ -27,7 +27,7 @@ from nnode.model.system import System
 from nnode.population.drivers import full_names, initial_variances
 from nnode.population.estimate import fit_deviations
 from nnode.population.followers import Followers, Paths
-from nnode.population.likelihood import Linearised, PushNoise
+from nnode.population.likelihood import NOISE, Linearised, PushNoise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,13 +55,14 @@ def predict(
     Args:
         system: the calibrated law, with the parameters of the typical driver.
         paths: the followers.
-        variances: ``push`` (m/s or m/s²), ``push_time`` (s), and by the short names of the
-            parameters that differ between drivers the standard deviations of their logarithms.
+        variances: parameters of the noise by the names of
+            :data:`~nnode.population.likelihood.NOISE`, and by the short names of the parameters
+            that differ between drivers the standard deviations of their logarithms.
         seconds: length of the known beginning; at least two samples are used.
     """
     times = paths.dt * np.arange(paths.x.shape[1])
     given = (times <= seconds + 1e-9) | (np.arange(len(times)) < 2)
-    names = [name for name in variances if name not in ("push", "push_time")]
+    names = [name for name in variances if name not in NOISE]
     law = Followers(system, paths)
     past = replace(
         paths.starting_from(given),
@@ -72,16 +73,20 @@ def predict(
     initial = initial_variances(model)
     fixed = replace(
         initial,
-        noise=np.array([variances["push"], variances["push_time"]]),
+        noise=np.array([variances[name] for name in NOISE if name in variances]),
         spread=np.array([variances[name] for name in names]),
     )
-    modes = fit_deviations(model, PushNoise(paths.error), model.start, fixed)
+    modes = fit_deviations(model, PushNoise(), model.start, fixed)
     data = modes.data
     mean, deviation = np.empty_like(data.residual), np.empty_like(data.residual)
+    white, *lasting = fixed.noise[2:]
+    errors = white**2 * np.eye(len(times))
+    if lasting:
+        errors += lasting[0] ** 2 * np.exp(-np.abs(times[:, None] - times) / lasting[1])
     for f in range(len(mean)):
         covariance = _covariance(data, f, fixed.noise, fixed.spread, fixed.start)
         at = past.observed[f]
-        inner = covariance[np.ix_(at, at)] + paths.error**2 * np.eye(at.sum())
+        inner = (covariance + errors)[np.ix_(at, at)]
         gain = np.linalg.solve(inner, covariance[at]).T
         mean[f] = paths.x[f] - data.residual[f] + gain @ data.residual[f, at]
         variance = np.diag(covariance) - np.einsum("ij,ji->i", gain, covariance[at])
@@ -95,7 +100,7 @@ def _covariance(
     """``(K, K)`` covariance of the true positions of a follower, m²."""
     assert data.step is not None
     assert data.forced is not None
-    sigma, tau = noise
+    sigma, tau = noise[:2]
     samples = len(data.residual[f])
     response = np.zeros((samples, data.step.shape[-1], samples))
     for k in range(samples - 1):

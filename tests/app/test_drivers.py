@@ -55,7 +55,7 @@ def test_the_typical_driver_and_every_driver_are_found(
     rows = found.drivers.variability
     for name, true in {"T": 15.0, "push": PUSH, "push_time": LASTING}.items():
         assert rows.lower[name] < true < rows.upper[name]
-    assert list(rows.unit) == ["m/s²", "s", "%", "m"]
+    assert list(rows.unit) == ["m/s²", "s", "m", "%"]
     assert rows.estimate["measurement"] == pytest.approx(0.05, rel=0.1)
     own = drawn[1]["T"]
     drivers = found.drivers.table.set_index("driver")

@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import nnode
+from benchmarks.drivers import LASTS, PUSH
+from benchmarks.drivers import platoons as benchmark_platoons
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.model import Traffic, make_law
+from nnode.model.term import Interval
 from nnode.population.drivers import fit_drivers
 from nnode.population.followers import paths_of
 from nnode.population.intervals import deviation_intervals, influence
+from nnode.population.likelihood import NOISE
 
 #: Platoons, vehicles, s, sampling interval and step, s, errors of measurement, m.
 PLATOONS, VEHICLES, SECONDS, DT, STEP, ERROR = 8, 5, 30.0, 0.2, 0.02, 0.05
@@ -56,7 +61,7 @@ def test_drivers_who_differ_are_found_and_told_apart() -> None:
     half = influence(found, found.model.paths.sequence)[0].half_widths()
     assert (np.abs(found.estimate.theta - truth) < half).all()
     assert (half < 0.1).all()
-    push, lasting, differ, start = deviation_intervals(found)
+    push, lasting, _, differ, start = deviation_intervals(found)
     for (low, high), true in ((push, 0.2), (lasting, 4.0), (differ, drawn)):
         assert low < true < high < 2.5 * low
     assert np.isnan(start).all()  # it is given
@@ -67,8 +72,42 @@ def test_drivers_alike_do_not_differ() -> None:
     system = Traffic([make_law("lin")], leader="measured").double()
     found = fit_drivers(system, paths_of(sequences, 0.2))
     assert found.random == []
-    sigma, _ = found.estimate.variances.noise
+    sigma, _, error = found.estimate.variances.noise
     assert sigma == pytest.approx(0.2, rel=0.2)
+    assert error == pytest.approx(ERROR, rel=0.05)
+
+
+@pytest.mark.parametrize("law", ["lin", "idm"])
+def test_errors_that_last_are_found_and_told_apart_from_pushes(law: str) -> None:
+    table = benchmark_platoons(law, "none", 0.15, 21, 16, nature="lasting")
+    system = Traffic([make_law(law)], leader="measured").double()
+    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), pairs=0)
+    true = {"push": PUSH[law], "push_time": LASTS, "lasting_error": 0.06, "lasting_error_time": 1.0}
+    noise = dict(zip(NOISE, found.estimate.variances.noise, strict=True))
+    for name, value in true.items():
+        assert noise[name] == pytest.approx(value, rel=0.5), name
+
+
+def test_white_errors_do_not_last() -> None:
+    sequences, _ = platoons(0.15, 3)
+    system = Traffic([make_law("lin")], leader="measured").double()
+    found = fit_drivers(system, paths_of(sequences, 0.2), pairs=0)
+    assert len(found.estimate.variances.noise) == 3
+
+
+def test_with_v0_at_its_bound_l_is_the_most_likely_one_there() -> None:
+    sequences, _ = platoons(0.15, 4)
+    law = make_law("lin")
+    law.bounds["v0"] = Interval(0.0, 24.0)  # below most drivers
+    law.project_()
+    system = Traffic([law], leader="measured").double()
+    found = fit_drivers(system, paths_of(sequences, 0.2), "none", pairs=0).estimate
+    assert found.converged
+    assert np.exp(found.theta[0]) == pytest.approx(24.0)
+    products = found.marginal.agents.sum(0)
+    slope = products[1:, 0]  # of the log likelihood
+    assert slope[0] > 0
+    assert abs(slope[1]) < 0.02 * np.sqrt(products[2, 2])
 
 
 def test_an_unknown_parameter_is_refused() -> None:

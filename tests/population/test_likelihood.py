@@ -34,8 +34,12 @@ def example(seed: int, states: int) -> Linearised:
     )
 
 
-def covariance(data: Linearised) -> np.ndarray:
-    """Of all samples of all segments, without any filter."""
+def covariance(data: Linearised, lasting: tuple[float, ...]) -> np.ndarray:
+    """Of all samples of all segments, without any filter.
+
+    Args:
+        lasting: standard deviation and time of errors that last, or nothing.
+    """
     segments, samples = data.residual.shape
     apart = np.abs(np.arange(samples)[:, None] - np.arange(samples)) * DT
     pushes = SIGMA**2 * np.exp(-apart / TAU)
@@ -53,18 +57,21 @@ def covariance(data: Linearised) -> np.ndarray:
         start = data.start[s] * START
         whole[own, own] = response @ pushes @ response.T + ERROR**2 * np.eye(samples)
         whole[own, own] += start @ start.T
+        if lasting:
+            whole[own, own] += lasting[0] ** 2 * np.exp(-apart / lasting[1])
     random = (data.random * SPREAD).reshape(segments * samples, -1)
     same = np.equal.outer(*[np.repeat(data.agent, samples)] * 2)
     found: np.ndarray = whole + same * (random @ random.T)
     return found
 
 
+@pytest.mark.parametrize("lasting", [(), (0.1, 0.7)])
 @pytest.mark.parametrize("states", [1, 2])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_filter_is_a_dense_gaussian(seed: int, states: int) -> None:
+def test_the_filter_is_a_dense_gaussian(seed: int, states: int, lasting: tuple[float, ...]) -> None:
     data = example(seed, states)
     observed = data.observed.ravel()
-    v = covariance(data)[np.ix_(observed, observed)]
+    v = covariance(data, lasting)[np.ix_(observed, observed)]
     x, w = data.fixed.reshape(-1, 2)[observed], data.residual.ravel()[observed]
     information = x.T @ np.linalg.solve(v, x)
     change = np.linalg.solve(information, x.T @ np.linalg.solve(v, w))
@@ -72,8 +79,8 @@ def test_the_filter_is_a_dense_gaussian(seed: int, states: int) -> None:
     # Harville 1977
     loss = np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
 
-    noise = PushNoise(ERROR)
-    products = noise.products(data, np.array([SIGMA, TAU]))
+    noise = PushNoise()
+    products = noise.products(data, np.array([SIGMA, TAU, ERROR, *lasting]))
     found = marginal(data, products, SPREAD, START)
     restricted = marginal(data, products, SPREAD, START, restricted=True)
 
@@ -89,3 +96,16 @@ def test_the_filter_is_a_dense_gaussian(seed: int, states: int) -> None:
         np.testing.assert_allclose(found.deviations[d], SPREAD**2 * (own.T @ rest), rtol=1e-7)
         left = SPREAD**2 - SPREAD**4 * np.diag(own.T @ np.linalg.solve(v, own))
         np.testing.assert_allclose(found.variances[d], left, rtol=1e-7)
+
+
+def test_bounded_changes_are_the_most_likely_ones_within_the_bounds() -> None:
+    data = example(5, 2)
+    products = PushNoise().products(data, np.array([SIGMA, TAU, ERROR]))
+    free = marginal(data, products, SPREAD, START)
+    low, high = free.change - 1.0, free.change + np.array([-0.2, 1.0])
+    found = marginal(data, products, SPREAD, START, low=low, high=high)
+    assert found.change[0] == pytest.approx(high[0])
+    fixed = found.change + np.outer(np.linspace(-1e-3, 1e-3, 3), [0.0, 1.0])
+    values = [marginal(data, products, SPREAD, START, low=c, high=c).loglik for c in fixed]
+    assert values[1] == pytest.approx(found.loglik)
+    assert max(values) == values[1] < free.loglik

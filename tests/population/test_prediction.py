@@ -16,7 +16,8 @@ from nnode.population.likelihood import PushNoise, marginal
 from nnode.population.prediction import predict
 from tests.population.test_drivers import ERROR, platoons
 
-VARIANCES = {"push": 0.2, "push_time": 4.0, "v0": 0.15}
+NOISE = {"push": 0.2, "push_time": 4.0, "measurement": ERROR}
+VARIANCES = NOISE | {"v0": 0.15}
 
 
 def law() -> Traffic:
@@ -28,7 +29,7 @@ def test_drivers_are_predicted_better_than_the_typical_one_and_bands_cover(secon
     paths = paths_of(platoons(0.15, 11)[0], 0.2)
     late = paths.dt * np.arange(paths.x.shape[1]) > 10.0
     prediction = predict(law(), paths, VARIANCES, seconds)
-    typical = predict(law(), paths, {"push": 0.2, "push_time": 4.0}, seconds).mean
+    typical = predict(law(), paths, NOISE, seconds).mean
     error = (prediction.mean - paths.x)[:, late]
     assert (error**2).mean() < 0.25 * ((typical - paths.x)[:, late] ** 2).mean()
     deviation = np.sqrt(prediction.deviation**2 + ERROR**2)[:, late]
@@ -42,14 +43,16 @@ def test_the_next_sample_has_the_density_of_the_marginal_likelihood(seconds: flo
     paths = replace(paths, agent=np.arange(len(paths.agent)))
     prediction = predict(law(), paths, VARIANCES, seconds)
     following = int(prediction.given.sum())
-    deviation = np.sqrt(prediction.deviation[:, following] ** 2 + paths.error**2)
+    deviation = np.sqrt(prediction.deviation[:, following] ** 2 + ERROR**2)
     density = norm.logpdf(paths.x[:, following], prediction.mean[:, following], deviation)
     known = replace(
         paths.starting_from(prediction.given), observed=paths.observed & prediction.given
     )
-    model, noise = Followers(law(), known, ["lin.v0"]), PushNoise(paths.error)
+    model, noise = Followers(law(), known, ["lin.v0"]), PushNoise()
     variances = replace(
-        initial_variances(model), noise=np.array([0.2, 4.0]), spread=np.array([0.15])
+        initial_variances(model),
+        noise=np.array(list(NOISE.values())),
+        spread=np.array([0.15]),
     )
     data = fit_deviations(model, noise, model.start, variances).data
     data = replace(data, fixed=data.fixed[..., :0])

@@ -40,7 +40,7 @@ from nnode.model.system import System
 from nnode.model.term import State
 from nnode.population.drivers import Population, fit_drivers, refit
 from nnode.population.followers import Followers, Paths, Push, antithetic_draws, paths_of
-from nnode.population.likelihood import Whitening, marginal
+from nnode.population.likelihood import PushNoise, Whitening, marginal
 from nnode.simulation.numpy import strides
 from nnode.simulation.rhs import side_by_side
 
@@ -306,7 +306,7 @@ class FollowersEngine(TrafficEngine):
         estimate, variances = population.estimate, population.estimate.variances
         self.population = population
         self._whitening = Whitening(
-            estimate.data, population.noise, variances.noise, variances.spread, variances.start
+            estimate.data, PushNoise(), variances.noise, variances.spread, variances.start
         )
         self._last_run = None
 
@@ -319,7 +319,7 @@ class FollowersEngine(TrafficEngine):
         variances = self.population.estimate.variances
         data = self.population.estimate.data
         data = replace(data, residual=errors, fixed=data.fixed[..., :0])
-        products = self.population.noise.products(data, variances.noise)
+        products = PushNoise().products(data, variances.noise)
         posterior = marginal(data, products, variances.spread, variances.start)
         errors = errors - np.einsum("fkh,fh->fk", data.start, posterior.start)
         driver_deviations = posterior.deviations[model.paths.agent]

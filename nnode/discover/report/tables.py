@@ -169,6 +169,8 @@ _VARIATIONS = {
     "push": "process noise",
     "push_time": "correlation time of the process noise",
     "measurement": "measurement error of positions",
+    "lasting_error": "autocorrelated measurement error of positions",
+    "lasting_error_time": "correlation time of this error",
 }
 
 
