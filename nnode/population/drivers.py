@@ -20,7 +20,7 @@ from nnode.population.estimate import (
     fit_deviations,
     fit_variances,
 )
-from nnode.population.followers import Followers, Paths, score_bias
+from nnode.population.followers import FLOOR, Followers, Paths, score_bias
 from nnode.population.likelihood import Linearised, Marginal, PushNoise, marginal
 from nnode.simulation.rhs import formula_of
 
@@ -42,7 +42,7 @@ START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
 LONGEST, TOLERANCE = 0.3, 1e-2
 #: Bounds of standard deviations of errors of positions, m, and of the correlation time of
 #: autocorrelated ones, s. Searches for the latter start at 1 s.
-ERRORS, ERROR_TIMES = (1e-3, 1.0), (0.1, 5.0)
+ERRORS, ERROR_TIMES = (FLOOR, 1.0), (0.1, 5.0)
 #: At most so many candidate random effects are estimated before the best is chosen.
 RANKED = 2
 #: Linearisations of each of these before the best is chosen. Most estimates converge in fewer. If
@@ -305,24 +305,27 @@ def _price(agents: int) -> float:
 
 def _with_lasting_errors(best: Population) -> Population:
     """The estimate with autocorrelated errors of measurement, if they raise the log likelihood by
-    more than two parameters need; otherwise the same."""
+    more than two parameters need; otherwise the same. White errors, which fourth differences then
+    overestimate, are estimated with them."""
     before, model = best.estimate, best.model
-    push, push_time, white, *known = before.variances.noise
-    if known:
+    push, push_time, white, *lasting = before.variances.noise
+    if lasting:
         return best
-    at, (low, high), (short, long) = 3, ERRORS, ERROR_TIMES
-    start = replace(
-        before.variances,
+    low, high = before.variances.low.copy(), before.variances.high.copy()
+    low[2], high[2] = ERRORS
+    only_white = replace(before.variances, low=low, high=high)
+    extended = replace(
+        only_white,
         noise=np.array([push, push_time, white, white, 1.0]),
-        low=np.insert(before.variances.low, at, [low, short]),
-        high=np.insert(before.variances.high, at, [high, long]),
+        low=np.insert(low, 3, [ERRORS[0], ERROR_TIMES[0]]),
+        high=np.insert(high, 3, [ERRORS[1], ERROR_TIMES[1]]),
     )
-    limit = best.marginal.loglik + 2 * _price(len(before.agents))
-    loglik, refitted = _refitted(best, before.data, start)
+    limit = _refitted(best, before.data, only_white)[0] + 2 * _price(len(before.agents))
+    loglik, variances = _refitted(best, before.data, extended)
     if loglik <= limit:
         return best
-    extended = _estimated(model, before.theta, refitted, before.agents, before.start)
-    return extended if extended.marginal.loglik > limit else best
+    estimated = _estimated(model, before.theta, variances, before.agents, before.start)
+    return estimated if estimated.marginal.loglik > limit else best
 
 
 def _with_random_effects(best: Population) -> Population:
@@ -402,8 +405,8 @@ def initial_variances(model: Followers) -> Variances:
         noise=np.array([push, np.clip(LASTING, short, long), paths.error]),
         spread=np.full(number, SPREAD),
         start=np.array(starts),
-        low=np.array([low_push, short, ERRORS[0], *[LEAST_SPREAD] * number, *lowest]),
-        high=np.array([high_push, long, ERRORS[1], *[MOST_SPREAD] * number, *highest]),
+        low=np.array([low_push, short, paths.error, *[LEAST_SPREAD] * number, *lowest]),
+        high=np.array([high_push, long, paths.error, *[MOST_SPREAD] * number, *highest]),
     )
 
 

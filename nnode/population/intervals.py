@@ -102,6 +102,7 @@ def variations(population: Population) -> dict[str, dict[str, Any]]:
         factor = 1.0 if k < len(noise) else 100.0
         bound = "low" if value <= lowest * (1 + NEAR) else ""
         bound = "high" if value >= highest / (1 + NEAR) else bound
+        bound = bound if lowest < highest else ""
         table[name] = {
             "estimate": float(factor * value),
             "lower": float(factor * ends[k, 0]),
