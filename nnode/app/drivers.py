@@ -6,7 +6,7 @@ import copy
 import logging
 from collections.abc import Callable
 from collections.abc import Sequence as ListLike
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -30,9 +30,6 @@ AUTO, NONE = "auto", "none"
 #: Root mean square error (m) of pooled parameters below which paths are explained exactly, as by a
 #: model's own simulation.
 EXACT = 0.01
-#: Assumed measurement error (m) of smoothed positions. Smoothing leaves autocorrelated errors,
-#: which the model would attribute to disturbances if the assumed error were small.
-SMOOTHED = 0.1
 #: Distance of start values from the bounds, as a share of the admissible interval.
 INSIDE = 0.01
 
@@ -110,7 +107,8 @@ class Drivers:
         variability, table: see :class:`nnode.app.calibration.Calibration`.
         converged: whether the estimation converged.
         bias: short name of a parameter to the bias correction, relative for positive parameters.
-        observations: number of measured positions of followers.
+        observations: number of measured positions of followers that are used.
+        apart: smallest time between them, s; 0: all are used.
         variances: number of estimated standard deviations and times.
         log_likelihood: logarithm of the marginal likelihood of the positions (m).
     """
@@ -125,6 +123,7 @@ class Drivers:
     converged: bool
     bias: dict[str, float]
     observations: int
+    apart: float
     variances: int
     log_likelihood: float
 
@@ -176,6 +175,7 @@ class Drivers:
             "variability": {str(name): row for name, row in rows.items()},
             "bias": self.bias,
             "converged": self.converged,
+            "apart": self.apart,
             "table": self.table.to_dict("records"),
         }
 
@@ -202,7 +202,7 @@ def calibrated_drivers(
         ConfigError: see :func:`nnode.population.drivers.fit_drivers`.
     """
     from nnode.population.drivers import STEP, checked, fit_drivers  # compiled code takes a second
-    from nnode.population.followers import paths_of, without_errors
+    from nnode.population.followers import APART, paths_of, without_errors
     from nnode.population.intervals import variations
 
     double = copy.deepcopy(model).double()
@@ -210,19 +210,19 @@ def calibrated_drivers(
     low, high = vector.bounds
     inside = np.where(np.isfinite(high - low), INSIDE * (high - low), 0.0)
     vector.fill_(np.clip(vector.row.numpy(), low + inside, high - inside))
-    paths = paths_of(sequences, STEP)
+    paths, apart = paths_of(sequences, STEP), 0.0
     if without_errors(sequences):
-        # positions of a simulation are explained by a law, and those that were smoothed are not
+        # a law explains positions of a simulation, and not those that were smoothed
         part = paths_of(checked(sequences), STEP)
         if not fit_drivers(double, part, first=first, pairs=0).explains_rates:
             if drivers is None:
                 return None
             log.info(
                 "positions show no errors that are new at every sample, so that they were "
-                "smoothed: errors of %g m are assumed",
-                SMOOTHED,
+                "smoothed: positions that are %g s apart are used",
+                APART,
             )
-            paths = replace(paths, error=SMOOTHED)
+            paths, apart = paths.apart(APART), APART
     population = fit_drivers(double, paths, drivers or AUTO, first, seed=seed)
     if not population.estimate.converged:
         log.warning(
@@ -253,6 +253,7 @@ def calibrated_drivers(
             )
             for i, name in enumerate(followers.names)
         },
+        apart=apart,
         observations=int(population.estimate.data.observed.sum()),
         variances=int((variances.low < variances.high).sum()),
         # the restricted likelihood is not comparable between laws with different parameters

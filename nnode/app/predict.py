@@ -153,9 +153,9 @@ def predict_run(
     else:
         checkpoint = load_checkpoint(checkpoint_of(str(run)))
         drivers = result_of(str(run)).get("drivers")
-    variances = _variances(drivers)
+    noise = _noise(drivers)
     store = data_used(checkpoint) if data is None else Sequences.of(data)
-    return _predicted(checkpoint, store, variances, seconds, part)
+    return _predicted(checkpoint, store, *noise, seconds, part)
 
 
 def predict(config: DictConfig, folder: Path) -> None:
@@ -165,19 +165,19 @@ def predict(config: DictConfig, folder: Path) -> None:
         NNodeError: see :func:`predict_run`.
     """
     checkpoint = load_checkpoint(checkpoint_of(config.run))
-    variances = _variances(result_of(config.run).get("drivers"))
+    noise = _noise(result_of(config.run).get("drivers"))
     config = with_prepared(merge_saved(config, checkpoint.config, ("data",)))
     data: DataOptions = options_of(config.data)
     store = open_data(data, folder / "data")
-    predictions = _predicted(checkpoint, store, variances, float(config.seconds), config.part)
+    predictions = _predicted(checkpoint, store, *noise, float(config.seconds), config.part)
     print(predictions)
     for path in predictions.write(folder):
         print(f"{'plot' if path.suffix == '.png' else path.name.partition('.')[0]}: {path}")
 
 
-def _variances(drivers: Any) -> dict[str, float]:
+def _noise(drivers: Any) -> tuple[dict[str, float], float]:
     """Standard deviations and times by name, as :func:`nnode.population.prediction.predict` takes
-    them."""
+    them, and the smallest time between positions that are used, s."""
     if drivers is None:
         raise ConfigError(
             "the run has no differences between drivers, from which a driver's parameters are "
@@ -190,21 +190,25 @@ def _variances(drivers: Any) -> dict[str, float]:
         lasting = [name for name in NOISE[3:] if name in rows]
         names = [*NOISE[:3], *lasting, *drivers["differ"]]
         values = {name: float(rows[name]["estimate"]) for name in names}
+        apart = float(drivers.get("apart", 0.0))
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
             "the differences between drivers in result.json are damaged: expected an estimate of "
             "push, push_time, measurement and of each parameter that differs; train again"
         ) from error
+    if not 0 <= apart < np.inf:
+        raise CheckpointError(f"result.json: apart is {apart:g}, expected a number of seconds")
     for name, value in values.items():
         if not 0 < value < np.inf:
             raise CheckpointError(f"result.json: {name} is {value:g}, expected a positive number")
-    return values | {name: values[name] / 100 for name in drivers["differ"]}
+    return values | {name: values[name] / 100 for name in drivers["differ"]}, apart
 
 
 def _predicted(
     checkpoint: Checkpoint,
     store: Source,
     variances: Mapping[str, float],
+    apart: float,
     seconds: float,
     part: str,
 ) -> Predictions:
@@ -230,7 +234,7 @@ def _predicted(
         )
     if reason := obstacle(model, sequences, needed=1):
         raise ConfigError(f"followers cannot be predicted: {reason}")
-    paths = paths_of(sequences, STEP)
+    paths = paths_of(sequences, STEP).apart(apart)
     prediction = predict_paths(model, paths, variances, seconds)
     alike = {name: value for name, value in variances.items() if name in NOISE}
     typical = predict_paths(model, paths, alike, seconds).mean

@@ -60,7 +60,7 @@ from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.system import System
 from nnode.population.drivers import EXPLAINED
-from nnode.population.followers import drivers_differ, without_errors
+from nnode.population.followers import APART, drivers_differ, without_errors
 from nnode.population.intervals import variations
 from nnode.progress import Stages
 
@@ -156,7 +156,7 @@ def _diagnosed(
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
     candidates = [e for e in CATALOGUE.of(domain, system.order) if e.name in names]
-    differ = _drivers_differ(system, sequences, options)
+    differ = drivers_differ(system, sequences)
     refused = {e.name: reason for e in candidates if (reason := not_offered(e, system, differ))}
     offered = [effect for effect in candidates if effect.name not in refused]
     effects = [effect for effect in offered if not issubclass(effect, IndividualEffect)]
@@ -275,13 +275,6 @@ def _diagnosed(
     )
 
 
-def _drivers_differ(system: System, sequences: list[Sequence], options: DiscoverOptions) -> bool:
-    """Whether differences between drivers are part of the statistical model. They are not if
-    positions were smoothed, because the errors that are left are autocorrelated."""
-    smoothed = options.smoothed and without_errors(sequences)
-    return drivers_differ(system, sequences) and not smoothed
-
-
 def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves]:
     """The curves that remain significant in the residuals of a selected model."""
     engine, remaining = exploration.engine, exploration.base_curves
@@ -314,7 +307,7 @@ def _drivers(engine: Engine, fit: Fit, notes: list[str]) -> list[Variation]:
     if push.at_bound == "high" or not engine.population.explains_rates:
         rate = "accelerations" if fit.system.order > 1 else "speeds"
         hint = ""
-        if without_errors(engine.sequences):
+        if without_errors(engine.sequences) and not engine.apart:
             hint = " If positions were smoothed before, set discover.smoothed=true."
         notes.append(
             f"The law explains little of how {rate} vary: pushes have a standard deviation of "
@@ -367,7 +360,8 @@ def _explore(
     division = divide(sequences, options, together=together)
     exploration_sequences = [sequences[i] for i in division.exploration]
     label = division.label[division.exploration]
-    engine = engine_of(system, exploration_sequences, label, differ=differ)
+    apart = APART if options.smoothed and without_errors(sequences) else 0.0
+    engine = engine_of(system, exploration_sequences, label, differ=differ, apart=apart)
     initial = initial_fit(engine, copy.deepcopy(system).double())
     if initial is None:
         raise SimulationError(

@@ -27,8 +27,8 @@ class DiscoverOptions:
     exclude: list[str] = field(default_factory=list)  # names not to look for
     # models to compare before effects are looked for; null: the domain's laws; []: none
     compare: list[str] | None = None
-    # positions without white errors were smoothed before: their errors are autocorrelated, and all
-    # drivers are simulated with the same parameters; null: whether the data source is known for it
+    # positions without white errors were smoothed before: their errors are autocorrelated, and one
+    # position in a second is used; null: whether the data source is known for it
     smoothed: bool | None = None
     max_effects: int = 4  # at most so many are added
     structure: bool = (

@@ -43,6 +43,9 @@ FLOOR = 0.01
 #: ESIMAS's errors of 0.57 m are attributed to pushes. Tables in docs/discovery.md compare both
 #: approaches.
 NOISE = (0.015, 0.45)
+#: Positions that were smoothed are used at times that are at least so many seconds apart, because
+#: their errors are autocorrelated. The table in docs/method.md has the autocorrelations.
+APART = 1.0
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
 DIFFERENCE, START_DIFFERENCE = 1e-4, 1e-2
 #: The push on the highest rate ``(R, F)``, as a function of the index of the time in the paths
@@ -90,6 +93,11 @@ class Paths:
     start: np.ndarray
     error: float
     batch: Batch
+
+    def apart(self, seconds: float) -> Paths:
+        """The same paths, measured only at times that are at least so many seconds apart."""
+        stride = max(1, math.ceil(seconds / self.dt - 1e-9))
+        return replace(self, observed=self.observed & (np.arange(self.x.shape[1]) % stride == 0))
 
     def starting_from(self, given: np.ndarray) -> Paths:
         """The same paths, with starts that are smoothed from the given samples ``(K,)`` only."""

@@ -38,6 +38,7 @@ def engine_of(
     *,
     whole: bool = False,
     differ: bool = False,
+    apart: float = 0.0,
     like: Engine | None = None,
 ) -> Engine:
     """The engine for a model and its extensions.
@@ -45,7 +46,7 @@ def engine_of(
     Args:
         whole: compare whole lane sequences with unweighted errors, as most calibrations do; it has
             no effect in crowds.
-        differ: whether drivers differ.
+        differ: whether drivers differ. apart: smallest time between their positions, s.
         like: an engine whose variances are used if drivers differ.
     """
     if whole and system.domain == "traffic":
@@ -53,7 +54,7 @@ def engine_of(
     if isinstance(like, FollowersEngine):
         return FollowersEngine(sequences, clusters, like=like)
     if differ:
-        return FollowersEngine(sequences, clusters)
+        return FollowersEngine(sequences, clusters, apart=apart)
     return windows_of(system, sequences, clusters)
 
 

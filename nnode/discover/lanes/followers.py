@@ -78,6 +78,7 @@ class FollowersEngine(TrafficEngine):
         large: threshold of Huber's loss.
         like: an engine whose estimates are used for all models; only deviations of drivers and of
             starts are estimated.
+        apart: smallest time between positions that are used, s.
 
     Attributes:
         population: the last estimate of :meth:`fit_whitening`; None before.
@@ -89,8 +90,10 @@ class FollowersEngine(TrafficEngine):
         clusters: np.ndarray | None = None,
         large: float = LARGE,
         like: FollowersEngine | None = None,
+        apart: float = 0.0,
     ) -> None:
         super().__init__(sequences, np.inf, clusters, large)
+        self.apart: float = apart if like is None else like.apart
         self.smallest_share = -np.inf
         self._paths_by_step, self._like = dict[tuple[int, int], Paths](), like
         self._label = np.arange(len(sequences)) if clusters is None else np.asarray(clusters)
@@ -246,7 +249,7 @@ class FollowersEngine(TrafficEngine):
         clusters counts as several drivers, because clusters must be independent."""
         key = strides(self.batch.dt, longest)
         if key not in self._paths_by_step:
-            paths = paths_of(self.sequences, longest)
+            paths = paths_of(self.sequences, longest).apart(self.apart)
             pairs = np.stack([paths.agent, self._label[paths.sequence]])
             drivers, agent = np.unique(pairs, axis=1, return_inverse=True)
             names = tuple(paths.names[i] for i in drivers[0])
