@@ -94,6 +94,11 @@ class Paths:
     error: float
     batch: Batch
 
+    @property
+    def _samples(self) -> np.ndarray:
+        """``(F,)`` number of samples up to the last one that is used."""
+        return self.x.shape[1] - np.argmax(self.observed[:, ::-1], 1)
+
     def apart(self, seconds: float) -> Paths:
         """The same paths, measured only at times that are at least so many seconds apart."""
         stride = max(1, math.ceil(seconds / self.dt - 1e-9))
@@ -102,8 +107,8 @@ class Paths:
     def starting_from(self, given: np.ndarray) -> Paths:
         """The same paths, with starts that are smoothed from the given samples ``(K,)`` only."""
         start = [
-            _start(smooth(path[observed & given]), self.dt)
-            for path, observed in zip(self.x, self.observed, strict=True)
+            _start(smooth(path[:number][given[:number]]), self.dt)
+            for path, number in zip(self.x, self._samples, strict=True)
         ]
         return replace(self, start=np.stack(start, 1))
 
