@@ -150,9 +150,10 @@ def diagnose_table(
     chosen = replace(options or DiscoverOptions(), seed=seed)
     place = None if folder is None else Path(folder)
     source: Any = data
-    if isinstance(data, Sequences):
+    if not isinstance(data, Table):
         refuse_reading(None, {"walls": walls, **reading})
-        data_options = data_of(data)
+        source = Sequences.of(data)
+        data_options = data_of(source)
     else:
         source, data_options = table_options(data, domain, walls, place, reading)
     groups = {"model": str(plain_model["name"]), "data": str(data_options.name)}

@@ -17,7 +17,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from nnode.app.calibration import Calibration, calibrated
 from nnode.app.cli.saved import options_of, plain
-from nnode.app.python.inputs import choice, data_of, merged, model_options, sequences
+from nnode.app.python.inputs import (
+    Table,
+    choice,
+    data_of,
+    merged,
+    model_options,
+    sequences,
+)
 from nnode.app.python.words import python_words
 from nnode.app.training import (
     build_solver,
@@ -300,7 +307,7 @@ def fit(
         NNodeError: invalid table, model or options; the message says what to do.
     """
     options = {"walls": None if walls is None else str(walls), **reading}
-    if not isinstance(data, Sequences):
+    if isinstance(data, Table):
         options["domain"] = domain
     given = sequences(data, **{key: value for key, value in options.items() if value is not None})
     calibrator = Calibrator(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as ListLike
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from nnode.data.options import DataOptions, with_present_names
 from nnode.data.prepare import FORMATS
 from nnode.data.readers.columns import Table as DataTable
 from nnode.data.readers.table import TableOptions
+from nnode.data.sequence import Sequence
 from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
 from nnode.errors import ConfigError, unknown_value
@@ -146,7 +147,7 @@ def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
 
 @python_words()
 def sequences(
-    table: pd.DataFrame | str | Path | Sequences | None = None,
+    table: pd.DataFrame | str | Path | Iterable[Sequence] | None = None,
     *,
     data: str | None = None,
     **options: Any,
@@ -157,7 +158,8 @@ def sequences(
     :func:`nnode.check`. A printed line states what was recognised. Given ``options`` have priority.
 
     Args:
-        table: a data frame, or the path of a table; None for data sets with known places.
+        table: a data frame, the path of a table, or sequences, such as part of those of another
+            call; None for data sets with known places.
         data: format, a name as in ``conf/data``: ``table``, ``pairs``, ``vehicles``, ``esimas``,
             ...; None recognises it.
         options: options of the data, as on the command line after ``data.``: ``columns={...}``,
@@ -167,9 +169,9 @@ def sequences(
         NNodeError: data or options are unknown; the table is invalid, with the row; or its columns
             or units are ambiguous, with both possibilities.
     """
-    if isinstance(table, Sequences):
+    if table is not None and not isinstance(table, Table | DataTable):
         refuse_reading(data, options)
-        return table
+        return Sequences.of(table)
     if table is None and data is None:
         raise ConfigError("there is no table: give one, or name a data set: data='esimas'")
     return Sequences.of(*read_options(table, data, options))

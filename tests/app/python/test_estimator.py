@@ -247,8 +247,16 @@ def test_what_is_asked_too_early_or_does_not_exist_is_refused(tidy: pd.DataFrame
     with pytest.raises(DataError, match="row 8: column 'x' holds 'here'"):
         nnode.Calibrator().fit(tidy.assign(x=tidy.x.astype(object).where(tidy.index != 7, "here")))
     for nothing in (3, [], np.zeros((3, 2))):
-        with pytest.raises(DataError, match="expected a data frame"):
-            nnode.Calibrator().fit(nothing)
+        for reads in (nnode.Calibrator().fit, nnode.fit, nnode.sequences, nnode.diagnose):
+            with pytest.raises(DataError, match="expected a data frame"):
+                reads(nothing)
+
+
+def test_a_part_of_sequences_is_calibrated(tidy: pd.DataFrame) -> None:
+    read = nnode.sequences(tidy, domain="traffic")
+    part = list(read)[:3]
+    run = nnode.fit(part, model="lin", epochs=1, heldout=0.0)
+    assert {f"table/{name}" for name in run.residuals().sequence} == {s.name for s in part}
 
 
 @pytest.mark.filterwarnings("error")
