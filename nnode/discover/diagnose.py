@@ -43,6 +43,7 @@ from nnode.discover.residuals.engine import Engine, of_residuals, square_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.residuals.variables import Curves, Variable
 from nnode.discover.result import (
+    Absence,
     Clusters,
     Diagnosis,
     FirstScreen,
@@ -238,6 +239,7 @@ def _diagnosed(
             bool(named_individuals),
             testable,
             bool(imitations),
+            absent_effects,
         ),
         domain=domain,
         model="",
@@ -479,6 +481,7 @@ def _verdict(
     individuals_named: bool,
     testable: bool,
     imitated: bool,
+    absences: list[Absence],
 ) -> Verdict:
     """The verdict.
 
@@ -486,6 +489,7 @@ def _verdict(
         removed: share of the squared errors that the named effects removed.
         individuals_named: whether agent-specific parameters were confirmed.
         imitated: whether effects were selected that a better-fitting law does not need.
+        absences: the effects that were not found.
     """
     if not testable:
         return "not_testable"
@@ -497,6 +501,8 @@ def _verdict(
         return "named"
     if unexplained or imitated:
         return "unknown"
+    if absences and not any(absence.testable for absence in absences):
+        return "not_testable"
     return "none"
 
 

@@ -154,6 +154,12 @@ def verdict(d: Diagnosis) -> str:
             )
         case "not_testable":
             c = d.clusters
+            if c.open >= c.least:
+                return (
+                    "These data cannot test the model: no effect of the catalogue, with its "
+                    "smallest relevant size, would be named with a probability of 80 %. No "
+                    f"effect is named.{unconfirmed}"
+                )
             return (
                 f"The data are too few for a test: they contain "
                 f"{_count(c.open, 'exploration cluster')} and "

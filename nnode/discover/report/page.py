@@ -168,7 +168,7 @@ def _decided(d: Diagnosis) -> list[Block]:
         blocks.append(tables.effects_table(d))
     if any(effect.alternatives for effect in d.effects):
         blocks.append(tables.alternatives_table(d))
-    if d.verdict == "not_testable" and d.screen.leads:
+    if d.clusters.open < d.clusters.least and d.screen.leads:
         blocks += [
             Heading("Hypotheses", 3),
             Text(

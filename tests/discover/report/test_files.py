@@ -126,6 +126,12 @@ def test_every_verdict_is_a_sentence(traffic: Case, verdict: Verdict, words: str
         assert "about 17 clusters" in sentence(d)
 
 
+def test_many_clusters_can_be_not_testable_as_well(traffic: Case) -> None:
+    d = traffic.found.diagnosis
+    many = replace(d, verdict="not_testable", clusters=replace(d.clusters, open=40, least=9))
+    assert sentence(many).startswith("These data cannot test the model: no effect of the catalogue")
+
+
 def test_faults_of_the_measurement_stand_beside_the_verdict(traffic: Case) -> None:
     plain = traffic.found.diagnosis
     jumps = [DataFault("jump", f"lane/{i}", ["v1"], 3.0) for i in (1, 1, 2)]
