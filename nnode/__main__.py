@@ -10,6 +10,9 @@ from nnode.errors import suggestion
 from nnode.program import COMMANDS, words
 from nnode.version import VERSION
 
+#: Names of Python's functions, and a usual word, for commands of other names.
+SYNONYMS = {"calibrate": "train", "diagnose": "discover", "fit": "train"}
+
 
 def main() -> None:
     """Run the command that the command line names; ends the process where there is none such."""
@@ -26,7 +29,7 @@ def main() -> None:
     else:
         print(
             f"error: there is no command {name}, expected one of {', '.join(names)}"
-            f"{suggestion(name, names)}",
+            f"{suggestion(name, dict(zip(names, names, strict=True)) | SYNONYMS)}",
             file=sys.stderr,
         )
         sys.exit(2)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from nnode.__main__ import main as program
 from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver
 from nnode.calibrate.options import FusedOptions
@@ -249,3 +250,15 @@ def test_the_fused_solver_gets_its_options() -> None:
 def test_what_is_printed_can_be_pasted_into_a_shell() -> None:
     for place in ("runs/a/last.pt", "/tmp/a folder/it's/last.pt", "a,b=[c]/x.pt"):
         assert composed("train", *shlex.split(shell_override("resume", place))).resume == place
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"), [("diagnose", "discover"), ("fit", "train"), ("dicover", "discover")]
+)
+def test_an_unknown_command_is_told_the_one_that_was_meant(
+    given: str, meant: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["nnode", given])
+    with pytest.raises(SystemExit):
+        program()
+    assert capsys.readouterr().err.endswith(f"did you mean {meant}?\n")
