@@ -261,7 +261,7 @@ def _diagnosed(
             "open": [sequences[i].name for i in division.exploration],
             "sealed": [sequences[i].name for i in division.confirmation],
         },
-        notes=notes,
+        notes=[*notes, *_reached_bounds(base_system, extended)],
         not_offered=refused,
         seconds=clock.seconds,
         sealed=errors,
@@ -504,6 +504,29 @@ def _verdict(
     if absences and not any(absence.testable for absence in absences):
         return "not_testable"
     return "none"
+
+
+def _reached_bounds(base: System, extended: System) -> list[str]:
+    """A note on the law's parameters that are at bounds only in the extended model."""
+    reached = sorted(_at_bounds(extended) - _at_bounds(base))
+    if not reached:
+        return []
+    verb = "is at a bound of its" if len(reached) == 1 else "are at bounds of their"
+    return [
+        f"With the effects, {', '.join(reached)} {verb} admissible values: the effects replace "
+        "part of the law. Compare other laws."
+    ]
+
+
+def _at_bounds(system: System) -> set[str]:
+    """Addresses of the law's parameters at a bound of their admissible values."""
+    law = system.term_list[0]
+    return {
+        f"{law.name}.{name}"
+        for name, interval in law.bounds.items()
+        if "." not in name  # no weights of networks
+        and np.isclose(float(getattr(law, name)), [interval.low, interval.high], 1e-3, 1e-6).any()
+    }
 
 
 def _shift(before: System, after: System) -> dict[str, dict[str, Any]]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.discover.diagnose import diagnose
+from nnode.discover.diagnose import _reached_bounds, diagnose
 from nnode.discover.options import DiscoverOptions
 from nnode.errors import DataError
 from nnode.model import System
@@ -108,3 +108,13 @@ def test_a_desired_speed_can_be_tested_where_it_would_bind(
 def test_two_sequences_are_too_few() -> None:
     with pytest.raises(DataError, match="at least 3 sequences without a fault, there are 2"):
         diagnose(law(), platoons(number=2), OPTIONS)
+
+
+def test_a_law_whose_parameters_reach_bounds_with_effects_is_noted() -> None:
+    base, extended = law(), law()
+    assert _reached_bounds(base, extended) == []
+    with torch.no_grad():
+        extended.terms[0].L.fill_(extended.terms[0].bounds["L"].low)
+    (note,) = _reached_bounds(base, extended)
+    assert note.startswith("With the effects, lin.L is at a bound of its admissible values")
+    assert _reached_bounds(extended, extended) == []
