@@ -115,3 +115,20 @@ def test_an_unknown_parameter_is_refused() -> None:
     system = Traffic([make_law("lin")], leader="measured").double()
     with pytest.raises(ConfigError, match=r"drivers=T is no parameter .* v0, L"):
         fit_drivers(system, paths_of(sequences, 0.2), ["T"])
+
+
+def test_positions_apart_in_time_have_the_same_starts_and_parameters() -> None:
+    sequences, _ = platoons(0.0, 5)
+    every = paths_of(sequences, 0.2)
+    apart = every.apart(1.0)
+    times = np.flatnonzero(apart.observed[0])
+    assert len(times) == 31
+    np.testing.assert_allclose(np.diff(times) * DT, 1.0)
+    everything = np.ones(every.x.shape[1], dtype=bool)
+    np.testing.assert_allclose(
+        apart.starting_from(everything).start, every.starting_from(everything).start
+    )
+    system = Traffic([make_law("lin")], leader="measured").double()
+    found = fit_drivers(system, apart, "none")
+    deviation = 1 / np.sqrt(np.diag(found.marginal.information))
+    assert (np.abs(found.estimate.theta - np.log([29.0, 6.0])) < 4 * deviation).all()
