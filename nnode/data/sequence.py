@@ -180,6 +180,11 @@ class Sequence:
             v=None if self.v is None else self.v[low:high],
         )
 
+    def every(self, stride: int) -> Sequence:
+        """The first, and then every ``stride``-th sample."""
+        v = None if self.v is None else self.v[::stride]
+        return replace(self, time=self.time[::stride], x=self.x[::stride], v=v)
+
     def select(self, keep: np.ndarray) -> Sequence:
         """The same sequence with only the agents where ``keep`` (N booleans) holds."""
         index = np.flatnonzero(keep)

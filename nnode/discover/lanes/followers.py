@@ -38,6 +38,7 @@ from nnode.model.effects import Effect, Probe
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State
+from nnode.population.drivers import STEP as DRIVER_STEP
 from nnode.population.drivers import Population, fit_drivers, refit
 from nnode.population.followers import Followers, Paths, Push, antithetic_draws, paths_of
 from nnode.population.likelihood import PushNoise, Whitening, marginal
@@ -78,7 +79,8 @@ class FollowersEngine(TrafficEngine):
         large: threshold of Huber's loss.
         like: an engine whose estimates are used for all models; only deviations of drivers and of
             starts are estimated.
-        apart: smallest time between positions that are used, s.
+        apart: smallest time between positions that are used, s. If it is not 0, sequences are
+            simulated with samples at most :data:`~nnode.population.drivers.STEP` apart.
 
     Attributes:
         population: the last estimate of :meth:`fit_whitening`; None before.
@@ -92,8 +94,11 @@ class FollowersEngine(TrafficEngine):
         like: FollowersEngine | None = None,
         apart: float = 0.0,
     ) -> None:
-        super().__init__(sequences, np.inf, clusters, large)
         self.apart: float = apart if like is None else like.apart
+        if self.apart:
+            stride = max(1, int(DRIVER_STEP / sequences[0].dt + 1e-9))
+            sequences = [s.every(stride) for s in sequences]
+        super().__init__(sequences, np.inf, clusters, large)
         self.smallest_share = -np.inf
         self._paths_by_step, self._like = dict[tuple[int, int], Paths](), like
         self._label = np.arange(len(sequences)) if clusters is None else np.asarray(clusters)
