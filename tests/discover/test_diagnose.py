@@ -118,3 +118,14 @@ def test_a_law_whose_parameters_reach_bounds_with_effects_is_noted() -> None:
     (note,) = _reached_bounds(base, extended)
     assert note.startswith("With the effects, lin.L is at a bound of its admissible values")
     assert _reached_bounds(extended, extended) == []
+
+
+def test_smoothed_positions_are_used_one_second_apart_with_drivers_who_differ() -> None:
+    sequences = platoons(relative_speed(0.4), **MANY | {"noise": 0.0})
+    options = DiscoverOptions(effects=["relative_speed"], structure=False, smoothed=True)
+    found = diagnose(law(), sequences, options)
+    d = found.diagnosis
+    assert d.verdict == "named"
+    assert d.effects[0].coefficients["kappa"].value == pytest.approx(0.4, abs=0.05)
+    assert {"push", "push_time", "measurement"} <= {row.name for row in d.drivers}
+    assert "behind the measured paths of the vehicles ahead" in d.gap.definition
