@@ -525,7 +525,7 @@ def _at_bounds(system: System) -> set[str]:
         f"{law.name}.{name}"
         for name, interval in law.bounds.items()
         if "." not in name  # no weights of networks
-        and np.isclose(float(getattr(law, name)), [interval.low, interval.high], 1e-3, 1e-6).any()
+        and np.isclose(getattr(law, name).item(), [interval.low, interval.high], 1e-3, 1e-6).any()
     }
 
 
