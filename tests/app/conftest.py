@@ -86,7 +86,7 @@ def start_script(
         env={**environment(), **env},
         capture_output=True,
         text=True,
-        timeout=900,
+        timeout=1500,
         check=False,
     )
     return ended(done, status)

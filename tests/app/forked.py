@@ -54,7 +54,7 @@ class Forked:
     def send_signal(self, number: int) -> None:
         os.kill(self.pid, number)
 
-    def communicate(self, timeout: float = 900.0) -> tuple[str, str]:
+    def communicate(self, timeout: float = 1500.0) -> tuple[str, str]:
         """What it printed, at its end; one that works for longer is ended."""
         if self.poll(timeout) is None:
             self.send_signal(signal.SIGKILL)
