@@ -30,7 +30,7 @@ SHARE = EDGE["m"] / (ZONE[1] - ZONE[0])
 #: Where the scenario's first vehicle begins, m, and its speed, m/s.
 START, SPEED = 50.0, 20.0
 #: s; what the whole may take.
-LIMIT = 600.0
+LIMIT = 900.0
 
 
 def stepped(x: np.ndarray, v: np.ndarray, gap: np.ndarray, ahead: np.ndarray) -> np.ndarray:
