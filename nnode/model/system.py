@@ -128,10 +128,9 @@ class System(nn.Module):
         for term in terms:
             rule = term.rule_for(self.order)
             number = 0 if rule is None else rule.memory
-            term_memory = None
-            if memory is not None and number:
-                term_memory = memory[..., first : first + number]
-                first += number
+            own = slice(first, first + number)
+            term_memory = memory[..., own] if memory is not None and number else None
+            first = own.stop
             rate = term(replace(state, terms=terms, rate=total, memory=term_memory))
             if number:
                 added.append(rate[..., self.dim :])

@@ -213,8 +213,7 @@ def _filtered(
     white, logdet = np.zeros((number, samples, width)), np.zeros(number)
     mean, before = np.empty((n, width)), np.empty((n, width))
     spread, half = np.empty((n, n)), np.empty((n, n))
-    forward, noise, gain = np.zeros((n, n)), np.empty(n), np.empty(n)
-    noise[:] = 0.0
+    forward, noise, gain = np.zeros((n, n)), np.zeros(n), np.empty(n)
     for s in range(number):
         mean[:], spread[:] = 0.0, 0.0
         spread[m, m] = sigma[0] ** 2
