@@ -78,6 +78,8 @@ def test_a_diagnosis_ends_with_a_verdict(
     assert f"verdict: {report['verdict']}" in done.stdout
     # six open clusters are as many as it takes to test one effect
     assert report["clusters"]["open"] == report["clusters"]["least"] == 6
-    assert report["verdict"] in ("none", "unknown")
+    # with so few clusters the effect may be one that cannot be tested
+    testable = any(absence["testable"] for absence in report["absences"])
+    assert report["verdict"] in ("unknown", "none" if testable else "not_testable")
     assert report["effects"] == report["data_faults"] == []
     assert len(report["split"]["open"]) + len(report["split"]["sealed"]) == 9
