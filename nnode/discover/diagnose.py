@@ -375,9 +375,13 @@ def _explore(
         populations = [engine.population_of(initial.system)]
         if not populations[0].plausible:
             # a strong missing effect is attributed to pushes
-            extensions = likely_extensions(engine, initial, effects)
+            usual = engine.with_usual_variances(initial.system)
+            extensions = likely_extensions(usual, refine(usual, initial.system), effects)
             hints += extensions
-            populations += map(engine.population_of, extensions)
+            for extension in extensions:
+                populations.append(engine.population_of(extension))
+                if populations[-1].plausible:
+                    break
         engine.set_likeliest(populations)
         base = refine(engine, initial.system)
     else:

@@ -93,11 +93,11 @@ class Population:
 
     @property
     def plausible(self) -> bool:
-        """Whether the estimate converged, with pushes that are small compared to the rates and
-        shorter than the longest allowed. Others stand for a deviation of the law."""
+        """Whether pushes are small compared to the rates and shorter than the longest allowed.
+        Others stand for a deviation of the law."""
         variances = self.estimate.variances
-        short = variances.noise[1] < (1 - NEAR) * variances.high[1]
-        return self.estimate.converged and short and self.explains_rates
+        short = bool(variances.noise[1] < (1 - NEAR) * variances.high[1])
+        return short and self.explains_rates
 
     @property
     def explains_rates(self) -> bool:

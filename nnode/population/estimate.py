@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
+from scipy import stats
 from scipy.optimize import minimize
 
 from nnode.population.likelihood import Linearised, Marginal, Noise, Products, marginal
@@ -32,6 +33,10 @@ MODES = 0.02
 #: Largest number of steps of a search. Most converge in 6 to 16. The variances of a zone with free
 #: ends may need more: with 20 steps, the log likelihood of one ended at 25,152 in place of 26,914.
 STEPS = 40
+#: A search ends when the log likelihood has not exceeded its maximum for so many steps, for example
+#: because the steps cycle around a kink of the model. It counts as converged if all of these steps
+#: remained within the confidence region of this level around the maximum.
+PATIENCE, REGION = 10, 0.95
 #: The smallest relaxation factor of steps that reverse the previous one.
 LEAST = 0.2
 
@@ -90,7 +95,9 @@ class Estimate:
         data: the samples, linearised at the estimate.
         marginal: the marginal likelihood at the estimate.
         steps: number of linearisations.
-        converged: whether the last step was below the tolerance.
+        converged: whether the last step was below the tolerance, or the last ones remained close
+            to the maximum, see :data:`PATIENCE`. If the last step was not, the estimate is the
+            iterate with the largest likelihood.
     """
 
     theta: np.ndarray
@@ -139,10 +146,13 @@ def estimate(
     high = np.full(len(theta), np.inf) if high is None else high
     empty = np.zeros((0, 0))
     data = response(theta, empty if agents is None else agents, empty if start is None else start)
-    converged, n_linearisations, n_agents = False, 1, int(data.agent.max()) + 1
+    converged, stalled, recent = False, False, list[float]()
+    n_linearisations, n_agents = 1, int(data.agent.max()) + 1
     agents = np.zeros((n_agents, data.random.shape[-1])) if agents is None else agents
     start = np.zeros(data.start.shape[::2]) if start is None else start
     relaxation, previous_change = 1.0, np.zeros(len(theta))
+    best, logliks = (theta, agents, start, data, variances), list[float]()
+    region = float(stats.chi2.ppf(REGION, max(len(theta), 1))) / 2
     for _ in range(steps):
         before = variances
         variances = fit_variances(
@@ -164,6 +174,9 @@ def estimate(
             high=np.minimum(high - theta, longest),
             restricted=restricted,
         )
+        logliks.append(current.unchanged)
+        if logliks[-1] == max(logliks):
+            best = theta, agents, start, data, variances
         change = current.change
         misfit = _misfit(data, products, variances, agents, start)
         reversed_step = previous_change @ current.information @ change < 0
@@ -194,9 +207,13 @@ def estimate(
         largest_change = max(np.max(values, initial=0.0) for values in changes)
         if accepted is not None:
             (theta, agents, start), data = accepted, linearised
-        if largest_change < tolerance or accepted is None:
-            converged = bool(largest_change < tolerance)
+        converged, recent = bool(largest_change < tolerance), logliks[-PATIENCE:]
+        stalled = len(logliks) > PATIENCE and max(recent) < max(logliks)
+        if converged or accepted is None or stalled:
             break
+    if not converged:
+        theta, agents, start, data, variances = best
+        converged = stalled and max(logliks) - min(recent) < region
     bounds: dict[str, Any] = {"low": low - theta, "high": high - theta, "restricted": restricted}
     variances = fit_variances(data, noise, variances, tolerance=tolerance, **bounds)
     products = noise.products(data, variances.noise)

@@ -399,10 +399,20 @@ class Followers:
             parameters[self.random] += agents[self.paths.agent].T
         return parameters
 
-    def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
-        paths, order = self.paths, self.lane.order
-        parameters, n_parameters, n_starts = self.spread(theta, agents), len(theta), self.starts
-        initial = start.T if start.size else np.zeros((n_starts, len(paths.agent)))
+    def columns(
+        self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray, n_starts: int = 0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of the positions, by central differences.
+
+        Args:
+            theta, agents, start: see :class:`~nnode.population.estimate.Response`.
+            n_starts: number of states whose start is varied.
+
+        Returns:
+            ``(F, K, P + n_starts)`` by parameters and starts, and the states ``(K, M, F)``.
+        """
+        parameters, n_parameters = self.spread(theta, agents), len(theta)
+        initial = start.T if start.size else np.zeros((self.starts, len(self.paths.agent)))
         runs = np.repeat(parameters[None], 1 + 2 * (n_parameters + n_starts), 0)
         initials = np.repeat(initial[None], len(runs), 0)
         for p in range(n_parameters):
@@ -413,17 +423,21 @@ class Followers:
             initials[2 + 2 * (n_parameters + h), h] -= START_DIFFERENCE
         states = self.simulate(runs, initials)
         x = states[:, 0].transpose(1, 2, 0)  # (R, F, K)
-        higher, lower = x[1::2], x[2::2]
         step = np.repeat([DIFFERENCE, START_DIFFERENCE], [n_parameters, n_starts])
-        columns = ((higher - lower) / (2 * step[:, None, None])).transpose(1, 2, 0)
+        columns = (x[1::2] - x[2::2]) / (2 * step[:, None, None])
+        return columns.transpose(1, 2, 0), states[:, :, 0]
+
+    def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
+        paths, order, n_parameters = self.paths, self.lane.order, len(theta)
+        columns, states = self.columns(theta, agents, start, self.starts)
         fixed, by_start = columns[..., :n_parameters], columns[..., n_parameters:]
         random = fixed[..., self.random]
-        residual = paths.x - x[0]
+        residual = paths.x - states[:, 0].T
         if agents.size:
             residual = residual + np.einsum("fkq,fq->fk", random, agents[paths.agent])
         if start.size:
             residual = residual + np.einsum("fkh,fh->fk", by_start, start)
-        transition, by_forcing = self.linear(parameters, states[:, :, 0])
+        transition, by_forcing = self.linear(self.spread(theta, agents), states)
         forced = np.ascontiguousarray(by_forcing[..., order - 1])
         return Linearised(
             residual=residual,

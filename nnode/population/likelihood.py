@@ -402,6 +402,13 @@ class Marginal:
     shrinkage: np.ndarray
     start: np.ndarray
 
+    @property
+    def unchanged(self) -> float:
+        """The log likelihood without the change of the parameters."""
+        score = self.agents.sum(0)[1:, 0]
+        rise = self.change @ score - self.change @ self.information @ self.change / 2
+        return self.loglik - float(rise)
+
 
 def marginal(
     data: Linearised,

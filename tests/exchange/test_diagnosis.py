@@ -141,7 +141,6 @@ def test_sumo_s_drivers_are_understood_without_any_noise(
     assert (report["gap"]["closed"] > 0.7) == bool(report["effects"])
 
 
-@pytest.mark.skip(reason="takes more than 14 minutes of one core; to be made faster")
 def test_the_stretch_of_longer_times_is_found(
     sumo: Path,
     script: Script,  # noqa: F811

@@ -39,7 +39,8 @@ from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State
 from nnode.population.drivers import STEP as DRIVER_STEP
-from nnode.population.drivers import Population, fit_drivers, refit
+from nnode.population.drivers import Population, fit_drivers, initial_variances, refit
+from nnode.population.estimate import fit_deviations
 from nnode.population.followers import Followers, Paths, Push, antithetic_draws, paths_of
 from nnode.population.likelihood import PushNoise, Whitening, marginal
 from nnode.simulation.numpy import strides
@@ -143,7 +144,7 @@ class FollowersEngine(TrafficEngine):
         run = self._run_of(system, row)
         theta = run.model.at(row.numpy()[: len(run.model.names)])
         agents, start = self._deviations(run.model)
-        columns = run.model(theta, agents, start).fixed
+        columns, _ = run.model.columns(theta, agents, start)
         natural = run.model.natural(theta)
         columns = columns / np.where(run.model.logs, natural, 1.0)
         if curve is not None:
@@ -214,18 +215,25 @@ class FollowersEngine(TrafficEngine):
         else:
             self._set_population(refit(start, fixed, paths, fixed=self._like is not None))
 
-    def population_of(self, system: System, *, anew: bool = False) -> Population:
-        """The estimate with a model; the engine keeps its own.
-
-        Args:
-            anew: whether to start from the usual variances instead of the present estimate.
-        """
+    def population_of(self, system: System) -> Population:
+        """The estimate with a model; the engine keeps its own."""
         trial = copy.copy(self)
-        if anew:
-            trial.population = None
         trial.fit_whitening(system, ParameterVector(system).row)
         assert trial.population is not None
         return trial.population
+
+    def with_usual_variances(self, system: System) -> FollowersEngine:
+        """An engine with the variances where searches start, and all parameters of the law that can
+        differ between drivers as random effects. The variances of a model that lacks a strong
+        effect attribute it to pushes, and would hide where it acts."""
+        row = ParameterVector(system).row
+        paths = self._paths(self._longest(system, row[None]))
+        model = Followers(system, paths, Followers(system, paths).may_differ)
+        variances = initial_variances(model)
+        deviations = fit_deviations(model, PushNoise(), model.start, variances)
+        engine = copy.copy(self)
+        engine._set_population(Population(model=model, estimate=deviations, bias=0 * model.start))
+        return engine
 
     def set_likeliest(self, populations: Iterable[Population]) -> None:
         """Take the estimate with the best BIC. The variances of a model that lacks an effect would

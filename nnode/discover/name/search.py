@@ -93,7 +93,10 @@ def likely_extensions(engine: Engine, fit: Fit, effects: list[type[Effect]]) -> 
     extensions = []
     for score in Screen(fit, engine.cluster).scores(effect_traces)[:LIKELY]:
         with suppress(SimulationError):
-            extensions.append(calibrated(engine, fit, score, 0.0).system)
+            extension = calibrated(engine, fit, score, 0.0)
+            if score.effect.consecutive:
+                extension = refined_edges(engine, extension, score.effect.name)
+            extensions.append(extension.system)
     return extensions
 
 
@@ -297,11 +300,7 @@ def _with_refitted_variances(
     model without a strong effect would attribute it to autocorrelated pushes."""
     assert selection.screen is not None
     likeliest = sorted(candidates, key=lambda c: c.fit.cost)[:LIKELY]
-    populations = [engine.population_of(candidate.fit.system) for candidate in likeliest]
-    best = max(populations, key=lambda population: population.criterion)
-    if not best.plausible:  # it can be a local maximum
-        populations.append(engine.population_of(best.model.system, anew=True))
-    engine.set_likeliest(populations)
+    engine.set_likeliest(engine.population_of(candidate.fit.system) for candidate in likeliest)
     selection.fit = refine(engine, selection.fit.system)
     refitted = []
     for candidate in candidates:
