@@ -198,16 +198,10 @@ def estimate(
                 break
             rises = (trial_misfit > misfit)[:, None]
             share, shares = share / 2, np.where(rises, shares / 2, shares)
-        scale = np.sqrt(np.maximum(np.diag(current.information), 1e-300))
-        changes = (
-            np.abs(change) * scale,
-            np.abs(np.log(variances.row / before.row)),
-            np.abs(current.deviations - agents) / variances.spread,
-        )
-        largest_change = max(np.max(values, initial=0.0) for values in changes)
+        largest_change = _largest_change(current, agents, variances, before)
         if accepted is not None:
             (theta, agents, start), data = accepted, linearised
-        converged, recent = bool(largest_change < tolerance), logliks[-PATIENCE:]
+        converged, recent = largest_change < tolerance, logliks[-PATIENCE:]
         stalled = len(logliks) > PATIENCE and max(recent) < max(logliks)
         if converged or accepted is None or stalled:
             break
@@ -332,6 +326,19 @@ def fit_variances(
     )
     logs_all[free] = best.x * scale
     return variances.filled(np.exp(logs_all))
+
+
+def _largest_change(
+    current: Marginal, agents: np.ndarray, variances: Variances, before: Variances
+) -> float:
+    """The largest change of a step, in the units of the tolerance of :func:`estimate`."""
+    scale = np.sqrt(np.maximum(np.diag(current.information), 1e-300))
+    changes = (
+        np.abs(current.change) * scale,
+        np.abs(np.log(variances.row / before.row)),
+        np.abs(current.deviations - agents) / variances.spread,
+    )
+    return max(float(np.max(values, initial=0.0)) for values in changes)
 
 
 def _misfit(
