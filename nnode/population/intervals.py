@@ -51,6 +51,7 @@ def deviation_intervals(population: Population) -> np.ndarray:
     variances, data = population.estimate.variances, population.estimate.data
     logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
     free = np.flatnonzero((logs > low + NEAR) & (logs < high - NEAR))
+    theta, model = population.estimate.theta, population.model
     products: dict[tuple[float, ...], Products] = {}
 
     def loglik(move: np.ndarray) -> float:
@@ -60,7 +61,14 @@ def deviation_intervals(population: Population) -> np.ndarray:
         key = tuple(shifted.noise)
         if key not in products:
             products[key] = PushNoise().products(data, shifted.noise)
-        return marginal(data, products[key], shifted.spread, shifted.start).loglik
+        return marginal(
+            data,
+            products[key],
+            shifted.spread,
+            shifted.start,
+            low=model.low - theta,
+            high=model.high - theta,
+        ).loglik
 
     steps, size = DIFFERENCE * np.eye(len(free)), len(free)
     curvature = np.zeros((size, size))
