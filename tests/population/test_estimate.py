@@ -1,0 +1,74 @@
+"""Searches for estimates that cannot converge step by step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import nnode
+from benchmarks.drivers import platoons
+from nnode.app.python.inputs import model_options
+from nnode.model.build import build_model
+from nnode.population.drivers import LONGEST, initial_variances
+from nnode.population.estimate import STEPS, Variances, estimate
+from nnode.population.followers import Followers, paths_of
+from nnode.population.likelihood import Linearised, PushNoise, WhiteNoise
+
+DRIVERS, SAMPLES = 8, 5
+
+
+class Kink:
+    """The response 1 + |theta| of all samples, which are 0: steps jump across the kink at 0."""
+
+    def __init__(self) -> None:
+        self.tried: list[float] = []
+
+    def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
+        self.tried.append(float(theta[0]))
+        shape = DRIVERS, SAMPLES
+        errors = 0.1 * np.random.default_rng(1).standard_normal(shape)
+        return Linearised(
+            residual=errors - 1 - abs(theta[0]),
+            fixed=np.full((*shape, 1), np.sign(theta[0])),
+            random=np.zeros((*shape, 0)),
+            start=np.zeros((*shape, 0)),
+            observed=np.ones(shape, dtype=bool),
+            agent=np.arange(DRIVERS),
+        )
+
+
+def test_a_search_around_a_kink_ends_with_its_most_likely_iterate() -> None:
+    variances = Variances(
+        noise=np.ones(1),
+        spread=np.zeros(0),
+        start=np.zeros(0),
+        low=np.full(1, 0.1),
+        high=np.full(1, 10.0),
+    )
+    model = Kink()
+    result = estimate(model, WhiteNoise(), np.array([0.7]), variances)
+    assert abs(result.theta[0]) == min(abs(theta) for theta in model.tried)
+    assert not result.converged
+
+
+def test_further_steps_never_make_an_estimate_less_likely() -> None:
+    sequences = nnode.sequences(platoons("idm", "speed_zone", 0.15, 3, 4, 4, 0.0))
+    # far from the zone that slows the vehicles, steps raise the pushes in place of the likelihood
+    zone = {"name": "speed_zone", "alpha": 0.8, "a": 200.0, "b": 380.0}
+    system = build_model(model_options("idm", "measured", effects=[zone])).double()
+    model = Followers(system, paths_of(list(sequences), 0.2), ["idm.T"])
+
+    def loglik(steps: int) -> float:
+        result = estimate(
+            model,
+            PushNoise(),
+            model.start,
+            initial_variances(model),
+            low=model.low,
+            high=model.high,
+            longest=LONGEST,
+            steps=steps,
+        )
+        assert result.steps < STEPS
+        return result.marginal.unchanged
+
+    assert loglik(STEPS) >= loglik(5)
