@@ -350,7 +350,7 @@ def _misfit(
 ) -> np.ndarray:
     """``(D,)`` the agents' penalised sums of squares; infinite where a simulation diverges."""
     number, count = data.fixed.shape[-1], len(agents)
-    diverged = ~np.isfinite(np.where(data.observed, data.residual, 0.0)).all(1)
+    finite = np.isfinite(products.gram).all((1, 2))
     negative_deviations = -np.concatenate([agents[data.agent], start], 1)
     weights = np.concatenate(
         [
@@ -360,7 +360,10 @@ def _misfit(
         ],
         1,
     )
-    square = np.einsum("si,sij,sj->s", weights, products.gram, weights)
-    square = np.where(diverged, np.inf, square + ((start / variances.start) ** 2).sum(1))
+    square = np.full(len(weights), np.inf)
+    square[finite] = np.einsum(
+        "si,sij,sj->s", weights[finite], products.gram[finite], weights[finite]
+    )
+    square += ((start / variances.start) ** 2).sum(1)
     penalty = ((agents / variances.spread) ** 2).sum(1)
     return np.bincount(data.agent, square, count) + penalty

@@ -135,7 +135,8 @@ class Noise(Protocol):
             values: positive values of its parameters.
         """
         white, logdet = self.whitened(data, data.columns, values)
-        return Products(white.transpose(0, 2, 1) @ white, logdet)
+        with np.errstate(over="ignore", invalid="ignore"):  # trial parameters may blow up
+            return Products(white.transpose(0, 2, 1) @ white, logdet)
 
     def whitened(
         self, data: Linearised, columns: np.ndarray, values: np.ndarray

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 
 import nnode
@@ -14,6 +17,13 @@ from nnode.population.followers import Followers, paths_of
 from nnode.population.likelihood import Linearised, PushNoise, WhiteNoise
 
 DRIVERS, SAMPLES = 8, 5
+VARIANCES = Variances(
+    noise=np.ones(1),
+    spread=np.zeros(0),
+    start=np.zeros(0),
+    low=np.full(1, 0.1),
+    high=np.full(1, 10.0),
+)
 
 
 class Kink:
@@ -37,15 +47,8 @@ class Kink:
 
 
 def test_a_search_around_a_kink_ends_with_its_most_likely_iterate() -> None:
-    variances = Variances(
-        noise=np.ones(1),
-        spread=np.zeros(0),
-        start=np.zeros(0),
-        low=np.full(1, 0.1),
-        high=np.full(1, 10.0),
-    )
     model = Kink()
-    result = estimate(model, WhiteNoise(), np.array([0.7]), variances)
+    result = estimate(model, WhiteNoise(), np.array([0.7]), VARIANCES)
     assert abs(result.theta[0]) == min(abs(theta) for theta in model.tried)
     assert not result.converged
 
@@ -72,3 +75,19 @@ def test_further_steps_never_make_an_estimate_less_likely() -> None:
         return result.marginal.unchanged
 
     assert loglik(STEPS) >= loglik(5)
+
+
+class Overflow(Kink):
+    """The same, whose simulations reach numbers that cannot be squared where theta is negative."""
+
+    def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
+        data = super().__call__(theta, agents, start)
+        return replace(data, residual=data.residual * 1e200) if theta[0] < 0 else data
+
+
+def test_trial_parameters_that_blow_up_are_refused_without_a_warning() -> None:
+    model = Overflow()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = estimate(model, WhiteNoise(), np.array([0.7]), VARIANCES)
+    assert min(model.tried) < 0 < result.theta[0]
