@@ -135,7 +135,7 @@ def estimate(
         low, high: ``(P,)`` bounds of the parameters.
         restricted: REML, for few agents.
         longest: largest step of a parameter, in its own unit.
-        steps: largest number of linearisations.
+        steps: largest number of steps; halving one takes further linearisations.
         tolerance: the search ends when a step moves no parameter by more than this share of its
             standard error, no standard deviation by more than this share of itself, and no agent's
             deviation by more than this share of their standard deviation.
@@ -146,8 +146,8 @@ def estimate(
     high = np.full(len(theta), np.inf) if high is None else high
     empty = np.zeros((0, 0))
     data = response(theta, empty if agents is None else agents, empty if start is None else start)
-    converged, stalled, recent = False, False, list[float]()
-    n_linearisations, n_agents = 1, int(data.agent.max()) + 1
+    converged, stalled, n_linearisations = False, False, 1
+    n_agents = int(data.agent.max()) + 1
     agents = np.zeros((n_agents, data.random.shape[-1])) if agents is None else agents
     start = np.zeros(data.start.shape[::2]) if start is None else start
     relaxation, previous_change = 1.0, np.zeros(len(theta))
@@ -201,13 +201,13 @@ def estimate(
         largest_change = _largest_change(current, agents, variances, before)
         if accepted is not None:
             (theta, agents, start), data = accepted, linearised
-        converged, recent = largest_change < tolerance, logliks[-PATIENCE:]
-        stalled = len(logliks) > PATIENCE and max(recent) < max(logliks)
+        converged = largest_change < tolerance
+        stalled = max(logliks[-PATIENCE:]) < max(logliks)
         if converged or accepted is None or stalled:
             break
     if not converged:
         theta, agents, start, data, variances = best
-        converged = stalled and max(logliks) - min(recent) < region
+        converged = stalled and max(logliks) - min(logliks[-PATIENCE:]) < region
     bounds: dict[str, Any] = {"low": low - theta, "high": high - theta, "restricted": restricted}
     variances = fit_variances(data, noise, variances, tolerance=tolerance, **bounds)
     products = noise.products(data, variances.noise)

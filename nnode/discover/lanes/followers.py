@@ -231,8 +231,8 @@ class FollowersEngine(TrafficEngine):
         model = Followers(system, paths, Followers(system, paths).may_differ)
         variances = initial_variances(model)
         deviations = fit_deviations(model, PushNoise(), model.start, variances)
-        engine = copy.copy(self)
-        engine._set_population(Population(model=model, estimate=deviations, bias=0 * model.start))
+        bias, engine = np.zeros(len(model.start)), copy.copy(self)
+        engine._set_population(Population(model=model, estimate=deviations, bias=bias))
         return engine
 
     def set_likeliest(self, populations: Iterable[Population]) -> None:
