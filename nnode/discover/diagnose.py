@@ -191,7 +191,7 @@ def _diagnosed(
     assert selection.screen is not None
     power = PowerSimulation(selection.screen, options.alpha, numbers.sealed if testable else 0)
     absent_effects = absences(selection, power)
-    corrected = confirmation.corrected(selection)
+    corrected = confirmation.corrected(engine, selection)
     if unconfirmed:
         # an unconfirmed effect that was removed could otherwise show as a difference of agents
         refitted = [estimate_individual(engine, selection.fit, kind) for kind in kinds]

@@ -47,7 +47,7 @@ NOISE = (0.015, 0.45)
 #: their errors are autocorrelated. The table in docs/method.md has the autocorrelations.
 APART = 1.0
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
-DIFFERENCE, START_DIFFERENCE = 1e-4, 1e-2
+DIFFERENCE, START_DIFFERENCE = 1e-6, 1e-4
 #: The push on the highest rate ``(R, F)``, as a function of the index of the time in the paths
 #: ahead, and of states and rates ``(M, R, F)``.
 Push = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
@@ -402,7 +402,7 @@ class Followers:
     def columns(
         self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray, n_starts: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of the positions, by central differences.
+        """Derivatives of the positions, by forward differences.
 
         Args:
             theta, agents, start: see :class:`~nnode.population.estimate.Response`.
@@ -413,18 +413,16 @@ class Followers:
         """
         parameters, n_parameters = self.spread(theta, agents), len(theta)
         initial = start.T if start.size else np.zeros((self.starts, len(self.paths.agent)))
-        runs = np.repeat(parameters[None], 1 + 2 * (n_parameters + n_starts), 0)
+        runs = np.repeat(parameters[None], 1 + n_parameters + n_starts, 0)
         initials = np.repeat(initial[None], len(runs), 0)
         for p in range(n_parameters):
-            runs[1 + 2 * p, p] += DIFFERENCE
-            runs[2 + 2 * p, p] -= DIFFERENCE
+            runs[1 + p, p] += DIFFERENCE
         for h in range(n_starts):
-            initials[1 + 2 * (n_parameters + h), h] += START_DIFFERENCE
-            initials[2 + 2 * (n_parameters + h), h] -= START_DIFFERENCE
+            initials[1 + n_parameters + h, h] += START_DIFFERENCE
         states = self.simulate(runs, initials)
         x = states[:, 0].transpose(1, 2, 0)  # (R, F, K)
         step = np.repeat([DIFFERENCE, START_DIFFERENCE], [n_parameters, n_starts])
-        columns = (x[1::2] - x[2::2]) / (2 * step[:, None, None])
+        columns = (x[1:] - x[0]) / step[:, None, None]
         return columns.transpose(1, 2, 0), states[:, :, 0]
 
     def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:

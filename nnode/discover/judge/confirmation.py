@@ -22,6 +22,7 @@ from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
 from nnode.discover.rules import rules
+from nnode.discover.statistics.bias import corrected_for_bias
 from nnode.discover.statistics.combination import combined
 from nnode.discover.statistics.paired import gains
 from nnode.discover.statistics.random_effects import (
@@ -247,11 +248,11 @@ class ConfirmationSet:
     def _bias_corrected(self, fit: Fit) -> Fit:
         return bias_corrected(fit, self.exploration, self.seed) if self.domain == "crowd" else fit
 
-    def corrected(self, selection: Selection) -> Fit:
+    def corrected(self, engine: Engine, selection: Selection) -> Fit:
         """The fit with the confirmed effects, corrected for its bias by simulation."""
         if self._corrected_fit is None or not selection.steps:
             return selection.fit
-        return self._corrected_fit
+        return corrected_for_bias(engine, self._corrected_fit, self.seed)
 
     def confirmation(self, agents: list[Agents]) -> Confirmation:
         """The weakest test of the selected effects: of the population, or else of individuals."""

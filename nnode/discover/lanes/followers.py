@@ -24,7 +24,6 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import (
     LARGE,
-    STEP,
     TrafficEngine,
     huber_residuals,
     weights_of,
@@ -38,8 +37,7 @@ from nnode.model.effects import Effect, Probe
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State
-from nnode.population.drivers import STEP as DRIVER_STEP
-from nnode.population.drivers import Population, fit_drivers, initial_variances, refit
+from nnode.population.drivers import STEP, Population, fit_drivers, initial_variances, refit
 from nnode.population.estimate import fit_deviations
 from nnode.population.followers import Followers, Paths, Push, antithetic_draws, paths_of
 from nnode.population.likelihood import PushNoise, Whitening, marginal
@@ -97,7 +95,7 @@ class FollowersEngine(TrafficEngine):
     ) -> None:
         self.apart: float = apart if like is None else like.apart
         if self.apart:
-            stride = max(1, int(DRIVER_STEP / sequences[0].dt + 1e-9))
+            stride = max(1, int(STEP / sequences[0].dt + 1e-9))
             sequences = [s.every(stride) for s in sequences]
         super().__init__(sequences, np.inf, clusters, large)
         self.smallest_share = -np.inf
@@ -106,7 +104,7 @@ class FollowersEngine(TrafficEngine):
         self.population: Population | None = None
         self._whitening: Whitening | None = None
         self._last_run: tuple[System, Tensor, _Run] | None = None
-        paths = self._paths(STEP[2])
+        paths = self._paths(STEP)
         self._observed = torch.from_numpy(paths.observed)
         f, k = np.nonzero(paths.observed)
         self.sequence = paths.sequence[f]
@@ -124,12 +122,12 @@ class FollowersEngine(TrafficEngine):
         """Squared errors of the followers' positions after the first sample, with the deviations
         of drivers and starts that are most likely under this model."""
         compared = self._observed.numpy() & (np.arange(self._observed.shape[1]) > 0)
-        sequence = np.repeat(self._paths(STEP[2]).sequence, compared.sum(1))
+        sequence = np.repeat(self._paths(STEP).sequence, compared.sum(1))
         return Squares(self._position_errors(system, row)[compared] ** 2, sequence)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """The simulated followers of each sequence, with the deviations of :meth:`squares`."""
-        errors, paths = self._position_errors(system, row), self._paths(STEP[2])
+        errors, paths = self._position_errors(system, row), self._paths(STEP)
         simulations: list[Simulation | None] = []
         for b, s in enumerate(self.sequences):
             x = np.full_like(s.x[..., 0], np.nan)
@@ -256,6 +254,10 @@ class FollowersEngine(TrafficEngine):
         return engines
 
     # -- parts -----------------------------------------------------------------------------------
+
+    def _longest(self, system: System, rows: Tensor) -> float:
+        """Longest step, s: as in a calibration of drivers."""
+        return min(STEP, super()._longest(system, rows))
 
     def _paths(self, longest: float) -> Paths:
         """The followers, for simulations with steps of at most ``longest`` s. A driver in several
