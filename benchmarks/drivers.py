@@ -1,11 +1,12 @@
 """The diagnosis of lanes where drivers differ: ``python -m benchmarks.drivers --seed N --cases K``.
 
-Every case is ``--platoons`` platoons of ``--vehicles`` vehicles for 30 s at 5 Hz, by ``lin`` or
-``idm``, in which one effect is hidden or none, or two with ``--pairs``. Drivers' parameters are
-log-normal (``lin``: v0; ``idm``: T and v0) with a standard deviation of ``--spread`` %, pushes last
-4 s, and positions are measured with errors of ``--error`` m. ``--nature`` departs from this. Paths
-are integrated here by Euler's method; everything else is the package's public interface. The cases
-of a run are fixed by its seed. The table has a row per case; what is printed last counts them.
+Every case is ``--platoons`` platoons of ``--vehicles`` vehicles for 30 s at 5 Hz, by ``lin``,
+``idm`` or ``fvdm``, in which one effect is hidden or none, or two with ``--pairs``. Drivers'
+parameters are log-normal (``lin``: v0; ``idm``: T and v0; ``fvdm``: s_c and v0) with a standard
+deviation of ``--spread`` %, pushes last 4 s, and positions are measured with errors of ``--error``
+m. ``--nature`` departs from this. Paths are integrated here by Euler's method; everything else is
+the package's public interface. The cases of a run are fixed by its seed. The table has a row per
+case; what is printed last counts them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from studies.runner import Task, run_tasks
 #: of ``lin`` by 0.008. The delay of these steps lowers it by 0.001, a tenth of its standard error.
 SECONDS, STEP, DT = 30.0, 0.002, 0.2
 #: s that pushes last; their standard deviation by law, m/s and m/s².
-LASTS, PUSH = 4.0, {"lin": 0.3, "idm": 0.06}
+LASTS, PUSH = 4.0, {"lin": 0.3, "idm": 0.06, "fvdm": 0.06}
 #: Hidden effects by law, with their sizes: a factor of v0 on 170 m of road; a share; s.
 HIDDEN = {
     "lin": {
@@ -44,11 +45,13 @@ HIDDEN = {
         "multi_anticipation": 0.2,
         "reaction_delay": 0.6,
     },
+    "fvdm": {"speed_zone": 0.8, "multi_anticipation": 0.2, "reaction_delay": 0.6},
 }
 #: Two effects that are hidden at once.
 PAIRS = {
     "lin": ["speed_zone+relative_speed", "multi_anticipation+inertia", "speed_zone+reaction_delay"],
     "idm": ["speed_zone+relative_speed", "speed_zone+multi_anticipation"],
+    "fvdm": ["speed_zone+multi_anticipation", "speed_zone+reaction_delay"],
 }
 #: What departs from the assumptions: desired speeds that vary by 8 % over 30 s, drivers of a skewed
 #: distribution (gamma), pushes with heavy tails (Student's t of four degrees of freedom), errors of
@@ -56,6 +59,8 @@ PAIRS = {
 NATURES = ("plain", "moods", "skewed", "heavy", "lasting")
 ZONE = (250.0, 420.0)
 V0, LENGTH, T, S0, A, B, CAR = 29.0, 6.0, 1.25, 2.0, 1.25, 1.8, 4.5
+#: Parameters of ``fvdm`` besides v0: m, m, 1/s, 1/s.
+S_C, W, KAPPA, LAM = 15.0, 12.0, 0.5, 0.5
 
 
 def platoons(
@@ -78,14 +83,11 @@ def platoons(
     """
     rng = np.random.default_rng(seed)
     shape, sizes = (number, vehicles - 1), _sizes(law, effect)
-    own_v0, own_t = (_factors(rng, spread, shape, nature) for _ in range(2))
+    own_v0, own_gap = (_factors(rng, spread, shape, nature) for _ in range(2))
     mean, phase = rng.uniform(11, 17, (number, 1)), rng.random((number, 4))
     height, period = rng.normal(0, 1.3, (number, 4)), np.array([7.0, 13.0, 21.0, 34.0])
-    v0, gap_time = V0 * own_v0, T * own_t
-    gap = LENGTH / np.maximum(1 - mean / v0, 0.15)
-    if law == "idm":
-        gap = CAR + (S0 + mean * gap_time) / np.sqrt(np.maximum(1 - (mean / v0) ** 4, 0.2))
-    gap = gap * rng.uniform(0.9, 1.2, shape)
+    v0 = V0 * own_v0
+    gap = _equilibrium_gap(law, mean, v0, own_gap) * rng.uniform(0.9, 1.2, shape)
     x = rng.uniform(0, 300, (number, 1)) - np.insert(gap.cumsum(1), 0, 0.0, 1)
     v, push = np.repeat(mean, vehicles, 1), PUSH[law] * rng.normal(size=shape)
     late = round(sizes.get("reaction_delay", 0.0) / STEP)
@@ -119,7 +121,7 @@ def platoons(
             v = np.column_stack([lead, after])
             x = x + STEP * v
         else:
-            rate = _rate(at, speed, wish, gap_time, sizes) + push
+            rate = _rate(law, at, speed, wish, own_gap, sizes) + push
             after = np.maximum(v[:, 1:] + STEP * np.clip(rate, -8.0, 5.0), 0.0)
             x = x + STEP * np.column_stack([lead, (v[:, 1:] + after) / 2])
             v = np.column_stack([lead, after])
@@ -164,6 +166,21 @@ def _error(rng: np.random.Generator, before: np.ndarray, nature: str) -> np.ndar
     return _next(before, shock, DT, 1.0) if nature == "lasting" else shock
 
 
+def _equilibrium_gap(
+    law: str, speed: np.ndarray, v0: np.ndarray, own_gap: np.ndarray
+) -> np.ndarray:
+    """Distances to the vehicle ahead, m, at which drivers keep a speed."""
+    share = speed / v0
+    if law == "idm":
+        wish = S0 + speed * T * own_gap
+        return np.asarray(CAR + wish / np.sqrt(np.maximum(1 - share**4, 0.2)))
+    if law == "fvdm":
+        bend = np.tanh(S_C * own_gap / W)
+        optimal = np.minimum(share * (1 + bend) - bend, 0.9)
+        return np.asarray(CAR + S_C * own_gap + W * np.arctanh(optimal))
+    return np.asarray(LENGTH / np.maximum(1 - share, 0.15))
+
+
 def _wanted(x: np.ndarray, v0: np.ndarray, sizes: dict[str, float]) -> np.ndarray:
     gap = np.maximum(x[:, :-1] - x[:, 1:], 0.6 * LENGTH)
     found = v0 * (1 - LENGTH / gap)
@@ -173,27 +190,37 @@ def _wanted(x: np.ndarray, v0: np.ndarray, sizes: dict[str, float]) -> np.ndarra
 
 
 def _rate(
+    law: str,
     x: np.ndarray,
     v: np.ndarray,
     v0: np.ndarray,
-    gap_time: np.ndarray,
+    own_gap: np.ndarray,
     sizes: dict[str, float],
 ) -> np.ndarray:
+    """Accelerations by ``idm`` or ``fvdm``, m/s².
+
+    Args:
+        own_gap: factors of T or of s_c.
+    """
     own, ahead, gap = v[:, 1:], v[:, :-1], np.maximum(x[:, :-1] - x[:, 1:] - CAR, 0.3)
 
-    def law(gap: np.ndarray, ahead: np.ndarray, at: slice) -> np.ndarray:
+    def rate(gap: np.ndarray, ahead: np.ndarray, at: slice) -> np.ndarray:
+        if law == "fvdm":
+            place = S_C * own_gap[:, at]
+            bend = np.tanh(place / W)
+            optimal = v0[:, at] * (np.tanh((gap - place) / W) + bend) / (1 + bend)
+            return np.asarray(KAPPA * (optimal - own[:, at]) - LAM * (own[:, at] - ahead))
         away = own[:, at] * (own[:, at] - ahead) / (2 * np.sqrt(A * B))
-        wish = S0 + np.maximum(own[:, at] * gap_time[:, at] + away, 0.0)
-        found: np.ndarray = A * (1 - (own[:, at] / v0[:, at]) ** 4 - (wish / gap) ** 2)
-        return found
+        wish = S0 + np.maximum(own[:, at] * T * own_gap[:, at] + away, 0.0)
+        return np.asarray(A * (1 - (own[:, at] / v0[:, at]) ** 4 - (wish / gap) ** 2))
 
-    found = law(gap, ahead, slice(None))
+    total = rate(gap, ahead, slice(None))
     if size := sizes.get("relative_speed"):
-        found += size * (ahead - own)
+        total += size * (ahead - own)
     if size := sizes.get("multi_anticipation"):
         second = np.maximum((x[:, :-2] - x[:, 2:]) / 2 - CAR, 0.3)
-        found[:, 1:] += size * (law(second, v[:, :-2], slice(1, None)) - found[:, 1:])
-    return found
+        total[:, 1:] += size * (rate(second, v[:, :-2], slice(1, None)) - total[:, 1:])
+    return np.asarray(total)
 
 
 def _table(law: str, x: np.ndarray) -> pd.DataFrame:
@@ -202,7 +229,7 @@ def _table(law: str, x: np.ndarray) -> pd.DataFrame:
     clock = DT * np.arange(samples)[:, None, None] + 100.0 * run
     columns = {"sequence": run, "time": clock.round(6), "x": x}
     columns["agent"] = agents * run + np.arange(agents)
-    if law == "idm":
+    if law != "lin":
         columns["length"] = np.array(CAR)
     return pd.DataFrame({k: np.broadcast_to(v, x.shape).ravel() for k, v in columns.items()})
 

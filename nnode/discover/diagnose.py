@@ -31,6 +31,7 @@ from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.locate.curves import curves, significant_curves
 from nnode.discover.name.search import (
     Selection,
+    best_fit,
     converged_fit,
     initial_fit,
     likely_extensions,
@@ -383,7 +384,7 @@ def _explore(
                 if populations[-1].plausible:
                     break
         engine.set_likeliest(populations)
-        base = refine(engine, initial.system)
+        base = best_fit(engine, [populations[0].system, initial.system]) or initial
     else:
         base = converged_fit(engine, initial.system)
     base_system = copy.deepcopy(base.system)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 from collections.abc import Iterable, Mapping
@@ -9,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, SimulationError
 from nnode.model.system import System
@@ -85,6 +87,12 @@ class Population:
     def marginal(self) -> Marginal:
         """The marginal likelihood and the quantities derived from it."""
         return self.estimate.marginal
+
+    @property
+    def system(self) -> System:
+        """The model with the estimated parameters of the typical driver."""
+        row = self.model.natural(self.estimate.theta)
+        return ParameterVector(copy.deepcopy(self.model.system)).fill_(row)
 
     @property
     def random(self) -> list[str]:

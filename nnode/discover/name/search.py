@@ -77,12 +77,16 @@ def initial_fit(engine: Engine, system: System) -> Fit | None:
     two starts: its own parameters, and a regression on the measured rates. None if the simulations
     of both diverge."""
     regression = getattr(engine, "regression_start", None)
+    starts = [copy.deepcopy(system), *([] if regression is None else [regression(system)])]
+    return best_fit(engine, starts, tolerance=ROUGH)
+
+
+def best_fit(engine: Engine, starts: list[System], tolerance: float = 1e-4) -> Fit | None:
+    """The calibration with the lowest cost from several starts; None if all simulations diverge."""
     fits = []
-    for start in (copy.deepcopy(system), *([] if regression is None else [regression(system)])):
-        try:
-            fits.append(refine(engine, start, tolerance=ROUGH))
-        except SimulationError:
-            continue
+    for start in starts:
+        with suppress(SimulationError):
+            fits.append(refine(engine, start, tolerance=tolerance))
     return min(fits, key=lambda fit: fit.cost, default=None)
 
 
@@ -105,7 +109,11 @@ def converged_fit(engine: Engine, system: System, rounds: int = 2) -> Fit:
     fit = refine(engine, system)
     for _ in range(rounds):
         engine.fit_whitening(fit.system, ParameterVector(fit.system).row)
-        fit = refine(engine, fit.system)
+        start = fit.system
+        if isinstance(engine, FollowersEngine) and engine.population is not None:
+            # far from the deviations of drivers that belong to it, a search can end elsewhere
+            start = engine.population.system
+        fit = refine(engine, start)
     return fit
 
 
@@ -300,11 +308,14 @@ def _with_refitted_variances(
     model without a strong effect would attribute it to autocorrelated pushes."""
     assert selection.screen is not None
     likeliest = sorted(candidates, key=lambda c: c.fit.cost)[:LIKELY]
-    engine.set_likeliest(engine.population_of(candidate.fit.system) for candidate in likeliest)
+    populations = {c.name: engine.population_of(c.fit.system) for c in likeliest}
+    engine.set_likeliest(populations.values())
     selection.fit = refine(engine, selection.fit.system)
     refitted = []
     for candidate in candidates:
-        fit = refine(engine, candidate.fit.system, tolerance=ROUGH)
+        population = populations.get(candidate.name)
+        start = candidate.fit.system if population is None else population.system
+        fit = refine(engine, start, tolerance=ROUGH)
         refitted.append(
             _candidate(candidate.score, fit, selection.fit, selection.screen, candidate.removed)
         )
