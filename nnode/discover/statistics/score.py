@@ -21,7 +21,8 @@ hypotheses); Murphy & Myors 1999 (tests of a minimal effect).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,8 @@ from nnode.model.effects import Effect, Probe
 
 #: Number of sign flips of a p-value.
 FLIPS = 1999
+#: Parts of a cell in steps of which an effect increases over its width.
+PARTS = 4
 
 
 @dataclass
@@ -106,21 +109,35 @@ class Score:
 
 def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
     """The traces of an effect's probes in the residuals of a calibrated model."""
-    probes = effect.probes(engine.batch, fit.system)
-    row = torch.from_numpy(fit.row)
-    columns = [engine.screen_columns(fit.system, row, effect, p).numpy().T for p in probes]
+    probes, row = effect.probes(engine.batch, fit.system), torch.from_numpy(fit.row)
     if effect.consecutive:
         # cells of one size are neighbours of each other
-        sizes = [tuple(probe.steps.values()) for probe in probes]
-        effect_traces = []
-        for size in dict.fromkeys(sizes):
-            cells = [i for i, other_size in enumerate(sizes) if other_size == size]
-            parts = [columns[i] for i in cells]
-            effect_traces.append(
-                Trace(effect, [probes[i] for i in cells], np.concatenate(parts, 1))
-            )
-        return effect_traces
+        sizes = dict.fromkeys(tuple(probe.steps.values()) for probe in probes)
+        sized = {size: [p for p in probes if tuple(p.steps.values()) == size] for size in sizes}
+        return [_cells(engine, fit, effect, cells) for cells in sized.values()]
+    columns = [engine.screen_columns(fit.system, row, effect, p).numpy().T for p in probes]
     return [Trace(effect, [p], c) for p, c in zip(probes, columns, strict=True)]
+
+
+def _cells(engine: Engine, fit: Fit, effect: type[Effect], probes: list[Probe]) -> Trace:
+    """The trace of neighbouring cells, in which an effect increases and decreases linearly over the
+    width of a cell.
+
+    The sum of neighbouring cells is an interval with such ends. Where the true ends are sharp and
+    lie within a cell, sharp ends at its boundaries would have jumps at wrong places, and
+    generalised least squares would weight them more than all that lies between them.
+    """
+    row, parts = torch.from_numpy(fit.row), []
+    for probe in probes:
+        ends = np.linspace(probe.options["a"], probe.options["b"], PARTS + 1)
+        for low, high in pairwise(ends.tolist()):
+            part = replace(probe, options={**probe.options, "a": low, "b": high})
+            parts.append(engine.screen_columns(fit.system, row, effect, part).numpy()[0])
+    padded = np.pad(np.stack(parts, 1), ((0, 0), (PARTS // 2, PARTS // 2)))
+    rising = (np.arange(PARTS) + 0.5) / PARTS
+    weight = np.concatenate([rising, rising[::-1]])
+    columns = [padded[:, PARTS * k : PARTS * (k + 2)] @ weight for k in range(len(probes))]
+    return Trace(effect, probes, np.stack(columns, 1))
 
 
 class Screen:
