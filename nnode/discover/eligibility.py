@@ -45,6 +45,9 @@ def not_offered(effect: type[Effect], system: System, differ: bool = False) -> s
         return "the law has no force between people of its own that it could change"
     if effect.of_drivers and differ:
         return "the diagnosis estimates how drivers differ together with the law"
+    rules = effect.rules.values()
+    if differ and rules and all(rule.leader and not rule.rate for rule in rules):
+        return "all vehicles are simulated behind measured leaders, and it changes leaders only"
     if system.domain != "traffic" or system.order == 1:
         return ""
     try:

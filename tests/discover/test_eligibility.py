@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.crowds.engine import CrowdEngine
-from nnode.discover.eligibility import check_effect, check_model
+from nnode.discover.eligibility import check_effect, check_model, not_offered
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import converged_fit
 from nnode.discover.options import DiscoverOptions, check_options
@@ -277,3 +277,10 @@ def test_models_that_no_engine_can_simulate_are_refused() -> None:
         check_model(Traffic([Optimal(), SpeedZone(), SpeedZone(a=200.0, b=300.0)]))
     with pytest.raises(ConfigError, match="no parameter that is calibrated"):
         check_model(Crowd([make_law("relaxation", tau=0.5)]))
+
+
+def test_leaders_that_move_as_measured_are_not_tested() -> None:
+    leader_speed, law = CATALOGUE.effects["leader_speed"], Traffic([make_law("lin")])
+    assert "leaders" in not_offered(leader_speed, law, differ=True)
+    assert not not_offered(leader_speed, law)
+    assert not not_offered(SpeedZone, law, differ=True)

@@ -111,7 +111,8 @@ def converged_fit(engine: Engine, system: System, rounds: int = 2) -> Fit:
         engine.fit_whitening(fit.system, ParameterVector(fit.system).row)
         start = fit.system
         if isinstance(engine, FollowersEngine) and engine.population is not None:
-            # far from the deviations of drivers that belong to it, a search can end elsewhere
+            # the drivers' deviations belong to these parameters; from others, the search can end in
+            # another minimum
             start = engine.population.system
         fit = refine(engine, start)
     return fit

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -127,16 +126,21 @@ def _cells(engine: Engine, fit: Fit, effect: type[Effect], probes: list[Probe]) 
     lie within a cell, sharp ends at its boundaries would have jumps at wrong places, and
     generalised least squares would weight them more than all that lies between them.
     """
-    row, parts = torch.from_numpy(fit.row), []
-    for probe in probes:
-        ends = np.linspace(probe.options["a"], probe.options["b"], PARTS + 1)
-        for low, high in pairwise(ends.tolist()):
-            part = replace(probe, options={**probe.options, "a": low, "b": high})
-            parts.append(engine.screen_columns(fit.system, row, effect, part).numpy()[0])
-    padded = np.pad(np.stack(parts, 1), ((0, 0), (PARTS // 2, PARTS // 2)))
+    row, number = torch.from_numpy(fit.row), len(probes)
+    low, high = probes[0].options["a"], probes[-1].options["b"]
+
+    def beyond(place: float) -> np.ndarray:
+        """The trace of an interval from a place to the end."""
+        options = {**probes[0].options, "a": place, "b": 2 * high - low}
+        probe = replace(probes[0], options=options)
+        return engine.screen_columns(fit.system, row, effect, probe).numpy()[0]
+
+    places = np.linspace(low, high, PARTS * number + 1).tolist()
+    parts = -np.diff(np.stack([beyond(place) for place in places], 1))
+    padded = np.pad(parts, ((0, 0), (PARTS // 2, PARTS // 2)))
     rising = (np.arange(PARTS) + 0.5) / PARTS
     weight = np.concatenate([rising, rising[::-1]])
-    columns = [padded[:, PARTS * k : PARTS * (k + 2)] @ weight for k in range(len(probes))]
+    columns = [padded[:, PARTS * k : PARTS * (k + 2)] @ weight for k in range(number)]
     return Trace(effect, probes, np.stack(columns, 1))
 
 
