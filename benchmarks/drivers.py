@@ -300,7 +300,7 @@ def diagnosed(**case: Any) -> dict[str, Any]:
 
 def _variations(case: dict[str, Any]) -> dict[str, float]:
     """The true standard deviations of drivers' parameters, %, and of pushes, and their time, s."""
-    names = {"lin": ["v0"], "idm": ["v0", "T"]}[case["law"]]
+    names = {"lin": ["v0"], "idm": ["v0", "T"], "fvdm": ["v0", "s_c"]}[case["law"]]
     return dict.fromkeys(names, 100 * case["spread"]) | {
         "push": PUSH[case["law"]],
         "push_time": LASTS,

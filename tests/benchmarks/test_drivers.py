@@ -14,7 +14,10 @@ import nnode
 from benchmarks import drivers
 
 
-def test_rows_are_scored_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("law", "covered"), [("lin", "yes"), ("fvdm", "no")])
+def test_rows_are_scored_and_kept(
+    law: str, covered: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls = []
 
     def zone(table: pd.DataFrame, *given: Any, **options: Any) -> SimpleNamespace:
@@ -27,7 +30,9 @@ def test_rows_are_scored_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(nnode, "diagnose", zone)
     path = tmp_path / "table.csv"
     size = ["--platoons", "3", "--vehicles", "3", "--processes", "1", "--table", str(path)]
-    monkeypatch.setattr(sys, "argv", ["drivers", "--seed", "5", "--cases", "2", *size])
+    monkeypatch.setattr(
+        sys, "argv", ["drivers", "--laws", law, "--seed", "5", "--cases", "2", *size]
+    )
     for _ in range(2):
         drivers.main()
     assert len(calls) == 2
@@ -36,5 +41,5 @@ def test_rows_are_scored_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert rows["effect"].tolist() == ["none", "speed_zone"]
     assert rows[["exact", "false"]].to_numpy().tolist() == [[False, True], [True, False]]
     assert rows["estimate"].tolist() == ["", "0.88"]
-    assert rows["covered"].tolist() == ["", "yes"]
+    assert rows["covered"].tolist() == ["", covered]
     assert set(rows["v0 covered"]) == {"-"}
