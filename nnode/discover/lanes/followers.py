@@ -255,10 +255,6 @@ class FollowersEngine(TrafficEngine):
 
     # -- parts -----------------------------------------------------------------------------------
 
-    def _longest(self, system: System, rows: Tensor) -> float:
-        """Longest step, s: as in a calibration of drivers."""
-        return min(STEP, super()._longest(system, rows))
-
     def _paths(self, longest: float) -> Paths:
         """The followers, for simulations with steps of at most ``longest`` s. A driver in several
         clusters counts as several drivers, because clusters must be independent."""

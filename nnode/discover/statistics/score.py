@@ -135,12 +135,16 @@ def _cells(engine: Engine, fit: Fit, effect: type[Effect], probes: list[Probe]) 
         probe = replace(probes[0], options=options)
         return engine.screen_columns(fit.system, row, effect, probe).numpy()[0]
 
-    places = np.linspace(low, high, PARTS * number + 1).tolist()
-    parts = -np.diff(np.stack([beyond(place) for place in places], 1))
+    places = np.linspace(low, high, PARTS * number + 1)
+    # the effect's own ends are not within what was measured
+    places[0], places[-1] = 2 * low - high, 2 * high - low
+    parts = -np.diff(np.stack([beyond(place) for place in places.tolist()], 1))
     padded = np.pad(parts, ((0, 0), (PARTS // 2, PARTS // 2)))
     rising = (np.arange(PARTS) + 0.5) / PARTS
-    weight = np.concatenate([rising, rising[::-1]])
-    columns = [padded[:, PARTS * k : PARTS * (k + 2)] @ weight for k in range(number)]
+    weights = np.tile(np.concatenate([rising, rising[::-1]]), (number, 1))
+    # nothing was measured beyond the first and the last cell
+    weights[0, :PARTS] = weights[-1, PARTS:] = 1.0
+    columns = [padded[:, PARTS * k : PARTS * (k + 2)] @ weight for k, weight in enumerate(weights)]
     return Trace(effect, probes, np.stack(columns, 1))
 
 

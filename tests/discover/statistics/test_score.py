@@ -43,6 +43,10 @@ def test_cells_add_up_to_an_interval_with_ends_as_wide_as_a_cell() -> None:
     # the share of the zone
     np.testing.assert_allclose(cells, expected, atol=0.03 * np.abs(expected).max())
     assert abs(cells @ expected / (expected @ expected) - 1) < 0.01
+    whole = replace(trace.probes[0], options={"a": -1e4, "b": 1e4})
+    everywhere = engine.screen_columns(fit.system, row, ZONE, whole).numpy()[0]
+    largest = np.abs(everywhere).max()
+    np.testing.assert_allclose(trace.columns.sum(1), everywhere, atol=0.03 * largest)
     (score,) = Screen(fit, engine.cluster).scores([trace])
     assert score.options["a"] < 260.0 < 410.0 < score.options["b"]
     assert abs(score.options["alpha"] - 0.9) < 0.03
