@@ -220,7 +220,7 @@ def _rate(
     if size := sizes.get("multi_anticipation"):
         second = np.maximum((x[:, :-2] - x[:, 2:]) / 2 - CAR, 0.3)
         total[:, 1:] += size * (rate(second, v[:, :-2], slice(1, None)) - total[:, 1:])
-    return np.asarray(total)
+    return total
 
 
 def _table(law: str, x: np.ndarray) -> pd.DataFrame:

@@ -68,6 +68,11 @@ from nnode.progress import Stages
 
 #: Number of the strongest effects that the first screen lists.
 SCREENED = 3
+#: Why a model is not diagnosed whose simulations diverge.
+BLOWS_UP = (
+    "the model cannot be simulated on these data: it blows up from its own parameters and "
+    "from those near the measured rates; start from others, or look at the data"
+)
 
 
 #: Stages of a diagnosis, with the seconds that they take on 120 pairs of NGSIM I-80.
@@ -367,10 +372,7 @@ def _explore(
     engine = engine_of(system, exploration_sequences, label, differ=differ, apart=apart)
     initial = initial_fit(engine, copy.deepcopy(system).double())
     if initial is None:
-        raise SimulationError(
-            "the model cannot be simulated on these data: it blows up from its own parameters and "
-            "from those near the measured rates; start from others, or look at the data"
-        )
+        raise SimulationError(BLOWS_UP)
     hints = [] if hint is None else [hint]
     if isinstance(engine, FollowersEngine):
         populations = [engine.population_of(initial.system)]
@@ -384,7 +386,10 @@ def _explore(
                 if populations[-1].plausible:
                     break
         engine.set_likeliest(populations)
-        base = best_fit(engine, [populations[0].system, initial.system]) or initial
+        fit = best_fit(engine, [populations[0].system, initial.system])
+        if fit is None:
+            raise SimulationError(BLOWS_UP)
+        base = fit
     else:
         base = converged_fit(engine, initial.system)
     base_system = copy.deepcopy(base.system)

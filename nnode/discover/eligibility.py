@@ -47,7 +47,7 @@ def not_offered(effect: type[Effect], system: System, differ: bool = False) -> s
         return "the diagnosis estimates how drivers differ together with the law"
     rules = effect.rules.values()
     if differ and rules and all(rule.leader and not rule.rate for rule in rules):
-        return "all vehicles are simulated behind measured leaders, and it changes leaders only"
+        return "this effect changes leaders only, and the diagnosis takes leaders as measured"
     if system.domain != "traffic" or system.order == 1:
         return ""
     try:

@@ -200,10 +200,10 @@ class FollowersEngine(TrafficEngine):
     def fit_whitening(self, system: System, row: Tensor) -> None:
         """Estimate drivers, starts, pushes and their variances, with the model's parameters."""
         if self._like is not None and self._like.population is not None:
-            population = self._like.population
-            system = population.model.system
-            row = torch.from_numpy(population.model.natural(population.estimate.theta))
-        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
+            fixed = self._like.population.system
+        else:
+            fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
+        row = ParameterVector(fixed).row
         paths, previous = self._paths(self._longest(fixed, row[None])), self.population
         start = previous
         if start is None and self._like is not None:
