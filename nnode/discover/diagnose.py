@@ -68,6 +68,11 @@ from nnode.progress import Stages
 
 #: Number of the strongest effects that the first screen lists.
 SCREENED = 3
+#: In a law of first order, the speed at the start is that of the law. Vehicles of a simulation
+#: start with another one and need time to adapt, s; at most this share of a sequence. In a table of
+#: SUMO, the first 0.8 s were named as a period of lower speeds. A period was still selected if 1 s
+#: was left out, and none if 2 s were.
+SETTLING, SETTLING_SHARE = 2.0, 0.1
 #: Why a model is not diagnosed whose simulations diverge.
 BLOWS_UP = (
     "the model cannot be simulated on these data: it blows up from its own parameters and "
@@ -162,10 +167,11 @@ def _diagnosed(
     check_model(system)
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
-    candidates = [e for e in CATALOGUE.of(domain, system.order) if e.name in names]
     differ = drivers_differ(system, sequences)
-    refused = {e.name: reason for e in candidates if (reason := not_offered(e, system, differ))}
-    offered = [effect for effect in candidates if effect.name not in refused]
+    notes = list[str]()
+    if differ and system.order == 1 and without_errors(sequences):
+        sequences = _without_starts(sequences, notes)
+    offered, refused = _offered(system, names, differ)
     effects = [effect for effect in offered if not issubclass(effect, IndividualEffect)]
     explore = partial(_explore, system, sequences, options, effects, differ, clock, stages, hint)
     exploration = explore()
@@ -173,7 +179,7 @@ def _diagnosed(
         exploration = replace(explore(together=True), simultaneity=exploration.simultaneity)
     division, engine = exploration.division, exploration.engine
     base_system, selection = exploration.base_system, exploration.selection
-    notes: list[str] = [division.note] if division.note else []
+    notes += [division.note] if division.note else []
     imitations: list[NamedEffect] = []
     if nearer is not None and selection.steps:
         selection, imitations = _without_imitations(exploration, nearer, notes)
@@ -290,6 +296,38 @@ def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves
         remaining = curves(engine, selection.fit, exploration.variables)
         remaining = significant_curves(engine, selection.fit, remaining, rules().sure)
     return [curve for curve in remaining if curve.removed > rules().least]
+
+
+def _without_starts(sequences: list[Sequence], notes: list[str]) -> list[Sequence]:
+    """The sequences without the time in which a simulation adapts to its start.
+
+    Args:
+        notes: the reason is added to them.
+    """
+    notes.append(
+        "Positions have no errors of measurement, as in simulations or after smoothing. The first "
+        f"{SETTLING:g} s of each sequence (at most {SETTLING_SHARE:.0%} of it), in which a "
+        "simulation adapts to its start, are left out."
+    )
+    shares = [min(SETTLING / max(np.ptp(s.time), s.dt), SETTLING_SHARE) for s in sequences]
+    return [
+        replace(s.part(share, 1.0), name=s.name) for s, share in zip(sequences, shares, strict=True)
+    ]
+
+
+def _offered(
+    system: System, names: list[str], differ: bool
+) -> tuple[list[type[Effect]], dict[str, str]]:
+    """The effects that are tested, and by name why others are not.
+
+    Args:
+        names: of all candidates.
+        differ: whether drivers differ.
+    """
+    catalogue = CATALOGUE.of(cast(Domain, system.domain), system.order)
+    candidates = [effect for effect in catalogue if effect.name in names]
+    refused = {e.name: reason for e in candidates if (reason := not_offered(e, system, differ))}
+    return [effect for effect in candidates if effect.name not in refused], refused
 
 
 def _bonferroni(estimates: list[IndividualEstimate]) -> list[IndividualEstimate]:

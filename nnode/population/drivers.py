@@ -22,7 +22,7 @@ from nnode.population.estimate import (
     fit_deviations,
     fit_variances,
 )
-from nnode.population.followers import FLOOR, Followers, Paths, score_bias
+from nnode.population.followers import FLOOR, PAIRS, Followers, Paths, score_biases
 from nnode.population.likelihood import Linearised, Marginal, PushNoise, marginal
 from nnode.simulation.rhs import formula_of
 
@@ -44,15 +44,12 @@ START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
 LONGEST, TOLERANCE = 0.3, 1e-2
 #: Bounds of standard deviations of errors of positions, m, and of the correlation time of
 #: autocorrelated ones, s. Searches for the latter start at 1 s.
-ERRORS, ERROR_TIMES = (FLOOR, 1.0), (0.1, 5.0)
+ERRORS, ERROR_TIMES = (0.001, 1.0), (0.1, 5.0)
 #: At most so many candidate random effects are estimated before the best is chosen.
 RANKED = 2
 #: Linearisations of each of these before the best is chosen. Most estimates converge in fewer. If
 #: the chosen one did not, its search is continued.
 RANKING_STEPS = 15
-#: Antithetic pairs of simulations that estimate the bias. The Monte Carlo error of two pairs is a
-#: fifth of an estimate's standard error.
-PAIRS = 2
 #: With fewer followers, variances between drivers are not estimated.
 LEAST_DRIVERS = 5
 #: Pushes above this share of the standard deviation of measured rates show that a missing effect,
@@ -147,7 +144,7 @@ def fit_drivers(
         first: parameters by name, such as ``idm.T``, where a second search starts; the result with
             the larger likelihood is taken.
         seed: of the simulations that estimate the bias.
-        pairs: of these simulations, see :func:`nnode.population.followers.score_bias`; 0: the
+        pairs: of these simulations, see :func:`nnode.population.followers.score_biases`; 0: the
             estimates are not corrected. Estimates that did not converge are never corrected.
 
     Raises:
@@ -174,12 +171,9 @@ def fit_drivers(
         names = [] if drivers == "none" else full_names(drivers, law)
         model = Followers(system, paths, names) if names else plain
         population = _with_lasting_errors(_most_likely(model, starts))
-    correctable = pairs > 0 and population.estimate.converged
-    return (
-        _bias_corrected(population, np.random.default_rng(seed), pairs)
-        if correctable
-        else population
-    )
+    if pairs > 0 and population.estimate.converged:
+        return _bias_corrected(population, seed, pairs)
+    return population
 
 
 def obstacle(system: System, sequences: list[Sequence], needed: int = LEAST_DRIVERS) -> str | None:
@@ -255,7 +249,7 @@ def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
     return [short[name] for name in drivers]
 
 
-def _bias_corrected(population: Population, rng: np.random.Generator, pairs: int) -> Population:
+def _bias_corrected(population: Population, seed: int, pairs: int) -> Population:
     """Correct the parameters for their bias in simulations of the estimated model.
 
     The linearisation at the modes and the errors of smoothed leaders bias the estimates. Standard
@@ -263,7 +257,7 @@ def _bias_corrected(population: Population, rng: np.random.Generator, pairs: int
     """
     model, before = population.model, population.estimate
     try:
-        bias = score_bias(model, PushNoise(), before, rng, pairs)
+        bias = score_biases(model, PushNoise(), before, seed, pairs).mean(0)
     except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
         log.warning("parameters are not corrected for their bias: simulated drivers left the road")
         return population
@@ -405,6 +399,7 @@ def initial_variances(model: Followers) -> Variances:
     low_push, high_push, push = PUSH[order]
     short, long = SHORT * paths.dt, max(LONG * length, 2 * SHORT * paths.dt)
     position = START_POSITION * paths.error
+    low_error = paths.error if paths.error > FLOOR else ERRORS[0]
     low_speed, high_speed, speed = START_SPEED
     starts, lowest, highest = [position], [position], [position]
     for _ in range(model.starts - 1):  # of speeds, and of what terms remember
@@ -413,7 +408,7 @@ def initial_variances(model: Followers) -> Variances:
         noise=np.array([push, np.clip(LASTING, short, long), paths.error]),
         spread=np.full(number, SPREAD),
         start=np.array(starts),
-        low=np.array([low_push, short, paths.error, *[LEAST_SPREAD] * number, *lowest]),
+        low=np.array([low_push, short, low_error, *[LEAST_SPREAD] * number, *lowest]),
         high=np.array([high_push, long, paths.error, *[MOST_SPREAD] * number, *highest]),
     )
 

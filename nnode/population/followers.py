@@ -34,8 +34,8 @@ from nnode.simulation.linear import trapezoidal
 from nnode.simulation.numpy import simulated, strides
 from nnode.simulation.rhs import formula_of
 
-#: Smallest standard deviation of measurement errors where their estimation starts, m: that of a
-#: camera.
+#: Smallest standard deviation of measurement errors that fourth differences show, m: that of a
+#: camera. Smaller ones are estimated with the other variances.
 FLOOR = 0.01
 #: Range of white measurement errors, m. Below it, positions were simulated, or they were smoothed:
 #: then their errors are autocorrelated, which the likelihood neglects. SUMO's paths at 5 Hz, which
@@ -48,6 +48,9 @@ NOISE = (0.015, 0.45)
 APART = 1.0
 #: Differences for derivatives: of parameters, relative; of states at the start, m and m/s.
 DIFFERENCE, START_DIFFERENCE = 1e-6, 1e-4
+#: Antithetic pairs of simulations that estimate the bias. The Monte Carlo error of four pairs is
+#: about 15 % of an estimate's standard error.
+PAIRS = 4
 #: The push on the highest rate ``(R, F)``, as a function of the index of the time in the paths
 #: ahead, and of states and rates ``(M, R, F)``.
 Push = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
@@ -133,11 +136,12 @@ class Paths:
         return remeasured.starting_from(np.ones(x.shape[1], dtype=bool))
 
 
-def paths_of(sequences: list[Sequence], step: float) -> Paths:
+def paths_of(sequences: list[Sequence], step: float, floor: float = FLOOR) -> Paths:
     """The followers of sequences of one sampling interval.
 
     Args:
         step: longest step of a simulation, s.
+        floor: smallest standard deviation of measurement errors, m.
     """
     dt, samples = sequences[0].dt, max(s.n_samples for s in sequences)
     stride, parts = strides(dt, step)
@@ -173,7 +177,7 @@ def paths_of(sequences: list[Sequence], step: float) -> Paths:
         ahead_at_samples=_ahead(smoothed, sequence, place, dt, samples, dt),
         start=start,
         second=np.array([float(i + 2 < sequences[b].n_agents) for b, i in which]),
-        error=max(noise, FLOOR) if math.isfinite(noise) else FLOOR,
+        error=max(noise, floor) if math.isfinite(noise) else floor,
         batch=collate(_with_vehicles_ahead(sequences[b], i) for b, i in which),
     )
 
@@ -540,28 +544,30 @@ def _ornstein_uhlenbeck(normal: np.ndarray, step: float) -> np.ndarray:
     return process
 
 
-def score_bias(
-    model: Followers, noise: Noise, estimate: Estimate, rng: np.random.Generator, pairs: int = 4
+def score_biases(
+    model: Followers, noise: Noise, estimate: Estimate, seed: int, pairs: int
 ) -> np.ndarray:
-    """``(P,)`` the bias of the estimates, by simulation.
+    """``(pairs, P)`` biases of the estimates, by simulation; their mean is the best estimate.
 
     Simulated data of the estimated model are scored at the parameters that they were simulated
     with. The mean of a correct score is zero; the linearisation at the modes and the errors of
-    smoothed leaders shift it. Draws are antithetic pairs, in which the linear part of the score
-    cancels.
+    smoothed leaders shift it. A bias is the Gauss-Newton step of the mean score of an antithetic
+    pair of draws, in which the linear part of the score cancels.
 
     Args:
-        pairs: number of pairs.
+        seed: of the draws. pairs: their number.
     """
-    changes = []
-    for _ in range(pairs):
-        for draw in antithetic_draws(int(rng.integers(2**63))):
+    biases = []
+    for pair in range(pairs):
+        changes = []
+        for draw in antithetic_draws(seed + pair):
             paths = model.simulated_paths(estimate, draw)
             modes = fit_deviations(
                 model.with_paths(paths), noise, estimate.theta, estimate.variances
             )
             changes.append(modes.marginal.change)
-    return np.asarray(np.mean(changes, 0))
+        biases.append(np.mean(changes, 0))
+    return np.stack(biases)
 
 
 def antithetic_draws(seed: int) -> list[Draw]:

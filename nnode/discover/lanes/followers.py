@@ -39,11 +39,23 @@ from nnode.model.system import System
 from nnode.model.term import State
 from nnode.population.drivers import STEP, Population, fit_drivers, initial_variances, refit
 from nnode.population.estimate import fit_deviations
-from nnode.population.followers import Followers, Paths, Push, antithetic_draws, paths_of
+from nnode.population.followers import (
+    PAIRS,
+    Followers,
+    Paths,
+    Push,
+    antithetic_draws,
+    paths_of,
+    score_biases,
+)
 from nnode.population.likelihood import PushNoise, Whitening, marginal
 from nnode.simulation.numpy import strides
 from nnode.simulation.rhs import side_by_side
 
+#: Smallest standard deviation of errors of positions, m. Paths without measurement errors differ
+#: from the model's by some centimetres, because its zones have ends of finite width and simulators
+#: integrate differently. The table in docs/method.md shows what other values do.
+ERROR = 0.05
 #: Difference of a curve's scale for derivatives.
 SCALE = 1e-3
 
@@ -241,17 +253,30 @@ class FollowersEngine(TrafficEngine):
     def simulated_engines(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
         """Engines of paths simulated by a model, with deviations of drivers, pushes and measurement
         errors as estimated under it: an antithetic pair of draws."""
-        assert self.population is not None
-        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
-        paths = self._paths(self._longest(fixed, row[None]))
-        refitted, engines = refit(self.population, fixed, paths, fixed=True), []
+        refitted, engines = self._deviations_under(system, row), []
         for draw in antithetic_draws(seed):
             engine = copy.copy(self)
             paths = refitted.model.simulated_paths(refitted.estimate, draw)
             engine._paths_by_step = {strides(paths.dt, 2 * paths.half + 1e-9): paths}
-            engine._set_population(refit(refitted, fixed, paths, fixed=True))
+            engine._set_population(refit(refitted, refitted.model.system, paths, fixed=True))
             engines.append(engine)
         return engines
+
+    def biases(self, system: System, row: Tensor, seed: int) -> np.ndarray:
+        """``(R, K)`` biases of a model's parameters, in their units, see
+        :func:`~nnode.population.followers.score_biases`."""
+        population = self._deviations_under(system, row)
+        model, theta = population.model, population.estimate.theta
+        biases = score_biases(model, PushNoise(), population.estimate, seed, PAIRS)
+        return model.natural(theta) - model.natural(theta - biases)
+
+    def _deviations_under(self, system: System, row: Tensor) -> Population:
+        """The last estimate, with the deviations of drivers and starts under a model."""
+        assert self.population is not None
+        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
+        return refit(
+            self.population, fixed, self._paths(self._longest(fixed, row[None])), fixed=True
+        )
 
     # -- parts -----------------------------------------------------------------------------------
 
@@ -260,7 +285,7 @@ class FollowersEngine(TrafficEngine):
         clusters counts as several drivers, because clusters must be independent."""
         key = strides(self.batch.dt, longest)
         if key not in self._paths_by_step:
-            paths = paths_of(self.sequences, longest).apart(self.apart)
+            paths = paths_of(self.sequences, longest, ERROR).apart(self.apart)
             pairs = np.stack([paths.agent, self._label[paths.sequence]])
             drivers, agent = np.unique(pairs, axis=1, return_inverse=True)
             names = tuple(paths.names[i] for i in drivers[0])

@@ -4,8 +4,7 @@ The linearisation at the drivers' modes and the errors of smoothed leaders bias 
 which is significant in large data sets. The bias is the mean score in paths that the calibrated
 model simulates. An effect must be significant with and without this correction, because simulations
 of a very wrong model are wrong too. Draws are antithetic pairs, in which terms that are linear in
-pushes, deviations and errors cancel. The bias of the parameters is the Gauss-Newton step of the
-mean score.
+pushes, deviations and errors cancel.
 """
 
 from __future__ import annotations
@@ -27,9 +26,6 @@ from nnode.model.extend import effects_of, place_of
 
 #: Engines of simulated paths, and the model's fits to them.
 SimulatedFits = list[tuple[Engine, Fit]]
-#: Antithetic pairs of simulations that estimate the bias of parameters. The Monte Carlo error of
-#: four pairs is about 15 % of a standard error.
-PAIRS = 4
 
 
 def simulated_fits(engine: Engine, fit: Fit, seed: int) -> SimulatedFits:
@@ -68,7 +64,7 @@ def mean_scores(
 
 def corrected_for_bias(engine: Engine, fit: Fit, seed: int) -> Fit:
     """A calibrated model, corrected for the bias of its parameters, with the standard errors of the
-    correction; the same if :func:`simulated_fits` are missing.
+    correction; the same if the engine does not simulate, or if the simulations diverge.
 
     Residuals and derivatives remain those of the calibration, and so do the ends of intervals,
     whose confidence intervals are profiles.
@@ -76,23 +72,18 @@ def corrected_for_bias(engine: Engine, fit: Fit, seed: int) -> Fit:
     Args:
         seed: of the draws.
     """
-    pairs = [simulated_fits(engine, fit, seed + k) for k in range(PAIRS)]
-    if not all(pairs):
+    if not isinstance(engine, FollowersEngine):
         return fit
-    biases = np.array([np.mean([_step(simulated) for _, simulated in pair], 0) for pair in pairs])
+    try:
+        biases = engine.biases(fit.system, torch.from_numpy(fit.row), seed)
+    except (SimulationError, np.linalg.LinAlgError):
+        return fit
     corrected = fit.free & ~np.isin(fit.names, _ends(fit))
     bias = np.where(corrected, biases.mean(0), 0.0)
-    error = np.where(corrected, biases.std(0, ddof=1) / np.sqrt(PAIRS), 0.0)
+    error = np.where(corrected, biases.std(0, ddof=1) / np.sqrt(len(biases)), 0.0)
     row = np.clip(fit.row - bias, *ParameterVector(fit.system).bounds)
     system = ParameterVector(copy.deepcopy(fit.system)).fill_(row)
     return replace(fit, system=system, row=row, simulated=error)
-
-
-def _step(fit: Fit) -> np.ndarray:
-    """``(K,)`` the Gauss-Newton step of a fit; 0 for parameters at a bound."""
-    step = np.zeros(len(fit.row))
-    step[fit.free] = -np.linalg.lstsq(fit.tangents, fit.residual, rcond=None)[0]
-    return step
 
 
 def _ends(fit: Fit) -> list[str]:

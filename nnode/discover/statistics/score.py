@@ -21,7 +21,7 @@ hypotheses); Murphy & Myors 1999 (tests of a minimal effect).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,8 @@ from nnode.model.effects import Effect, Probe
 
 #: Number of sign flips of a p-value.
 FLIPS = 1999
+#: Parts of a cell in steps of which an effect increases over its width.
+PARTS = 4
 
 
 @dataclass
@@ -107,20 +109,55 @@ class Score:
 def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
     """The traces of an effect's probes in the residuals of a calibrated model."""
     probes = effect.probes(engine.batch, fit.system)
+    if not effect.consecutive:
+        return [Trace(effect, [p], _columns(engine, fit, effect, p)) for p in probes]
+    # cells of one size are neighbours of each other
+    sizes = dict.fromkeys(tuple(probe.steps.values()) for probe in probes)
+    sized = [[p for p in probes if tuple(p.steps.values()) == size] for size in sizes]
+    if effect.overlapping:
+        return [_overlapping_cells(engine, fit, effect, cells) for cells in sized]
+    return [
+        Trace(effect, cells, np.concatenate([_columns(engine, fit, effect, p) for p in cells], 1))
+        for cells in sized
+    ]
+
+
+def _columns(engine: Engine, fit: Fit, effect: type[Effect], probe: Probe) -> np.ndarray:
+    """``(n, k)`` the linear response of the residuals to the strengths of a probe."""
     row = torch.from_numpy(fit.row)
-    columns = [engine.screen_columns(fit.system, row, effect, p).numpy().T for p in probes]
-    if effect.consecutive:
-        # cells of one size are neighbours of each other
-        sizes = [tuple(probe.steps.values()) for probe in probes]
-        effect_traces = []
-        for size in dict.fromkeys(sizes):
-            cells = [i for i, other_size in enumerate(sizes) if other_size == size]
-            parts = [columns[i] for i in cells]
-            effect_traces.append(
-                Trace(effect, [probes[i] for i in cells], np.concatenate(parts, 1))
-            )
-        return effect_traces
-    return [Trace(effect, [p], c) for p, c in zip(probes, columns, strict=True)]
+    columns: np.ndarray = engine.screen_columns(fit.system, row, effect, probe).numpy().T
+    return columns
+
+
+def _overlapping_cells(
+    engine: Engine, fit: Fit, effect: type[Effect], probes: list[Probe]
+) -> Trace:
+    """The trace of neighbouring cells, in which an effect increases and decreases linearly over the
+    width of a cell.
+
+    The sum of neighbouring cells is an interval with such ends. Where the true ends are sharp and
+    lie within a cell, sharp ends at its boundaries would have jumps at wrong places, and
+    generalised least squares would weight them more than all that lies between them.
+    """
+    number = len(probes)
+    low, high = probes[0].options["a"], probes[-1].options["b"]
+
+    def from_place(place: float) -> np.ndarray:
+        """The trace of an interval from a place to the end."""
+        options = {**probes[0].options, "a": place, "b": 2 * high - low}
+        return _columns(engine, fit, effect, replace(probes[0], options=options))
+
+    places = np.linspace(low, high, PARTS * number + 1)
+    # the effect's own ends are not within what was measured
+    places[0], places[-1] = 2 * low - high, 2 * high - low
+    parts = -np.diff(np.concatenate([from_place(place) for place in places.tolist()], 1))
+    padded = np.pad(parts, ((0, 0), (PARTS // 2, PARTS // 2)))
+    rising = (np.arange(PARTS) + 0.5) / PARTS
+    weights = np.tile(np.concatenate([rising, rising[::-1]]), (number, 1))
+    # nothing was measured beyond the first and the last cell
+    weights[0, :PARTS] = weights[-1, PARTS:] = 1.0
+    columns = [padded[:, PARTS * k : PARTS * (k + 2)] @ weight for k, weight in enumerate(weights)]
+    return Trace(effect, probes, np.stack(columns, 1))
 
 
 class Screen:

@@ -103,6 +103,8 @@ class Effect(Term):
         contains: names of effects that are special cases of this one.
         consecutive: whether the probes are neighbouring intervals of one quantity, with the ends
             ``a`` and ``b``. The change by an effect on several intervals is the sum of theirs.
+        overlapping: whether the score test lets neighbouring intervals overlap, because the ends of
+            the effect may lie anywhere within them.
         covariate: ``kind``, ``group`` or ``length``: the property of an agent by which it acts. If
             it is constant within every recording, recordings are the units of evidence.
         individual: whether every agent has a separate strength, with mean zero over the agents.
@@ -123,6 +125,7 @@ class Effect(Term):
     distinguishing_data: ClassVar[str] = ""
     contains: ClassVar[tuple[str, ...]] = ()
     consecutive: ClassVar[bool] = False
+    overlapping: ClassVar[bool] = False
     covariate: ClassVar[str | None] = None
     individual: ClassVar[bool] = False
     of_drivers: ClassVar[bool] = False

@@ -126,6 +126,7 @@ class SpeedZone(_Cells):
     """A section of the road where all vehicles drive slower or faster than by the law."""
 
     name = "speed_zone"
+    overlapping = True  # not a period: records often begin together, and so do their errors
     rules, settings = _inside("x", "m", "alpha/(alpha + (1 - alpha)*share)", 100.0)
     source = "a factor on all speeds; limits, which cap them: Hegyi, De Schutter & Hellendoorn 2005"
     rank = 10

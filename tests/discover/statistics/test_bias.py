@@ -13,8 +13,9 @@ from nnode.app.python.inputs import model_options
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.name.search import converged_fit
 from nnode.discover.residuals.fit import refine
-from nnode.discover.statistics.bias import PAIRS, corrected_for_bias
+from nnode.discover.statistics.bias import corrected_for_bias
 from nnode.model.build import build_model
+from nnode.population.followers import PAIRS
 
 
 def test_bias_is_that_of_calibrations_to_paths_simulated_by_the_model() -> None:
