@@ -406,7 +406,7 @@ def _simplest(candidates: list[Candidate], screen: Screen) -> Candidate:
         sizes = len(candidate.fit.row), len(best.fit.row)
         likelier = sizes[0] == sizes[1] and candidate.fit.cost < best.fit.cost
         comparable = candidate.gain.gain >= rules().near * best.gain.gain
-        distinguishable = _j_test(candidate, best, screen).p_value <= rules().level
+        distinguishable = _j_test(candidate, best, screen).p_value <= apart_at(candidate, best)
         if (sizes[0] < sizes[1] or likelier) and comparable and not distinguishable:
             best = candidate
     return best
