@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from benchmarks.discovery.regression import BASELINES, Library
-from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.config import SCHEMAS
 from nnode.data.options import Faults
 from nnode.data.readers.table import TableOptions
@@ -111,7 +111,7 @@ def _with(fit: Fit, chosen: list[tuple[Trace, np.ndarray]], change: np.ndarray) 
     """The base model with the chosen effects; its own parameters follow their ``change``, m."""
     row = fit.row.copy()
     row[fit.free] -= np.linalg.lstsq(fit.tangents, fit.residual + change, rcond=None)[0]
-    system = ParameterVector(copy.deepcopy(fit.system)).fill_(row)
+    system = with_parameters(fit.system, row)
     system.project_()
     for trace, theta in chosen:
         system, _ = extended(system, _effect(trace, theta))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 
 import numpy as np
@@ -73,3 +74,8 @@ class ParameterVector:
     def _flat(self) -> Tensor:
         values = [p.detach().double().flatten() for p in self.parameters.values()]
         return torch.cat(values) if values else torch.zeros(0, dtype=torch.float64)
+
+
+def with_parameters(system: System, row: Tensor | np.ndarray) -> System:
+    """A copy of a model whose parameters that need a gradient are a vector ``(K,)``."""
+    return ParameterVector(copy.deepcopy(system)).fill_(row)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 import math
 from collections.abc import Iterable, Mapping
@@ -10,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.parameters import with_parameters
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, SimulationError
 from nnode.model.system import System
@@ -89,7 +88,7 @@ class Population:
     def system(self) -> System:
         """The model with the estimated parameters of the typical driver."""
         row = self.model.natural(self.estimate.theta)
-        return ParameterVector(copy.deepcopy(self.model.system)).fill_(row)
+        return with_parameters(self.model.system, row)
 
     @property
     def random(self) -> list[str]:

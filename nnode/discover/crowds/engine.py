@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from collections.abc import Sequence as Many
 from dataclasses import replace
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.crowds.variables import crowd_variables
 from nnode.discover.crowds.whitening import Whitening
@@ -177,7 +176,7 @@ class CrowdEngine:
 
     def _simulated(self, system: System, row: Tensor) -> tuple[System, Tensor, RunAlone]:
         states = self._states(system, row[None])[:, 0]
-        filled = ParameterVector(copy.deepcopy(system)).fill_(row)
+        filled = with_parameters(system, row)
         assert self._around is not None
         run = RunAlone(self._around, filled, states)
         return system, row.clone(), run

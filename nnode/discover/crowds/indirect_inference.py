@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.paths import Path, Smoother
@@ -68,7 +68,7 @@ def bias_corrected(fit: Fit, sequences: Many[Sequence], seed: int = 0) -> Fit:
     bias = np.where(fit.free, np.mean(estimates, 0) - fit.row, 0.0)
     row = np.clip(fit.row - bias, *ParameterVector(fit.system).bounds)
     error = np.where(fit.free, np.std(estimates, 0, ddof=1) / np.sqrt(len(estimates)), 0.0)
-    system = ParameterVector(copy.deepcopy(fit.system)).fill_(row)
+    system = with_parameters(fit.system, row)
     return replace(fit, system=system, row=row, simulated=error)
 
 

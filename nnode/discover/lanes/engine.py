@@ -14,7 +14,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor, nn
 
-from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence, collate
 from nnode.discover.lanes.variables import traffic_variables
@@ -210,7 +210,7 @@ class TrafficEngine:
         if previous is None or previous[0] is not system or not torch.equal(previous[1], row):
             self.deviations(system, row[None])
         assert self._last is not None
-        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
+        fixed = with_parameters(system, row)
         step = self._step(self._longest(system, row[None]))
         scene = replace(fixed.scene(self.smoothed), step=step)
         with torch.no_grad():

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import (
     LARGE,
@@ -214,7 +214,7 @@ class FollowersEngine(TrafficEngine):
         if self._like is not None and self._like.population is not None:
             fixed = self._like.population.system
         else:
-            fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
+            fixed = with_parameters(system, row)
         row = ParameterVector(fixed).row
         paths, previous = self._paths(self._longest(fixed, row[None])), self.population
         start = previous
@@ -273,7 +273,7 @@ class FollowersEngine(TrafficEngine):
     def _deviations_under(self, system: System, row: Tensor) -> Population:
         """The last estimate, with the deviations of drivers and starts under a model."""
         assert self.population is not None
-        fixed = ParameterVector(copy.deepcopy(system)).fill_(row)
+        fixed = with_parameters(system, row)
         return refit(
             self.population, fixed, self._paths(self._longest(fixed, row[None])), fixed=True
         )
@@ -382,7 +382,7 @@ class FollowersEngine(TrafficEngine):
             return cached[2]
         difference, model, states = self._pseudo_residuals(system, row[None])
         plain, _ = _parts(system)
-        fixed = ParameterVector(copy.deepcopy(plain)).fill_(row[: len(model.names)])
+        fixed = with_parameters(plain, row[: len(model.names)])
         parameters = model.spread(
             model.at(row.numpy()[: len(model.names)]), self._deviations(model)[0]
         )

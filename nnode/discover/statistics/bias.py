@@ -9,14 +9,13 @@ pushes, deviations and errors cancel.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, evaluated, sums
@@ -82,7 +81,7 @@ def corrected_for_bias(engine: Engine, fit: Fit, seed: int) -> Fit:
     bias = np.where(corrected, biases.mean(0), 0.0)
     error = np.where(corrected, biases.std(0, ddof=1) / np.sqrt(len(biases)), 0.0)
     row = np.clip(fit.row - bias, *ParameterVector(fit.system).bounds)
-    system = ParameterVector(copy.deepcopy(fit.system)).fill_(row)
+    system = with_parameters(fit.system, row)
     return replace(fit, system=system, row=row, simulated=error)
 
 

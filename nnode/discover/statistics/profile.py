@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy import stats
 
-from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.parameters import with_parameters
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.model.effects import Effect
@@ -121,7 +120,7 @@ def refined_edges(engine: Engine, fit: Fit, name: str) -> Fit:
             break
         row = fit.row.copy()
         row[best.index] = best.at[int(np.argmin(best.rise))]
-        trial = refine(engine, ParameterVector(copy.deepcopy(fit.system)).fill_(row))
+        trial = refine(engine, with_parameters(fit.system, row))
         if trial.cost >= fit.cost:
             break
         fit = trial
