@@ -293,7 +293,8 @@ def _print(outcome: DiagnosisOutcome, paths: Mapping[str, Path], seconds: float)
     for laws in (d.laws, d.laws_again):
         if laws is not None and laws.ranking:
             effects = f", with {', '.join(laws.effects)}" if laws.effects else ""
-            print(f"laws{effects}, by held-out cost: {ranked(laws)}")
+            criterion = "likelihood" if laws.likelihood else "held-out cost"
+            print(f"laws{effects}, by {criterion}: {ranked(laws)}")
     for note in d.notes:
         print(note)
     print(sentence(d))

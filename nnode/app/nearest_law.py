@@ -138,15 +138,16 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
         return ranking, calibrated
 
     laws, systems = compared(job.laws, []) if job.laws else (None, {})
-    nearest = _with_law(job, laws.best or job.name) if laws else job
+    nearest = _with_law(job, _nearest(laws, job)) if laws else job
     outcome = _diagnose(nearest, watch)
     effects, second_comparison = _added_effects(nearest, outcome), None
     calibrated_laws: dict[str, System] = {}
     if systems and effects:
         second_comparison, calibrated_laws = compared(systems, effects)
-        if second_comparison.best != nearest.name:
-            nearest = _with_law(job, second_comparison.best)
-            outcome = _diagnose(nearest, watch, hint=calibrated_laws[second_comparison.best])
+        best = _nearest(second_comparison, nearest)
+        if best != nearest.name:
+            nearest = _with_law(job, best)
+            outcome = _diagnose(nearest, watch, hint=calibrated_laws[best])
     diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws, watch)
     # effects that are built into other laws are excluded, because they would favour laws that
     # imitate those
@@ -165,6 +166,14 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
     first.laws, first.laws_again = laws, second_comparison
     first.seconds = {"reading": job.seconds, "laws": round(seconds, 3), **first.seconds}
     return diagnoses
+
+
+def _nearest(laws: Laws, job: Job) -> str:
+    """The name of the best law; the law of the job, if the comparison does not reject it."""
+    p_values = {law.name: law.p_value for law in laws.ranking}
+    if p_values.get(job.name, 0.0) > job.options.rules.sure:
+        return job.name
+    return laws.best or job.name
 
 
 def _added_effects(job: Job, outcome: DiagnosisOutcome) -> list[Effect]:
@@ -192,7 +201,7 @@ def _compared(job: Job, laws: dict[str, System], watch: Watch) -> tuple[Laws, di
         if stages is not None:
             stages.begin("comparing laws")
         within = [] if stages is None else [stages.within]
-        return compare_laws(laws, job.inputs.sequences, job.options, *within)
+        return compare_laws(laws, job.name, job.inputs.sequences, job.options, *within)
 
 
 def _diagnose(

@@ -15,7 +15,7 @@ import torch
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.compare.laws import BetterLaw, explained_by_law
-from nnode.discover.division import Division, divide
+from nnode.discover.division import SETTLED, Division, divide, without_starts
 from nnode.discover.eligibility import check_model, not_offered
 from nnode.discover.judge.confirmation import ConfirmationSet
 from nnode.discover.judge.model_comparison import engine_of
@@ -68,11 +68,6 @@ from nnode.progress import Stages
 
 #: Number of the strongest effects that the first screen lists.
 SCREENED = 3
-#: In a law of first order, the speed at the start is that of the law. Vehicles of a simulation
-#: start with another one and need time to adapt, s; at most this share of a sequence. In a table of
-#: SUMO, the first 0.8 s were named as a period of lower speeds. A period was still selected if 1 s
-#: was left out, and none if 2 s were.
-SETTLING, SETTLING_SHARE = 2.0, 0.1
 #: Why a model is not diagnosed whose simulations diverge.
 BLOWS_UP = (
     "the model cannot be simulated on these data: it blows up from its own parameters and "
@@ -168,12 +163,12 @@ def _diagnosed(
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
     differ = drivers_differ(system, sequences)
-    notes = list[str]()
-    if differ and system.order == 1 and without_errors(sequences):
-        sequences = _without_starts(sequences, notes)
+    divided, (sequences, notes) = sequences, _used(system, sequences, differ)
     offered, refused = _offered(system, names, differ)
     effects = [effect for effect in offered if not issubclass(effect, IndividualEffect)]
-    explore = partial(_explore, system, sequences, options, effects, differ, clock, stages, hint)
+    explore = partial(
+        _explore, system, divided, sequences, options, effects, differ, clock, stages, hint
+    )
     exploration = explore()
     if exploration.simultaneity.together:
         exploration = replace(explore(together=True), simultaneity=exploration.simultaneity)
@@ -298,21 +293,17 @@ def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves
     return [curve for curve in remaining if curve.removed > rules().least]
 
 
-def _without_starts(sequences: list[Sequence], notes: list[str]) -> list[Sequence]:
-    """The sequences without the time in which a simulation adapts to its start.
+def _used(
+    system: System, sequences: list[Sequence], differ: bool
+) -> tuple[list[Sequence], list[str]]:
+    """The sequences as they are used, and notes on what is left out.
 
     Args:
-        notes: the reason is added to them.
+        differ: whether drivers differ.
     """
-    notes.append(
-        "Positions have no errors of measurement, as in simulations or after smoothing. The first "
-        f"{SETTLING:g} s of each sequence (at most {SETTLING_SHARE:.0%} of it), in which a "
-        "simulation adapts to its start, are left out."
-    )
-    shares = [min(SETTLING / max(np.ptp(s.time), s.dt), SETTLING_SHARE) for s in sequences]
-    return [
-        replace(s.part(share, 1.0), name=s.name) for s, share in zip(sequences, shares, strict=True)
-    ]
+    if differ and system.order == 1 and without_errors(sequences):
+        return without_starts(sequences), [SETTLED]
+    return sequences, []
 
 
 def _offered(
@@ -387,6 +378,7 @@ def _without_imitations(
 
 def _explore(
     system: System,
+    divided: list[Sequence],
     sequences: list[Sequence],
     options: DiscoverOptions,
     effects: list[type[Effect]],
@@ -399,11 +391,12 @@ def _explore(
     """Calibrate, locate deviations, and select effects on the exploration sequences.
 
     Args:
+        divided: the sequences by which clusters are divided. sequences: those that are used.
         differ: whether drivers differ.
         together: simultaneous sequences form one cluster.
     """
     stages.begin("calibrating")
-    division = divide(sequences, options, together=together)
+    division = divide(divided, options, together=together)
     exploration_sequences = [sequences[i] for i in division.exploration]
     label = division.label[division.exploration]
     apart = APART if options.smoothed and without_errors(sequences) else 0.0

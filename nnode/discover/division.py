@@ -1,8 +1,8 @@
-"""The division of sequences into an exploration and a confirmation set, by cluster."""
+"""The sequences that are used, and their division into an exploration and a confirmation set."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,17 @@ from nnode.data.sequence import Sequence
 from nnode.data.split import split
 from nnode.discover.options import DiscoverOptions
 from nnode.errors import DataError
+
+#: In a law of first order, the speed at the start is that of the law. Vehicles of a simulation
+#: start with another one and need time to adapt, s; at most this share of a sequence. In a table of
+#: SUMO, the first 0.8 s were named as a period of lower speeds. A period was still selected if 1 s
+#: was left out, and none if 2 s were.
+SETTLING, SETTLING_SHARE = 2.0, 0.1
+SETTLED = (
+    "Positions have no errors of measurement, as in simulations or after smoothing. The first "
+    f"{SETTLING:g} s of each sequence (at most {SETTLING_SHARE:.0%} of it), in which a simulation "
+    "adapts to its start, are left out."
+)
 
 
 @dataclass(frozen=True)
@@ -83,3 +94,11 @@ def _drawn(label: np.ndarray, wanted: int, rng: np.random.Generator) -> list[int
         if len(chosen) < wanted and 2 * (size[chosen].sum() + size[candidate]) <= len(label):
             chosen.append(int(candidate))
     return chosen
+
+
+def without_starts(sequences: list[Sequence]) -> list[Sequence]:
+    """The sequences without the time in which a simulation adapts to its start."""
+    shares = [min(SETTLING / max(np.ptp(s.time), s.dt), SETTLING_SHARE) for s in sequences]
+    return [
+        replace(s.part(share, 1.0), name=s.name) for s, share in zip(sequences, shares, strict=True)
+    ]

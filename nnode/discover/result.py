@@ -324,7 +324,8 @@ class ComparedLaw:
         error: mean square error of positions of whole sequences, m², in left-out clusters; in
             crowds, in the calibration clusters.
         behind: share by which its held-out cost exceeds that of the best law, in the mean of
-            logarithms over clusters.
+            logarithms over clusters; or by which the best law's likelihood of a position exceeds
+            this one's, see :class:`Laws`.
         p_value: one-sided, paired by cluster, that it is as good as the best law.
         values: parameter to value and unit.
     """
@@ -345,12 +346,15 @@ class Laws:
         refused: law to the reason why it was not compared.
         clusters: number of clusters of the comparison.
         effects: that were added to every law to which they apply.
+        likelihood: whether laws were compared by their marginal likelihoods, with drivers who
+            differ; otherwise by costs of left-out clusters.
     """
 
     ranking: list[ComparedLaw]
     refused: dict[str, str]
     clusters: int
     effects: list[str] = field(default_factory=list)
+    likelihood: bool = False
 
     @property
     def best(self) -> str:

@@ -175,6 +175,20 @@ def fit_drivers(
     return population
 
 
+def fit_all_random(system: System, paths: Paths) -> Population:
+    """A quick estimate in which all parameters of the law differ between drivers, for a comparison
+    of laws. The variances of those that do not differ become small.
+
+    Raises:
+        ConfigError: a model without a formula. SimulationError: its simulation diverges.
+    """
+    plain = Followers(system, paths)
+    if not np.isfinite(plain(plain.start, np.zeros((0, 0)), np.zeros((0, 0))).columns).all():
+        raise SimulationError("the followers' paths diverge")
+    model = Followers(system, paths, plain.may_differ)
+    return _estimated(model, model.start, initial_variances(model), steps=RANKING_STEPS)
+
+
 def obstacle(system: System, sequences: list[Sequence], needed: int = LEAST_DRIVERS) -> str | None:
     """Why drivers who differ cannot be estimated for a model or its data; None if they can.
 

@@ -1,9 +1,13 @@
-"""Comparison of base laws by leave-one-cluster-out costs.
+"""Comparison of base laws.
 
-Every law is calibrated to the positions of whole sequences. The whitening is fitted to the
-residuals of the best law, and all laws are recalibrated to residuals with this common whitening.
-Their costs are those of left-out clusters. If another law is then the best, the whitening is fitted
-to its residuals and the comparison is repeated.
+Every law is calibrated to the positions of whole sequences. Where drivers may differ, laws are then
+compared by their marginal likelihoods, each with drivers, pushes and parameters of its own, minus a
+price of parameters (BIC). A common parameter for drivers who differ would favour laws that imitate
+differences. The test is that of Vuong 1989, by cluster.
+
+Otherwise laws are compared by leave-one-cluster-out costs. The whitening is fitted to the residuals
+of the best law, and all laws are recalibrated to residuals with this common whitening. If another
+law is then the best, the whitening is fitted to its residuals and the comparison is repeated.
 """
 
 from __future__ import annotations
@@ -17,10 +21,12 @@ from typing import cast
 import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.data.clusters import better
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.division import divide
+from nnode.discover.division import divide, without_starts
 from nnode.discover.eligibility import check_model, not_offered
 from nnode.discover.judge.model_comparison import engine_of, windows_of
+from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.name.search import Selection, Step, initial_fit
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, square_of
@@ -28,17 +34,24 @@ from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import ComparedLaw, Laws
 from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import compare, heldout
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, SimulationError
 from nnode.model.effects import CATALOGUE, Effect
 from nnode.model.extend import effects_of, extended
 from nnode.model.system import System
+from nnode.population.followers import APART, drivers_differ, follower_formula, without_errors
 
+#: Why a law is not compared where drivers may differ.
+NO_FORMULA = (
+    "it is no formula of the positions and speeds of a driver and of the vehicles ahead, and has "
+    "no likelihood where drivers differ; diagnose it by itself with discover.compare=[]"
+)
 #: Largest number of repetitions with another law's whitening.
 ROUNDS = 3
 
 
 def compare_laws(
     candidates: Mapping[str, System],
+    name: str,
     sequences: list[Sequence],
     options: DiscoverOptions,
     within: Callable[[float], None] = lambda part: None,
@@ -48,6 +61,7 @@ def compare_laws(
     Args:
         candidates: models by name; they are not changed. Those that the diagnosis cannot simulate
             are reported as refused, with the reason.
+        name: of the law that is diagnosed.
         sequences: without faults, at least three of them.
         within: is told which part of the work is done, between 0 and 1.
 
@@ -58,19 +72,79 @@ def compare_laws(
         DataError: too few sequences.
     """
     division = divide(sequences, options)
-    exploration = [sequences[i] for i in division.exploration]
+    exact = without_errors(sequences)
+    asked = candidates[name]
+    differ = drivers_differ(asked, sequences)
+    used = without_starts(sequences) if differ and exact else sequences
+    exploration = [used[i] for i in division.exploration]
     label = division.label[division.exploration]
-    any_system = next(iter(candidates.values()))
-    whole = engine_of(any_system, exploration, label, whole=True)
-    fits, refused = _calibrated(whole, candidates, within)
+    whole = engine_of(asked, exploration, label, whole=True)
+    formulas, refused = dict(candidates), dict[str, str]()
+    if differ:
+        formulas = {key: law for key, law in candidates.items() if follower_formula(law)}
+        refused = {key: NO_FORMULA for key in candidates if key not in formulas}
+    fits, failed = _calibrated(whole, formulas, within)
+    refused |= failed
     if not fits:
         return Laws([], refused, 0), {}
     number = np.bincount(whole.cluster)
-    errors = {name: heldout(fit, whole.cluster) / number for name, fit in fits.items()}
-    if any_system.domain == "crowd":  # its residuals are not positions
-        errors = {n: np.array([square_of(whole, fit.system)]) for n, fit in fits.items()}
-    reference = min(errors, key=lambda name: float(errors[name].mean()))
-    engine = windows_of(any_system, exploration, label)
+    errors = {key: float((heldout(f, whole.cluster) / number).mean()) for key, f in fits.items()}
+    if asked.domain == "crowd":  # its residuals are not positions
+        errors = {key: square_of(whole, fit.system) for key, fit in fits.items()}
+    if differ:
+        apart = APART if options.smoothed and exact else 0.0
+        engine = FollowersEngine(exploration, label, apart=apart)
+        return _by_likelihood(engine, fits, errors, refused, within)
+    return _by_cost(windows_of(asked, exploration, label), fits, errors, refused, within)
+
+
+def _by_likelihood(
+    engine: FollowersEngine,
+    fits: Mapping[str, Fit],
+    errors: Mapping[str, float],
+    refused: dict[str, str],
+    within: Callable[[float], None],
+) -> tuple[Laws, dict[str, System]]:
+    """Rank laws by their marginal likelihoods.
+
+    Args:
+        fits: laws, calibrated. errors: see :class:`~nnode.discover.result.ComparedLaw`.
+        refused: is completed.
+    """
+    values, systems = dict[str, np.ndarray](), dict[str, System]()
+    for place, (name, fit) in enumerate(fits.items()):
+        within((1 + place / len(fits)) / 2)
+        try:
+            values[name], systems[name] = engine.log_likelihoods(fit.system)
+        except (SimulationError, np.linalg.LinAlgError):
+            refused[name] = "it blows up on these data"
+    if not values:
+        return Laws([], refused, 0), {}
+    names = sorted(values, key=lambda name: -float(values[name].sum()))
+    best, samples = values[names[0]], len(engine.cluster)
+    ranking = [
+        ComparedLaw(
+            name=name,
+            parameters=len(fits[name].row),
+            error=errors[name],
+            behind=math.expm1((best.sum() - values[name].sum()) / samples),
+            p_value=1.0 if name == names[0] else better(best - values[name]),
+            values=_parameters(systems[name]),
+        )
+        for name in names
+    ]
+    return Laws(ranking, refused, len(best), likelihood=True), systems
+
+
+def _by_cost(
+    engine: Engine,
+    fits: dict[str, Fit],
+    errors: Mapping[str, float],
+    refused: dict[str, str],
+    within: Callable[[float], None],
+) -> tuple[Laws, dict[str, System]]:
+    """Rank laws by their costs of left-out clusters; arguments as in :func:`_by_likelihood`."""
+    reference = min(errors, key=lambda name: errors[name])
     costs: dict[str, np.ndarray] = {}
     for _ in range(ROUNDS):
         engine.fit_whitening(fits[reference].system, ParameterVector(fits[reference].system).row)
@@ -82,22 +156,24 @@ def compare_laws(
         if best == reference:
             break
         reference = best
-    ranking = []
-    for name in sorted(costs, key=lambda name: _level(costs[name])):
-        comparison = compare(costs[name], costs[best])
-        system = fits[name].system
-        ranking.append(
-            ComparedLaw(
-                name=name,
-                parameters=len(fits[name].row),
-                error=float(errors[name].mean()),
-                behind=math.exp(_level(costs[name]) - _level(costs[best])) - 1,
-                p_value=1.0 if name == best else comparison.p_value,
-                values={k: (float(v), unit) for k, (v, unit) in system.physical().items()},
-            )
+    ranking = [
+        ComparedLaw(
+            name=name,
+            parameters=len(fits[name].row),
+            error=errors[name],
+            behind=math.exp(_level(costs[name]) - _level(costs[best])) - 1,
+            p_value=1.0 if name == best else compare(costs[name], costs[best]).p_value,
+            values=_parameters(fits[name].system),
         )
+        for name in sorted(costs, key=lambda name: _level(costs[name]))
+    ]
     systems = {name: fit.system for name, fit in fits.items()}
     return Laws(ranking, refused, int(engine.cluster.max()) + 1), systems
+
+
+def _parameters(system: System) -> dict[str, tuple[float, str]]:
+    """Parameter to value and unit."""
+    return {name: (float(value), unit) for name, (value, unit) in system.physical().items()}
 
 
 def with_effects(laws: Mapping[str, System], effects: list[Effect]) -> dict[str, System]:
@@ -141,13 +217,19 @@ def explained_by_law(
     Returns:
         The effects, and the one-sided p-value of that comparison.
     """
-    engine_of_law = windows_of(nearer.system, engine.sequences, label)
-    engine_of_law.fit_whitening(nearer.system, ParameterVector(nearer.system).row)
-    costs = [
-        heldout(refine(engine_of_law, copy.deepcopy(system)), engine_of_law.cluster)
-        for system in (selection.fit.system, nearer.system)
-    ]
-    p_value = compare(*costs).p_value
+    p_value = 1.0
+    if not isinstance(engine, FollowersEngine):
+        engine_of_law = windows_of(nearer.system, engine.sequences, label)
+        engine_of_law.fit_whitening(nearer.system, ParameterVector(nearer.system).row)
+        costs = [
+            heldout(refine(engine_of_law, copy.deepcopy(system)), engine_of_law.cluster)
+            for system in (selection.fit.system, nearer.system)
+        ]
+        p_value = compare(*costs).p_value
+    elif follower_formula(nearer.system):
+        systems = nearer.system, selection.fit.system
+        with_law, with_effects = (engine.log_likelihoods(system)[0] for system in systems)
+        p_value = better(with_law - with_effects)
     if p_value > rules().level:
         return [], p_value
     shared = {effect.name for effect in effects_of(nearer.system)}

@@ -37,7 +37,14 @@ from nnode.model.effects import Effect, Probe
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import State
-from nnode.population.drivers import STEP, Population, fit_drivers, initial_variances, refit
+from nnode.population.drivers import (
+    STEP,
+    Population,
+    fit_all_random,
+    fit_drivers,
+    initial_variances,
+    refit,
+)
 from nnode.population.estimate import fit_deviations
 from nnode.population.followers import (
     PAIRS,
@@ -231,6 +238,23 @@ class FollowersEngine(TrafficEngine):
         trial.fit_whitening(system, ParameterVector(system).row)
         assert trial.population is not None
         return trial.population
+
+    def log_likelihoods(self, system: System) -> tuple[np.ndarray, System]:
+        """``(G,)`` log marginal likelihoods of the clusters under a law with parameters of its own,
+        which all differ between drivers, minus their share of the number of parameters times half
+        the logarithm of the number of drivers (BIC); and the calibrated law.
+
+        Raises:
+            SimulationError: its simulation diverges.
+        """
+        paths = self._paths(self._longest(system, ParameterVector(system).row[None]))
+        population = fit_all_random(system, paths)
+        cluster = np.zeros(len(paths.names), dtype=int)
+        cluster[paths.agent] = self._label[paths.sequence]
+        each = np.bincount(cluster, population.marginal.each)
+        present = np.bincount(cluster) > 0
+        price = (population.marginal.loglik - population.criterion) / present.sum()
+        return each[present] - price, population.system
 
     def with_usual_variances(self, system: System) -> FollowersEngine:
         """An engine with the variances where searches start, and all parameters of the law that can

@@ -73,16 +73,32 @@ _ERRORS = {
 }
 
 
+#: The head of the column by which laws are ranked, and its explanation.
+_CRITERIA = {
+    "cost": (
+        "held-out cost above the best (%)",
+        "*Held-out cost*: mean log error after removing autocorrelation, each cluster left out in "
+        "turn; lower is better.",
+    ),
+    "likelihood": (
+        "likelihood below the best (%)",
+        "*Likelihood*: of one measured position, geometric mean, with all parameters of a law "
+        "differing between drivers; the number of parameters has its price (BIC).",
+    ),
+}
+
+
 def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
     """Base laws, the best first."""
     effects = f", with {', '.join(laws.effects)} where applicable" if laws.effects else ""
+    head, criterion = _CRITERIA["likelihood" if laws.likelihood else "cost"]
     return _table(
         name,
         [
             {
                 "law": law.name,
                 "parameters": law.parameters,
-                "held-out cost above the best (%)": amount(100 * law.behind),
+                head: amount(100 * law.behind),
                 "p": amount(law.p_value, 2),
                 "error on left-out open clusters (m²)": amount(law.error),
                 "calibrated": ", ".join(
@@ -92,8 +108,7 @@ def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
             }
             for law in laws.ranking
         ],
-        f"Base laws on {laws.clusters} exploration clusters{effects}. *Held-out cost*: mean log "
-        "error after removing autocorrelation, each cluster left out in turn; lower is better. "
+        f"Base laws on {laws.clusters} exploration clusters{effects}. {criterion} "
         f"*p*: one-sided, for the law being as good as the first one. *Error*: {_ERRORS[domain]}",
         heads={"error on left-out open clusters (m²)": "error (m²)", "calibrated": "parameters at"},
     )

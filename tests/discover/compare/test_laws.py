@@ -9,6 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import nnode
+from benchmarks import drivers
 from benchmarks.synthetic_cases.laws import measured
 from nnode.app.nearest_law import LAWS, candidates
 from nnode.app.python.inputs import model_options, table_options
@@ -17,6 +19,7 @@ from nnode.data.readers.table import read_table
 from nnode.data.sequence import Sequence
 from nnode.discover.compare.laws import BetterLaw, compare_laws, explained_by_law, with_effects
 from nnode.discover.lanes.engine import TrafficEngine
+from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.name.search import Selection, Step, converged_fit, initial_fit, without_steps
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.fit import refine
@@ -34,12 +37,12 @@ def law(name: str) -> System:
 
 @pytest.mark.parametrize("true", ["idm", "lin"])
 def test_the_true_law_comes_first(true: str, tmp_path: Path) -> None:
-    table, parameters = measured(true, 5, sequences=12, vehicles=4, seconds=20.0)
+    table, parameters = measured(true, 5, sequences=24, vehicles=4, seconds=20.0)
     path = tmp_path / "table.csv"
     table.to_csv(path, index=False)
     sequences = read_table(path, table_options(path, "traffic", None, tmp_path)[1])
     laws = {n: law(n) for n in ("lin", "idm", "helly")}
-    found, calibrated = compare_laws(laws, sequences, DiscoverOptions())
+    found, calibrated = compare_laws(laws, true, sequences, DiscoverOptions())
     assert set(calibrated) == set(laws)
     assert found.ranking[0].name == found.best == true
     assert found.ranking[0].behind == 0.0 < found.ranking[1].behind
@@ -49,10 +52,33 @@ def test_the_true_law_comes_first(true: str, tmp_path: Path) -> None:
     assert first[name] == pytest.approx(parameters[name], rel=0.15)
 
 
+def test_laws_are_compared_with_drivers_who_differ() -> None:
+    """With one parameter for all drivers, laws that imitate differences came first."""
+    sequences = list(nnode.sequences(drivers.platoons("idm", "none", 0.15, 6011, number=16)))
+    laws = {n: law(n) for n in ("fvdm", "idm", "gipps")}
+    laws["other"] = extended(law("idm"), CATALOGUE.effects["leader_speed"]())[0]
+    found, calibrated = compare_laws(laws, "idm", sequences, DiscoverOptions())
+    assert found.likelihood
+    assert found.best == "idm"
+    assert found.ranking[1].p_value < 0.01
+    assert found.ranking[0].values["idm.T"][0] == pytest.approx(drivers.T, rel=0.1)
+    assert min(found.ranking, key=lambda one: one.error).name != "idm"
+    assert "no formula" in found.refused["other"]
+    engine = FollowersEngine(sequences)
+    nearer = BetterLaw("idm", calibrated["idm"])
+    kind = CATALOGUE.effects["multi_anticipation"]
+    fit = initial_fit(engine, extended(law("fvdm").double(), kind())[0])
+    chosen = SimpleNamespace(name=kind.name, score=SimpleNamespace(effect=kind))
+    selection = Selection(fit, [Step(chosen, [])])
+    steps, p_value = explained_by_law(engine, selection, np.arange(16), nearer)
+    assert len(steps) == 1
+    assert p_value < 0.01
+
+
 def test_what_cannot_be_simulated_is_told(platoons_of_lin: list[Sequence]) -> None:
     models = {"lin": law("lin"), "newell": law("newell")}
     before = ParameterVector(models["lin"]).row
-    found, _ = compare_laws(models, platoons_of_lin, DiscoverOptions())
+    found, _ = compare_laws(models, "lin", platoons_of_lin, DiscoverOptions())
     assert [one.name for one in found.ranking] == ["lin"]
     assert "step by step" in found.refused["newell"]
     assert ParameterVector(models["lin"]).row.tolist() == before.tolist()
@@ -66,7 +92,7 @@ def platoons_of_lin() -> list[Sequence]:
 def test_people_are_compared_too() -> None:
     sequences = walkers.crowd()
     laws = {n: law(n) for n in ("sf", "ttc", "cfsm")}
-    found, _ = compare_laws(laws, sequences, DiscoverOptions())
+    found, _ = compare_laws(laws, "sf", sequences, DiscoverOptions())
     assert {one.name for one in found.ranking} == {"sf", "ttc"}
     assert "first order" in found.refused["cfsm"]
 
