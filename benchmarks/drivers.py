@@ -6,7 +6,7 @@ parameters are log-normal (``lin``: v0; ``idm``: T and v0; ``fvdm``: s_c and v0)
 deviation of ``--spread`` %, pushes last 4 s, and positions are measured with errors of ``--error``
 m. ``--nature`` departs from this. Paths are integrated here by Euler's method; everything else is
 the package's public interface. The cases of a run are fixed by its seed. The table has a row per
-case; what is printed last counts them.
+case; what is printed last counts them. ``--compare`` only compares laws.
 """
 
 from __future__ import annotations
@@ -21,8 +21,12 @@ import pandas as pd
 
 import nnode
 from benchmarks.discovery.run import sources
+from nnode.app.nearest_law import candidates
+from nnode.app.python.inputs import model_options
+from nnode.discover.compare.laws import compare_laws
 from nnode.discover.options import DiscoverOptions
 from nnode.files import write_text
+from nnode.model.build import build_model
 from studies.runner import Task, run_tasks
 
 #: s, step and sampling interval, s. Steps of 0.02 s delay reactions by 0.01 s, which lowers kappa
@@ -298,6 +302,27 @@ def diagnosed(**case: Any) -> dict[str, Any]:
     }
 
 
+def compared(**case: Any) -> dict[str, Any]:
+    """The case with the comparison of all laws, of which the case's law should be the first."""
+    begun, sequences = time.monotonic(), list(nnode.sequences(platoons(**case)))
+    options, law = model_options(case["law"], "measured"), DiscoverOptions()
+    laws = candidates(options, build_model(options), law)
+    ranking, _ = compare_laws(laws, case["law"], sequences, law)
+    names = [entry.name for entry in ranking.ranking]
+    true = ranking.ranking[names.index(case["law"])]
+    return {
+        **case,
+        "first": names[0],
+        "second": names[1],
+        "p second": ranking.ranking[1].p_value,
+        "p true": true.p_value,
+        "exact": names[0] == case["law"],
+        "among": true.p_value > 0.01,
+        "false": true.p_value <= 0.01,
+        "seconds": round(time.monotonic() - begun, 1),
+    }
+
+
 def _variations(case: dict[str, Any]) -> dict[str, float]:
     """The true standard deviations of drivers' parameters, %, and of pushes, and their time, s."""
     names = {"lin": ["v0"], "idm": ["v0", "T"], "fvdm": ["v0", "s_c"]}[case["law"]]
@@ -325,6 +350,7 @@ def main() -> None:
     parser.add_argument("--vehicles", type=int, default=6, help="in a platoon, its leader included")
     parser.add_argument("--error", type=float, default=0.06, help="of measured positions, m")
     parser.add_argument("--pairs", action="store_true", help="two effects at once")
+    parser.add_argument("--compare", action="store_true", help="only compare laws")
     parser.add_argument("--nature", default="plain", choices=NATURES)
     parser.add_argument("--laws", nargs="+", default=["lin", "idm"], choices=list(HIDDEN))
     parser.add_argument("--processes", type=int, default=2)
@@ -341,9 +367,8 @@ def main() -> None:
         pairs=given.pairs,
         nature=given.nature,
     )
-    tasks = [
-        Task(f"{case['law']}-{case['effect']}-s{case['seed']}", diagnosed, case) for case in chosen
-    ]
+    work = compared if given.compare else diagnosed
+    tasks = [Task(f"{case['law']}-{case['effect']}-s{case['seed']}", work, case) for case in chosen]
     folder = given.table.with_suffix("")
     results = run_tasks(
         tasks, folder, workers=given.processes, fingerprint=sources(), title="cases"

@@ -43,3 +43,15 @@ def test_rows_are_scored_and_kept(
     assert rows["estimate"].tolist() == ["", "0.88"]
     assert rows["covered"].tolist() == ["", covered]
     assert set(rows["v0 covered"]) == {"-"}
+
+
+def test_laws_are_compared_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "table.csv"
+    size = ["--platoons", "8", "--vehicles", "4", "--processes", "1", "--table", str(path)]
+    given = ["drivers", "--compare", "--laws", "lin", "--seed", "5", "--cases", "1", *size]
+    monkeypatch.setattr(sys, "argv", given)
+    drivers.main()
+    (row,) = pd.read_csv(path).to_dict("records")
+    assert row["exact"]
+    assert row["first"] == "lin" != row["second"]
+    assert row["p second"] < row["p true"] == 1.0
