@@ -339,7 +339,7 @@ def _drivers(engine: Engine, fit: Fit, notes: list[str]) -> list[Variation]:
         return []
     engine.fit_whitening(fit.system, torch.from_numpy(fit.row))
     assert engine.population is not None
-    drivers = [Variation(name, **row) for name, row in variations(engine.population).items()]
+    drivers = [Variation(name, **row) for name, row in variations(engine.drivers()).items()]
     push = next(row for row in drivers if row.name == "push")
     if push.at_bound == "high" or not engine.population.explains_rates:
         rate = "accelerations" if fit.system.order > 1 else "speeds"

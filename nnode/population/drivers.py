@@ -175,6 +175,16 @@ def fit_drivers(
     return population
 
 
+def with_smaller_errors(population: Population) -> Population:
+    """The estimate in which measurement errors may be smaller than was assumed. Errors that are too
+    large lengthen the pushes."""
+    before, variances = population.estimate, population.estimate.variances
+    low = variances.low.copy()
+    low[2] = ERRORS[0]
+    variances = replace(variances, low=low)
+    return _estimated(population.model, before.theta, variances, before.agents, before.start)
+
+
 def fit_all_random(system: System, paths: Paths) -> Population:
     """A quick estimate in which all parameters of the law differ between drivers, for a comparison
     of laws. The variances of those that do not differ become small.

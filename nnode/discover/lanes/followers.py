@@ -44,6 +44,7 @@ from nnode.population.drivers import (
     fit_drivers,
     initial_variances,
     refit,
+    with_smaller_errors,
 )
 from nnode.population.estimate import fit_deviations
 from nnode.population.followers import (
@@ -238,6 +239,14 @@ class FollowersEngine(TrafficEngine):
         trial.fit_whitening(system, ParameterVector(system).row)
         assert trial.population is not None
         return trial.population
+
+    def drivers(self) -> Population:
+        """The last estimate; where errors of positions are smaller than :data:`ERROR`, with errors
+        estimated as well, because larger ones would lengthen the pushes."""
+        assert self.population is not None
+        if self.population.model.paths.error > ERROR:
+            return self.population
+        return with_smaller_errors(self.population)
 
     def log_likelihoods(self, system: System) -> tuple[np.ndarray, System]:
         """``(G,)`` log marginal likelihoods of the clusters under a law with parameters of its own,
