@@ -25,6 +25,7 @@ from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report import page
+from nnode.discover.rules import Rules
 from nnode.errors import ConfigError
 from nnode.model import System
 from tests.app.conftest import Script, composed
@@ -279,7 +280,7 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
         "traffic",
         model={"term": "lin"},
         folder=tmp_path / "run",
-        options=DiscoverOptions(page=False, compare=["idm"]),
+        options=DiscoverOptions(page=False, compare=["idm"], rules=Rules(sure=0.5)),
     )
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert report.nearest is not None
@@ -292,6 +293,18 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
     assert names == {"checkpoints", "model.yaml", "report.json", "nearest_law"}
     assert json.loads((tmp_path / "run" / "report.json").read_text()) == report
     assert load_checkpoint(tmp_path / "run" / "checkpoints" / "best.pt").config["seed"] == 0
+
+
+@pytest.mark.usefixtures("by_hand")
+def test_a_law_that_is_not_rejected_is_diagnosed_alone(tmp_path: Path) -> None:
+    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
+    options = DiscoverOptions(page=False, compare=["idm"])
+    report = app.diagnose_table(table, "traffic", model={"term": "lin"}, options=options)
+    laws = report.plain()["laws"]["ranking"]
+    assert laws[0]["name"] == "idm"
+    assert laws[1]["p_value"] > 0.01
+    assert report.diagnosis.model == "lin"
+    assert report.nearest is None
 
 
 @pytest.mark.usefixtures("by_hand")
