@@ -164,6 +164,8 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
             diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws, watch)
     first = diagnoses[0][1].diagnosis
     first.laws, first.laws_again = laws, second_comparison
+    for comparison in filter(None, (laws, second_comparison)):
+        comparison.nearest = nearest.name
     first.seconds = {"reading": job.seconds, "laws": round(seconds, 3), **first.seconds}
     return diagnoses
 

@@ -348,6 +348,8 @@ class Laws:
         effects: that were added to every law to which they apply.
         likelihood: whether laws were compared by their marginal likelihoods, with drivers who
             differ; otherwise by costs of left-out clusters.
+        nearest: the name of the law that was diagnosed as the best one: that of the first, unless
+            the comparison does not reject the requested law.
     """
 
     ranking: list[ComparedLaw]
@@ -355,6 +357,7 @@ class Laws:
     clusters: int
     effects: list[str] = field(default_factory=list)
     likelihood: bool = False
+    nearest: str = ""
 
     @property
     def best(self) -> str:

@@ -290,6 +290,7 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
     assert nearest == report.nearest.plain()
     report = report.plain()
     assert [one["name"] for one in report["laws"]["ranking"]] == ["idm", "lin"]
+    assert report["laws"]["nearest"] == "idm"
     assert names == {"checkpoints", "model.yaml", "report.json", "nearest_law"}
     assert json.loads((tmp_path / "run" / "report.json").read_text()) == report
     assert load_checkpoint(tmp_path / "run" / "checkpoints" / "best.pt").config["seed"] == 0
@@ -300,9 +301,11 @@ def test_a_law_that_is_not_rejected_is_diagnosed_alone(tmp_path: Path) -> None:
     table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
     options = DiscoverOptions(page=False, compare=["idm"])
     report = app.diagnose_table(table, "traffic", model={"term": "lin"}, options=options)
-    laws = report.plain()["laws"]["ranking"]
-    assert laws[0]["name"] == "idm"
-    assert laws[1]["p_value"] > 0.01
+    laws = report.plain()["laws"]
+    assert laws["ranking"][0]["name"] == "idm"
+    assert laws["ranking"][1]["p_value"] > 0.01
+    assert laws["nearest"] == "lin"
+    assert "fits best" not in report.summary()
     assert report.diagnosis.model == "lin"
     assert report.nearest is None
 

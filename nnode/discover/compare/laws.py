@@ -15,6 +15,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import cast
 
@@ -45,6 +46,7 @@ NO_FORMULA = (
     "it is no formula of the positions and speeds of a driver and of the vehicles ahead, and has "
     "no likelihood where drivers differ; diagnose it by itself with discover.compare=[]"
 )
+BLOWS_UP = "it blows up on these data"
 #: Largest number of repetitions with another law's whitening.
 ROUNDS = 3
 
@@ -115,9 +117,13 @@ def _by_likelihood(
     for place, (name, fit) in enumerate(fits.items()):
         within((1 + place / len(fits)) / 2)
         try:
-            values[name], systems[name] = engine.log_likelihoods(fit.system)
+            value, systems[name] = engine.log_likelihoods(fit.system)
         except (SimulationError, np.linalg.LinAlgError):
-            refused[name] = "it blows up on these data"
+            value = np.array([np.nan])
+        if np.isfinite(value).all():
+            values[name] = value
+        else:
+            refused[name] = BLOWS_UP
     if not values:
         return Laws([], refused, 0), {}
     names = sorted(values, key=lambda name: -float(values[name].sum()))
@@ -228,8 +234,9 @@ def explained_by_law(
         p_value = compare(*costs).p_value
     elif follower_formula(nearer.system):
         systems = nearer.system, selection.fit.system
-        with_law, with_effects = (engine.log_likelihoods(system)[0] for system in systems)
-        p_value = better(with_law - with_effects)
+        with suppress(SimulationError, np.linalg.LinAlgError):
+            of_law, of_effects = (engine.log_likelihoods(system)[0] for system in systems)
+            p_value = better(of_law - of_effects)
     if p_value > rules().level:
         return [], p_value
     shared = {effect.name for effect in effects_of(nearer.system)}
@@ -262,7 +269,7 @@ def _calibrated(
             continue
         fit = initial_fit(engine, copy.deepcopy(system).double())
         if fit is None:
-            refused[name] = "it blows up on these data"
+            refused[name] = BLOWS_UP
         else:
             fits[name] = fit
     return fits, refused

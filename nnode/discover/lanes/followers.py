@@ -62,7 +62,7 @@ from nnode.simulation.rhs import side_by_side
 
 #: Smallest standard deviation of errors of positions, m. Paths without measurement errors differ
 #: from the model's by some centimetres, because its zones have ends of finite width and simulators
-#: integrate differently. The table in docs/method.md shows what other values do.
+#: integrate differently. The table in docs/discovery.md shows what other values do.
 ERROR = 0.05
 #: Difference of a curve's scale for derivatives.
 SCALE = 1e-3

@@ -117,8 +117,8 @@ def sentence(diagnosis: Diagnosis) -> str:
 def remarks(diagnosis: Diagnosis) -> list[str]:
     """Remarks on the verdict: a better-fitting law, faults of the measurement."""
     sentences, laws = [], diagnosis.laws_again or diagnosis.laws
-    if laws is not None and laws.best not in ("", diagnosis.model):
-        best = _listed([laws.best, *laws.effects])
+    if laws is not None and laws.nearest not in ("", diagnosis.model):
+        best = _listed([laws.nearest, *laws.effects])
         sentences.append(f"Of the compared laws, {best} fits best.")
     faults = diagnosis.data_faults
     if faults:

@@ -227,8 +227,10 @@ def _laws(d: Diagnosis) -> list[Block]:
     compared = {"laws": d.laws} | ({"laws_again": d.laws_again} if d.laws_again else {})
     latest = d.laws_again or d.laws
     words = f"Best law: {latest.best}. Diagnosed law: {d.model}."
-    if latest.best != d.model and any(law.name == d.model for law in latest.ranking):
+    if latest.nearest != d.model and any(law.name == d.model for law in latest.ranking):
         words += " The folder `nearest_law` contains the diagnosis of the best law."
+    elif latest.best != d.model:
+        words += " The comparison does not reject the diagnosed law."
     refused = [
         f"- not compared: {markdown(name)} ({markdown(reason)})"
         for name, reason in d.laws.refused.items()
