@@ -67,8 +67,8 @@ def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -
 
 
 _ERRORS = {
-    "traffic": "mean square error of whole sequences in exploration clusters that were left out of "
-    "the calibration.",
+    "traffic": "mean square error of whole sequences, with the same parameters for all drivers, in "
+    "exploration clusters that were left out of the calibration.",
     "crowd": "mean square error in the exploration clusters, which were used in the calibration.",
 }
 
@@ -82,8 +82,8 @@ _CRITERIA = {
     ),
     "likelihood": (
         "likelihood below the best (%)",
-        "*Likelihood*: of one measured position, geometric mean, with all parameters of a law "
-        "differing between drivers; the number of parameters has its price (BIC).",
+        "*Likelihood*: of one measured position, geometric mean. All parameters of a law "
+        "may differ between drivers, and the number of parameters is penalised (BIC).",
     ),
 }
 
