@@ -305,20 +305,20 @@ def diagnosed(**case: Any) -> dict[str, Any]:
 def compared(**case: Any) -> dict[str, Any]:
     """The case with the comparison of all laws, of which the case's law should be the first."""
     begun, sequences = time.monotonic(), list(nnode.sequences(platoons(**case)))
-    options, law = model_options(case["law"], "measured"), DiscoverOptions()
-    laws = candidates(options, build_model(options), law)
-    ranking, _ = compare_laws(laws, case["law"], sequences, law)
-    names = [entry.name for entry in ranking.ranking]
-    true = ranking.ranking[names.index(case["law"])]
+    model, options = model_options(case["law"], "measured"), DiscoverOptions()
+    laws = candidates(model, build_model(model), options)
+    p_values = compare_laws(laws, case["law"], sequences, options)[0].p_values
+    first, second, *_ = p_values
+    rejected = p_values[case["law"]] <= options.rules.sure
     return {
         **case,
-        "first": names[0],
-        "second": names[1],
-        "p second": ranking.ranking[1].p_value,
-        "p true": true.p_value,
-        "exact": names[0] == case["law"],
-        "among": true.p_value > 0.01,
-        "false": true.p_value <= 0.01,
+        "first": first,
+        "second": second,
+        "p second": p_values[second],
+        "p true": p_values[case["law"]],
+        "exact": first == case["law"],
+        "among": not rejected,
+        "false": rejected,
         "seconds": round(time.monotonic() - begun, 1),
     }
 

@@ -157,8 +157,7 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
     ]
     if len(diagnoses) > 1 and further:
         last, calibrated_laws = compared(systems, effects + further)
-        p_values = {entry.name: entry.p_value for entry in last.ranking}
-        if p_values.get(nearest.name, 1.0) <= job.options.rules.level:
+        if last.p_values.get(nearest.name, 1.0) <= job.options.rules.level:
             second_comparison, nearest = last, _with_law(job, last.best)
             outcome = _diagnose(nearest, watch, hint=calibrated_laws[last.best])
             diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws, watch)
@@ -172,8 +171,7 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
 
 def _nearest(laws: Laws, job: Job) -> str:
     """The name of the best law; the law of the job, if the comparison does not reject it."""
-    p_values = {law.name: law.p_value for law in laws.ranking}
-    if p_values.get(job.name, 0.0) > job.options.rules.sure:
+    if laws.p_values.get(job.name, 0.0) > job.options.rules.sure:
         return job.name
     return laws.best or job.name
 

@@ -15,7 +15,7 @@ import torch
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover.compare.laws import BetterLaw, explained_by_law
-from nnode.discover.division import SETTLED, Division, divide, without_starts
+from nnode.discover.division import SETTLED, Division, divide, spacing, without_starts
 from nnode.discover.eligibility import check_model, not_offered
 from nnode.discover.judge.confirmation import ConfirmationSet
 from nnode.discover.judge.model_comparison import engine_of
@@ -62,7 +62,7 @@ from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.system import System
 from nnode.population.drivers import EXPLAINED
-from nnode.population.followers import APART, drivers_differ, without_errors
+from nnode.population.followers import drivers_differ, without_errors
 from nnode.population.intervals import variations
 from nnode.progress import Stages
 
@@ -163,11 +163,11 @@ def _diagnosed(
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
     differ = drivers_differ(system, sequences)
-    divided, (sequences, notes) = sequences, _used(system, sequences, differ)
+    used, notes = _used(system, sequences, differ)
     offered, refused = _offered(system, names, differ)
     effects = [effect for effect in offered if not issubclass(effect, IndividualEffect)]
     explore = partial(
-        _explore, system, divided, sequences, options, effects, differ, clock, stages, hint
+        _explore, system, sequences, used, options, effects, differ, clock, stages, hint
     )
     exploration = explore()
     if exploration.simultaneity.together:
@@ -184,8 +184,8 @@ def _diagnosed(
     confirmation = ConfirmationSet(
         engine,
         base_system,
-        [sequences[i] for i in division.exploration],
-        [sequences[i] for i in division.confirmation],
+        [used[i] for i in division.exploration],
+        [used[i] for i in division.confirmation],
         division.label[division.confirmation],
         numbers.sealed,
         options.alpha,
@@ -378,8 +378,8 @@ def _without_imitations(
 
 def _explore(
     system: System,
-    divided: list[Sequence],
     sequences: list[Sequence],
+    used: list[Sequence],
     options: DiscoverOptions,
     effects: list[type[Effect]],
     differ: bool,
@@ -391,15 +391,15 @@ def _explore(
     """Calibrate, locate deviations, and select effects on the exploration sequences.
 
     Args:
-        divided: the sequences by which clusters are divided. sequences: those that are used.
+        sequences: as they are divided into clusters. used: the same, as they are compared.
         differ: whether drivers differ.
         together: simultaneous sequences form one cluster.
     """
     stages.begin("calibrating")
-    division = divide(divided, options, together=together)
-    exploration_sequences = [sequences[i] for i in division.exploration]
+    division = divide(sequences, options, together=together)
+    exploration_sequences = [used[i] for i in division.exploration]
     label = division.label[division.exploration]
-    apart = APART if options.smoothed and without_errors(sequences) else 0.0
+    apart = spacing(used, options)
     engine = engine_of(system, exploration_sequences, label, differ=differ, apart=apart)
     initial = initial_fit(engine, copy.deepcopy(system).double())
     if initial is None:

@@ -12,6 +12,7 @@ from nnode.data.sequence import Sequence
 from nnode.data.split import split
 from nnode.discover.options import DiscoverOptions
 from nnode.errors import DataError
+from nnode.population.followers import APART, without_errors
 
 #: In a law of first order, the speed at the start is that of the law. Vehicles of a simulation
 #: start with another one and need time to adapt, s; at most this share of a sequence. In a table of
@@ -94,6 +95,12 @@ def _drawn(label: np.ndarray, wanted: int, rng: np.random.Generator) -> list[int
         if len(chosen) < wanted and 2 * (size[chosen].sum() + size[candidate]) <= len(label):
             chosen.append(int(candidate))
     return chosen
+
+
+def spacing(sequences: list[Sequence], options: DiscoverOptions) -> float:
+    """The smallest time between positions that are used, s: positions that were smoothed have
+    autocorrelated errors; see :data:`~nnode.population.followers.APART`."""
+    return APART if options.smoothed and without_errors(sequences) else 0.0
 
 
 def without_starts(sequences: list[Sequence]) -> list[Sequence]:

@@ -364,6 +364,11 @@ class Laws:
         """The name of the first; empty if none was compared."""
         return self.ranking[0].name if self.ranking else ""
 
+    @property
+    def p_values(self) -> dict[str, float]:
+        """Of the compared laws, by name."""
+        return {law.name: law.p_value for law in self.ranking}
+
 
 @dataclass
 class Diagnosis:

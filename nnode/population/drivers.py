@@ -151,8 +151,7 @@ def fit_drivers(
             that blow up.
     """
     plain = Followers(system, paths)
-    initial = plain(plain.start, np.zeros((0, 0)), np.zeros((0, 0)))
-    if not np.isfinite(initial.columns).all():
+    if not _simulated_finitely(plain):
         raise ConfigError(
             "drivers who differ: followers behind their measured leaders are not simulated to "
             f"finite positions in steps of {2 * paths.half:g} s; start from other parameters, or "
@@ -175,6 +174,12 @@ def fit_drivers(
     return population
 
 
+def _simulated_finitely(model: Followers) -> bool:
+    """Whether the paths from a model's start parameters, and their derivatives, are finite."""
+    initial = model(model.start, np.zeros((0, 0)), np.zeros((0, 0)))
+    return bool(np.isfinite(initial.columns).all())
+
+
 def with_smaller_errors(population: Population) -> Population:
     """The estimate in which measurement errors may be smaller than was assumed. Errors that are too
     large lengthen the pushes."""
@@ -193,7 +198,7 @@ def fit_all_random(system: System, paths: Paths) -> Population:
         ConfigError: a model without a formula. SimulationError: its simulation diverges.
     """
     plain = Followers(system, paths)
-    if not np.isfinite(plain(plain.start, np.zeros((0, 0)), np.zeros((0, 0))).columns).all():
+    if not _simulated_finitely(plain):
         raise SimulationError("the followers' paths diverge")
     model = Followers(system, paths, plain.may_differ)
     return _estimated(model, model.start, initial_variances(model), steps=RANKING_STEPS)

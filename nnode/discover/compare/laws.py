@@ -24,7 +24,7 @@ import numpy as np
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import better
 from nnode.data.sequence import Domain, Sequence
-from nnode.discover.division import divide, without_starts
+from nnode.discover.division import divide, spacing, without_starts
 from nnode.discover.eligibility import check_model, not_offered
 from nnode.discover.judge.model_comparison import engine_of, windows_of
 from nnode.discover.lanes.followers import FollowersEngine
@@ -39,7 +39,7 @@ from nnode.errors import ConfigError, SimulationError
 from nnode.model.effects import CATALOGUE, Effect
 from nnode.model.extend import effects_of, extended
 from nnode.model.system import System
-from nnode.population.followers import APART, drivers_differ, follower_formula, without_errors
+from nnode.population.followers import drivers_differ, follower_formula, without_errors
 
 #: Why a law is not compared where drivers may differ.
 NO_FORMULA = (
@@ -94,62 +94,87 @@ def compare_laws(
     if asked.domain == "crowd":  # its residuals are not positions
         errors = {key: square_of(whole, fit.system) for key, fit in fits.items()}
     if differ:
-        apart = APART if options.smoothed and exact else 0.0
-        engine = FollowersEngine(exploration, label, apart=apart)
-        return _by_likelihood(engine, fits, errors, refused, within)
-    return _by_cost(windows_of(asked, exploration, label), fits, errors, refused, within)
+        engine = FollowersEngine(exploration, label, apart=spacing(sequences, options))
+        compared = _by_likelihood(engine, fits, refused, within)
+    else:
+        compared = _by_cost(windows_of(asked, exploration, label), fits, errors, within)
+    ranking = [
+        ComparedLaw(
+            name=key,
+            parameters=len(fits[key].row),
+            error=errors[key],
+            behind=behind,
+            p_value=p_value,
+            values={
+                n: (float(v), unit) for n, (v, unit) in compared.systems[key].physical().items()
+            },
+        )
+        for key, (behind, p_value) in compared.ranks.items()
+    ]
+    return Laws(ranking, refused, compared.clusters, likelihood=differ), compared.systems
+
+
+@dataclass(frozen=True)
+class _Ranks:
+    """Laws by their likelihoods or costs.
+
+    Attributes:
+        ranks: by name, ``behind`` and ``p_value`` of a
+            :class:`~nnode.discover.result.ComparedLaw`, the best law first.
+        systems: the laws, calibrated. clusters: their number.
+    """
+
+    ranks: dict[str, tuple[float, float]]
+    systems: dict[str, System]
+    clusters: int
 
 
 def _by_likelihood(
     engine: FollowersEngine,
     fits: Mapping[str, Fit],
-    errors: Mapping[str, float],
     refused: dict[str, str],
     within: Callable[[float], None],
-) -> tuple[Laws, dict[str, System]]:
+) -> _Ranks:
     """Rank laws by their marginal likelihoods.
 
     Args:
-        fits: laws, calibrated. errors: see :class:`~nnode.discover.result.ComparedLaw`.
-        refused: is completed.
+        fits: laws, calibrated. refused: laws whose paths diverge are added.
     """
     values, systems = dict[str, np.ndarray](), dict[str, System]()
     for place, (name, fit) in enumerate(fits.items()):
         within((1 + place / len(fits)) / 2)
         try:
-            value, systems[name] = engine.log_likelihoods(fit.system)
+            value, system = engine.log_likelihoods(fit.system)
         except (SimulationError, np.linalg.LinAlgError):
             value = np.array([np.nan])
         if np.isfinite(value).all():
-            values[name] = value
+            values[name], systems[name] = value, system
         else:
             refused[name] = BLOWS_UP
-    if not values:
-        return Laws([], refused, 0), {}
     names = sorted(values, key=lambda name: -float(values[name].sum()))
-    best, samples = values[names[0]], len(engine.cluster)
-    ranking = [
-        ComparedLaw(
-            name=name,
-            parameters=len(fits[name].row),
-            error=errors[name],
-            behind=math.expm1((best.sum() - values[name].sum()) / samples),
-            p_value=1.0 if name == names[0] else better(best - values[name]),
-            values=_parameters(systems[name]),
+    best = values[names[0]] if names else np.zeros(0)
+    ranks = {
+        name: (
+            math.expm1((best.sum() - values[name].sum()) / len(engine.cluster)),
+            1.0 if name == names[0] else better(best - values[name]),
         )
         for name in names
-    ]
-    return Laws(ranking, refused, len(best), likelihood=True), systems
+    }
+    return _Ranks(ranks, systems, len(best))
 
 
 def _by_cost(
     engine: Engine,
     fits: dict[str, Fit],
     errors: Mapping[str, float],
-    refused: dict[str, str],
     within: Callable[[float], None],
-) -> tuple[Laws, dict[str, System]]:
-    """Rank laws by their costs of left-out clusters; arguments as in :func:`_by_likelihood`."""
+) -> _Ranks:
+    """Rank laws by their costs of left-out clusters.
+
+    Args:
+        fits: laws, calibrated; they are replaced. errors: of positions; the whitening is first
+            fitted to the law with the smallest one.
+    """
     reference = min(errors, key=lambda name: errors[name])
     costs: dict[str, np.ndarray] = {}
     for _ in range(ROUNDS):
@@ -162,24 +187,15 @@ def _by_cost(
         if best == reference:
             break
         reference = best
-    ranking = [
-        ComparedLaw(
-            name=name,
-            parameters=len(fits[name].row),
-            error=errors[name],
-            behind=math.exp(_level(costs[name]) - _level(costs[best])) - 1,
-            p_value=1.0 if name == best else compare(costs[name], costs[best]).p_value,
-            values=_parameters(fits[name].system),
+    ranks = {
+        name: (
+            math.exp(_level(costs[name]) - _level(costs[best])) - 1,
+            1.0 if name == best else compare(costs[name], costs[best]).p_value,
         )
         for name in sorted(costs, key=lambda name: _level(costs[name]))
-    ]
+    }
     systems = {name: fit.system for name, fit in fits.items()}
-    return Laws(ranking, refused, int(engine.cluster.max()) + 1), systems
-
-
-def _parameters(system: System) -> dict[str, tuple[float, str]]:
-    """Parameter to value and unit."""
-    return {name: (float(value), unit) for name, (value, unit) in system.physical().items()}
+    return _Ranks(ranks, systems, int(engine.cluster.max()) + 1)
 
 
 def with_effects(laws: Mapping[str, System], effects: list[Effect]) -> dict[str, System]:

@@ -76,7 +76,8 @@ class _Run:
         system: the model, with the run's parameters. model: its followers.
         parameters: ``(P, F)`` parameters of each follower.
         states: ``(K, M, F)``.
-        step, after: the linear response, see :meth:`Followers.linear`.
+        rates: ``(M, K, F)`` of its states. step, after: the linear response, see
+            :meth:`Followers.linear`.
         weight: ``(n,)`` of the residuals: less than 1 for large ones.
     """
 
@@ -84,6 +85,7 @@ class _Run:
     model: Followers
     parameters: np.ndarray
     states: np.ndarray
+    rates: np.ndarray
     step: np.ndarray
     after: np.ndarray
     weight: Tensor
@@ -183,11 +185,10 @@ class FollowersEngine(TrafficEngine):
         if effect.remembers():
             changed, amount = with_all_strengths(run.system, effect, probe)
             return self._residual_changes(run, self._displacement(run, changed)[..., None] / amount)
-        base = run.model.rates(run.parameters, run.states)
         for changed, size in with_each_strength(run.system, effect, probe):
             model = self._model(changed, ParameterVector(changed).row)
             parameters = model.spread(model.start, self._deviations(model)[0])
-            changes.append((model.rates(parameters, run.states) - base) / size)
+            changes.append((model.rates(parameters, run.states) - run.rates) / size)
         return self._residual_changes(run, self._propagate(run, np.stack(changes, 2)))
 
     def response(
@@ -200,7 +201,7 @@ class FollowersEngine(TrafficEngine):
         """
         run = self._run_of(system, row)
         paths, (k, _, f) = run.model.paths, run.states.shape
-        speed = run.model.rates(run.parameters, run.states)[0]
+        speed = run.rates[0]
         time = torch.arange(k, dtype=torch.float64).repeat_interleave(f) * paths.dt
         scene = side_by_side(self._scene(run.model), k, at_samples=True)
         state = _state_of(run.model, time, run.states[:, 0], speed, paths.ahead_at_samples, scene)
@@ -224,7 +225,7 @@ class FollowersEngine(TrafficEngine):
         else:
             fixed = with_parameters(system, row)
         row = ParameterVector(fixed).row
-        paths, previous = self._paths(self._longest(fixed, row[None])), self.population
+        paths, previous = self._paths_for(fixed, row), self.population
         start = previous
         if start is None and self._like is not None:
             start = self._like.population
@@ -256,7 +257,7 @@ class FollowersEngine(TrafficEngine):
         Raises:
             SimulationError: its simulation diverges.
         """
-        paths = self._paths(self._longest(system, ParameterVector(system).row[None]))
+        paths = self._paths_for(system, ParameterVector(system).row)
         population = fit_all_random(system, paths)
         cluster = np.zeros(len(paths.names), dtype=int)
         cluster[paths.agent] = self._label[paths.sequence]
@@ -270,7 +271,7 @@ class FollowersEngine(TrafficEngine):
         differ between drivers as random effects. The variances of a model that lacks a strong
         effect attribute it to pushes, and would hide where it acts."""
         row = ParameterVector(system).row
-        paths = self._paths(self._longest(system, row[None]))
+        paths = self._paths_for(system, row)
         model = Followers(system, paths, Followers(system, paths).may_differ)
         variances = initial_variances(model)
         deviations = fit_deviations(model, PushNoise(), model.start, variances)
@@ -307,9 +308,7 @@ class FollowersEngine(TrafficEngine):
         """The last estimate, with the deviations of drivers and starts under a model."""
         assert self.population is not None
         fixed = with_parameters(system, row)
-        return refit(
-            self.population, fixed, self._paths(self._longest(fixed, row[None])), fixed=True
-        )
+        return refit(self.population, fixed, self._paths_for(fixed, row), fixed=True)
 
     # -- parts -----------------------------------------------------------------------------------
 
@@ -325,9 +324,13 @@ class FollowersEngine(TrafficEngine):
             self._paths_by_step[key] = replace(paths, agent=agent.reshape(-1), names=names)
         return self._paths_by_step[key]
 
+    def _paths_for(self, system: System, row: Tensor) -> Paths:
+        """The followers, for simulations of a model with these parameters."""
+        return self._paths(self._longest(system, row[None]))
+
     def _model(self, system: System, row: Tensor) -> Followers:
         random = [] if self.population is None else self.population.random
-        paths = self._paths(self._longest(system, row[None]))
+        paths = self._paths_for(system, row)
         model = Followers(system, paths)
         if set(random) <= set(model.names):
             model.random = np.array([model.names.index(name) for name in random], dtype=int)
@@ -421,7 +424,8 @@ class FollowersEngine(TrafficEngine):
         )
         step, after = model.linear(parameters, states[:, :, 0])
         weight = weights_of(self._whitened(difference.transpose(2, 1, 0))[0], self.large)
-        run = _Run(fixed, model, parameters, states[:, :, 0], step, after, weight)
+        rates = model.rates(parameters, states[:, :, 0])
+        run = _Run(fixed, model, parameters, states[:, :, 0], rates, step, after, weight)
         self._last_run = system, row.clone(), run
         return run
 
