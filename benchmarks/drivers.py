@@ -23,6 +23,7 @@ import nnode
 from benchmarks.discovery.run import sources
 from nnode.app.nearest_law import candidates
 from nnode.app.python.inputs import model_options
+from nnode.discover import thresholds
 from nnode.discover.compare.laws import compare_laws
 from nnode.discover.options import DiscoverOptions
 from nnode.files import write_text
@@ -309,7 +310,7 @@ def compared(**case: Any) -> dict[str, Any]:
     laws = candidates(model, build_model(model), options)
     p_values = compare_laws(laws, case["law"], sequences, options)[0].p_values
     first, second, *_ = p_values
-    rejected = p_values[case["law"]] <= options.rules.sure
+    rejected = p_values[case["law"]] <= thresholds.STRICT
     return {
         **case,
         "first": first,

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest import mock
 
 import pandas as pd
 
@@ -80,7 +81,7 @@ def evaluate(
     case: dict[str, Any],
     baselines: bool = False,
     structure: bool = True,
-    rules: dict[str, float] | None = None,
+    changed: dict[str, float] | None = None,
     fresh: int = 0,
 ) -> dict[str, Any]:
     """The score of one diagnosis, and its time. The truth stays outside the diagnosed folder.
@@ -89,15 +90,15 @@ def evaluate(
         case: of :class:`benchmarks.synthetic_cases.Case`, as plain JSON.
         baselines: scores of the baselines as well, by name.
         structure: as in the options of the diagnosis.
-        rules: options that differ from those of :class:`~nnode.discover.rules.Rules`.
+        changed: other values of :mod:`nnode.discover.thresholds`, by name.
         fresh: number of further sequences on which the named effects are tested.
     """
     # imported here: all workers read this file, and tests replace the diagnosis
     from benchmarks.discovery.baselines import baselines_on_table
     from benchmarks.discovery.fresh import kept_back, on_fresh
     from nnode.app import discover
+    from nnode.discover import thresholds
     from nnode.discover.options import DiscoverOptions
-    from nnode.discover.rules import Rules
     from nnode.model.effects import CATALOGUE
 
     what = Case.from_dict(case)
@@ -117,13 +118,12 @@ def evaluate(
         }
         table = Path(given) / TABLE
         back = kept_back(table, fresh)
-        options = DiscoverOptions(
-            page=False, replay=False, structure=structure, compare=[], rules=Rules(**(rules or {}))
-        )
+        options = DiscoverOptions(page=False, replay=False, structure=structure, compare=[])
         start = time.monotonic()
         extra: dict[str, Any] = {"failure": "", "baselines": {}}
         try:
-            found = discover.diagnose_table(table, what.domain, **known, options=options)
+            with mock.patch.dict(vars(thresholds), changed or {}):
+                found = discover.diagnose_table(table, what.domain, **known, options=options)
         except NNodeError as error:
             extra["failure"] = f"{type(error).__name__}: {error}"
             report: dict[str, Any] = {"verdict": ERROR, "effects": []}

@@ -15,6 +15,7 @@ from typing import Any
 
 from nnode.app.python.inputs import MODELS, model_options
 from nnode.app.training import set_threads
+from nnode.discover import thresholds
 from nnode.discover.compare.laws import BetterLaw, compare_laws, with_effects
 from nnode.discover.diagnose import STAGES, diagnose
 from nnode.discover.inputs import Inputs
@@ -157,7 +158,7 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
     ]
     if len(diagnoses) > 1 and further:
         last, calibrated_laws = compared(systems, effects + further)
-        if last.p_values.get(nearest.name, 1.0) <= job.options.rules.level:
+        if last.p_values.get(nearest.name, 1.0) <= thresholds.LEVEL:
             second_comparison, nearest = last, _with_law(job, last.best)
             outcome = _diagnose(nearest, watch, hint=calibrated_laws[last.best])
             diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws, watch)
@@ -171,7 +172,7 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
 
 def _nearest(laws: Laws, job: Job) -> str:
     """The name of the best law; the law of the job, if the comparison does not reject it."""
-    if laws.p_values.get(job.name, 0.0) > job.options.rules.sure:
+    if laws.p_values.get(job.name, 0.0) > thresholds.STRICT:
         return job.name
     return laws.best or job.name
 

@@ -24,7 +24,7 @@ from collections.abc import Sequence as ListLike
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from nnode.data.sequence import Sequence
@@ -203,3 +203,15 @@ def least_number(alpha: float, *, hypotheses: int = 1, sided: int = 2) -> int:
     """How many clusters sign flips need so that one of several hypotheses can reach a level,
     whatever the others do: sided · hypotheses · 2^-G is at most ``alpha``."""
     return max(1, math.ceil(math.log2(sided * hypotheses / alpha) - 1e-9))
+
+
+def group_sums(
+    values: np.ndarray, label: np.ndarray, weight: np.ndarray | None = None
+) -> np.ndarray:
+    """``(G, ...)`` sums of ``values`` ``(n, ...)`` over the rows of each label 0 ... G - 1, each
+    times its ``weight`` ``(n,)``."""
+    number, count = int(label.max()) + 1, len(label)
+    weight = np.ones(count) if weight is None else weight
+    member = csr_array((weight, (label, np.arange(count))), (number, count))
+    totals: np.ndarray = member @ values.reshape(count, -1)
+    return totals.reshape(number, *values.shape[1:])

@@ -14,6 +14,7 @@ import torch
 
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
+from nnode.discover import thresholds
 from nnode.discover.compare.laws import BetterLaw, explained_by_law
 from nnode.discover.division import SETTLED, Division, divide, spacing, without_starts
 from nnode.discover.eligibility import check_model, not_offered
@@ -53,7 +54,6 @@ from nnode.discover.result import (
     Variation,
     Verdict,
 )
-from nnode.discover.rules import applied, rules
 from nnode.discover.statistics.combination import least_confirmation
 from nnode.discover.statistics.power import PowerSimulation
 from nnode.discover.statistics.random_effects import IndividualEstimate, estimate_individual
@@ -145,18 +145,6 @@ def diagnose(
         DataError: too few sequences.
         SimulationError: the model cannot be simulated on these data at all.
     """
-    with applied(options.rules):
-        return _diagnosed(system, sequences, options, stages, nearer, hint)
-
-
-def _diagnosed(
-    system: System,
-    sequences: list[Sequence],
-    options: DiscoverOptions,
-    stages: Stages | None,
-    nearer: BetterLaw | None,
-    hint: System | None,
-) -> DiagnosisOutcome:
     domain = cast(Domain, system.domain)
     names = check_options(options, domain, system.order)
     check_model(system)
@@ -289,8 +277,8 @@ def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves
     engine, remaining = exploration.engine, exploration.base_curves
     if selection.fit is not exploration.base:
         remaining = curves(engine, selection.fit, exploration.variables)
-        remaining = significant_curves(engine, selection.fit, remaining, rules().sure)
-    return [curve for curve in remaining if curve.removed > rules().least]
+        remaining = significant_curves(engine, selection.fit, remaining, thresholds.STRICT)
+    return [curve for curve in remaining if curve.removed > thresholds.SMALLEST_SHARE]
 
 
 def _used(
@@ -427,7 +415,9 @@ def _explore(
     clock.lap("calibrate")
     stages.begin("locating")
     variables = engine.variables() if options.structure else []
-    base_curves = significant_curves(engine, base, curves(engine, base, variables), rules().sure)
+    base_curves = significant_curves(
+        engine, base, curves(engine, base, variables), thresholds.STRICT
+    )
     located = places(base_curves, _excess(engine, base))
     clock.lap("locate")
     stages.begin("naming")
@@ -535,7 +525,8 @@ def _verdict(
     if not testable:
         return "not_testable"
     if selection.steps:
-        if unexplained and unexplained[0].removed * (1 - removed) > rules().too_much * removed:
+        largest = max((curve.removed for curve in unexplained[:1]), default=0.0)
+        if largest * (1 - removed) > thresholds.UNEXPLAINED * removed:
             return "unknown"
         return "indistinguishable" if any(step.rivals for step in selection.steps) else "named"
     if individuals_named:

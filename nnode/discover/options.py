@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 
 from nnode.data.sequence import Domain
 from nnode.discover.eligibility import check_effect
-from nnode.discover.rules import Rules
 from nnode.errors import ConfigError
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.own import VARIABLE
@@ -37,7 +36,6 @@ class DiscoverOptions:
     step: float | None = None  # s, of the simulations that maps show; null takes the domain's
     page: bool = True  # report.html with figures, and figures in TensorBoard
     replay: bool = True  # sealed sequences in a player on the page
-    rules: Rules = field(default_factory=Rules)  # levels and shares; their reasons stand there
 
 
 def check_options(options: DiscoverOptions, domain: Domain, order: int = 1) -> list[str]:
@@ -56,12 +54,6 @@ def check_options(options: DiscoverOptions, domain: Domain, order: int = 1) -> l
     for name, value in (("sealed", options.sealed), ("alpha", options.alpha)):
         if not 0 < value < 1:
             raise ConfigError(f"discover.{name}={value} must lie between 0 and 1")
-    for rule in fields(Rules):
-        value, upper = getattr(options.rules, rule.name), math.inf if rule.name == "prior" else 1.0
-        if not 0 < value < upper:
-            raise ConfigError(
-                f"discover.rules.{rule.name}={value} must lie above 0 and below {upper:g}"
-            )
     if options.max_effects < 0:
         raise ConfigError(f"discover.max_effects={options.max_effects} must be at least 0")
     if options.step is not None and not (math.isfinite(options.step) and options.step > 0):

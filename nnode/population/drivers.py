@@ -400,7 +400,7 @@ def _linearised_loglik(best: Population, name: str) -> float:
     """The log marginal likelihood with one more random effect, at the present linearisation."""
     model, previous = best.model, best.estimate
     random = [*model.random, model.names.index(name)]
-    data = replace(previous.data, random=previous.data.fixed[..., random])
+    data = replace(previous.data, random=np.array(random))
     return _refitted(best, data, _with_random_effect(previous.variances))[0]
 
 

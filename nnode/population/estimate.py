@@ -22,7 +22,14 @@ import numpy as np
 from scipy import stats
 from scipy.optimize import minimize
 
-from nnode.population.likelihood import Linearised, Marginal, Noise, Products, marginal
+from nnode.population.likelihood import (
+    Linearised,
+    Marginal,
+    Noise,
+    Products,
+    log_likelihood,
+    marginal,
+)
 
 #: Difference of logarithms of standard deviations for derivatives.
 DIFFERENCE = 1e-6
@@ -148,7 +155,7 @@ def estimate(
     data = response(theta, empty if agents is None else agents, empty if start is None else start)
     converged, stalled, n_linearisations = False, False, 1
     n_agents = int(data.agent.max()) + 1
-    agents = np.zeros((n_agents, data.random.shape[-1])) if agents is None else agents
+    agents = np.zeros((n_agents, len(data.random))) if agents is None else agents
     start = np.zeros(data.start.shape[::2]) if start is None else start
     relaxation, previous_change = 1.0, np.zeros(len(theta))
     best, logliks = (theta, agents, start, data, variances), list[float]()
@@ -283,37 +290,39 @@ def fit_variances(
     if not len(free):
         return variances
 
-    def likelihoods(row: np.ndarray) -> tuple[Marginal, list[Marginal]]:
-        """The likelihood, and those with each standard deviation increased slightly."""
-        products: dict[tuple[float, ...], Products] = {}  # most share the same noise
-
-        def likelihood(row: np.ndarray) -> Marginal:
-            log_row = logs_all.copy()
-            log_row[free] = row
-            trial = variances.filled(np.exp(log_row))
-            key = tuple(trial.noise)
-            if key not in products:
-                products[key] = noise.products(data, trial.noise)
-            return marginal(
-                data,
-                products[key],
-                trial.spread,
-                trial.start,
-                low=low,
-                high=high,
-                restricted=restricted,
+    def likelihood(row: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """The log likelihood, its slope by ``row``, and the agents' scores ``(len(row), D)``. The
+        change of the parameters maximises it, so that derivatives may keep the change fixed."""
+        log_row = logs_all.copy()
+        log_row[free] = row
+        trial = variances.filled(np.exp(log_row))
+        deviations = trial.spread, trial.start
+        products = noise.products(data, trial.noise)
+        centre = marginal(data, products, *deviations, low=low, high=high, restricted=restricted)
+        by_noise, slope_by_noise = np.zeros((len(trial.noise), len(centre.each))), []
+        for place, value in enumerate(trial.noise):
+            if place not in free:
+                slope_by_noise.append(0.0)
+                continue
+            shifted = trial.noise.copy()
+            shifted[place] = value * np.exp(DIFFERENCE)
+            products = noise.products(data, shifted)
+            loglik, each = log_likelihood(
+                data, products, *deviations, centre.change, restricted=restricted
             )
+            by_noise[place] = (each - centre.each) / DIFFERENCE
+            slope_by_noise.append((loglik - centre.loglik) / DIFFERENCE)
+        scores = np.concatenate([by_noise, centre.by_spread.T, centre.by_start.T])
+        slope = scores.sum(1)
+        slope[: len(slope_by_noise)] = slope_by_noise
+        return centre.loglik, slope[free], scores[free]
 
-        return likelihood(row), [likelihood(row + step) for step in DIFFERENCE * np.eye(len(row))]
-
-    centre, sides = likelihoods(logs_all[free])
-    scores = np.stack([(up.each - centre.each) / DIFFERENCE for up in sides])
+    loglik, _, scores = likelihood(logs_all[free])
     scale = 1 / np.sqrt(np.maximum((scores**2).sum(1), 1.0))
 
     def value(scaled: np.ndarray) -> tuple[float, np.ndarray]:
-        centre, sides = likelihoods(scaled * scale)
-        slope = np.array([up.loglik - centre.loglik for up in sides]) / DIFFERENCE
-        return -centre.loglik, -slope * scale
+        loglik, slope, _ = likelihood(scaled * scale)
+        return -loglik, -slope * scale
 
     lowest, highest = np.log(variances.low[free]) / scale, np.log(variances.high[free]) / scale
     best = minimize(
@@ -322,7 +331,7 @@ def fit_variances(
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(lowest, highest, strict=True)),
-        options={"ftol": tolerance / max(abs(centre.loglik), 1.0), "gtol": tolerance},
+        options={"ftol": tolerance / max(abs(loglik), 1.0), "gtol": tolerance},
     )
     logs_all[free] = best.x * scale
     return variances.filled(np.exp(logs_all))

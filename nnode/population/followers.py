@@ -433,10 +433,10 @@ class Followers:
         paths, order, n_parameters = self.paths, self.lane.order, len(theta)
         columns, states = self.columns(theta, agents, start, self.starts)
         fixed, by_start = columns[..., :n_parameters], columns[..., n_parameters:]
-        random = fixed[..., self.random]
         residual = paths.x - states[:, 0].T
         if agents.size:
-            residual = residual + np.einsum("fkq,fq->fk", random, agents[paths.agent])
+            by_deviation = fixed[..., self.random]
+            residual = residual + np.einsum("fkq,fq->fk", by_deviation, agents[paths.agent])
         if start.size:
             residual = residual + np.einsum("fkh,fh->fk", by_start, start)
         transition, by_forcing = self.linear(self.spread(theta, agents), states)
@@ -444,7 +444,7 @@ class Followers:
         return Linearised(
             residual=residual,
             fixed=fixed,
-            random=random,
+            random=self.random,
             start=by_start,
             observed=paths.observed,
             agent=paths.agent,

@@ -27,6 +27,8 @@ import numpy as np
 from numba import njit
 from scipy.optimize import lsq_linear
 
+from nnode.data.clusters import group_sums
+
 #: Share of the largest eigenvalue of the scaled information below which a direction is flat.
 FLAT = 1e-10
 #: Parameters of :class:`PushNoise`: standard deviations of pushes (m/s or m/s²), of white errors of
@@ -41,7 +43,7 @@ class Linearised:
     Attributes:
         residual: ``(S, K)`` w of the module's text.
         fixed: ``(S, K, P)`` X, by parameters.
-        random: ``(S, K, Q)`` Z, by the agent's deviations.
+        random: ``(Q,)`` numbers of the parameters that differ between agents; Z are their columns.
         start: ``(S, K, H)`` by the deviations of the segment's start; H may be 0.
         observed: ``(S, K)`` True where there is a sample.
         agent: ``(S,)`` number of the segment's agent, from 0.
@@ -61,11 +63,22 @@ class Linearised:
     forced: np.ndarray | None = None
     dt: float = 1.0
 
+    @property
+    def by_deviation(self) -> np.ndarray:
+        """``(S, K, Q)`` Z, by the agent's deviations."""
+        return self.fixed[..., self.random]
+
     @cached_property
     def columns(self) -> np.ndarray:
-        """``(S, K, 1 + P + Q + H)`` w, X, Z and H; 0 where there is no sample."""
-        blocks = [self.residual[..., None], self.fixed, self.random, self.start]
+        """``(S, K, 1 + P + H)`` w, X and H; 0 where there is no sample."""
+        blocks = [self.residual[..., None], self.fixed, self.start]
         return np.where(self.observed[..., None], np.concatenate(blocks, -1), 0.0)
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """``(1 + P + Q + H,)`` places of w, X, Z and H in :attr:`columns`."""
+        n = 1 + self.fixed.shape[-1]
+        return np.concatenate([np.arange(n), 1 + self.random, np.arange(n, self.columns.shape[-1])])
 
 
 @dataclass(frozen=True)
@@ -96,26 +109,24 @@ class Products:
         logdet = 2 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
         return Products(reduced_gram, self.logdet + logdet)
 
-    def factors(self, deviations: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """``(S, Q)`` posterior means of the last columns' coefficients, and their variances.
+    def posterior(self, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The distribution of the last columns' coefficients, given the sum of the other columns.
 
         Args:
             deviations: ``(Q,)`` their prior standard deviations.
-            weights: ``(S, C - Q)`` weights of the other columns, whose sum is the response.
+
+        Returns:
+            ``(S, Q, C - Q)`` derivatives of their means by the weights of the other columns in this
+            sum, and ``(S, Q, Q)`` their covariance.
         """
         root, moved = self._inner(deviations)
         inverse = np.linalg.inv(root)
         scaled = deviations[:, None] * (inverse.transpose(0, 2, 1) @ inverse)
-        return (
-            np.einsum("sqp,spc,sc->sq", scaled, moved, weights),
-            np.einsum("sqq,q->sq", scaled, deviations),
-        )
+        return scaled @ moved, scaled * deviations
 
-    def summed(self, group: np.ndarray, number: int) -> Products:
+    def summed(self, group: np.ndarray) -> Products:
         """The products of groups of segments."""
-        gram = np.zeros((number, *self.gram.shape[1:]))
-        np.add.at(gram, group, self.gram)
-        return Products(gram, np.bincount(group, self.logdet, number))
+        return Products(group_sums(self.gram, group), np.bincount(group, self.logdet))
 
     def _inner(self, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The Cholesky factor of 1 + D Z'Z D, and D times the products with the other columns."""
@@ -129,14 +140,15 @@ class Noise(Protocol):
     """The residual covariance of a segment."""
 
     def products(self, data: Linearised, values: np.ndarray) -> Products:
-        """Products of the columns, whitened.
+        """Products of w, X, Z and H, whitened.
 
         Args:
             values: positive values of its parameters.
         """
         white, logdet = self.whitened(data, data.columns, values)
         with np.errstate(over="ignore", invalid="ignore"):  # trial parameters may blow up
-            return Products(white.transpose(0, 2, 1) @ white, logdet)
+            gram = white.transpose(0, 2, 1) @ white
+        return Products(gram[:, data.order][:, :, data.order], logdet)
 
     def whitened(
         self, data: Linearised, columns: np.ndarray, values: np.ndarray
@@ -351,7 +363,7 @@ class Whitening:
         segment = np.arange(len(data.agent))
         for column, deviation, group in (
             (data.start, start, segment),
-            (data.random, spread, data.agent),
+            (data.by_deviation, spread, data.agent),
         ):
             if column.shape[-1]:
                 self._add(self(column) * deviation, group)
@@ -361,15 +373,13 @@ class Whitening:
         observed = self._data.observed[..., None]
         white, _ = self._noise.whitened(self._data, np.where(observed, columns, 0.0), self._values)
         for column, inner, group in self._parts:
-            products = np.zeros((len(inner), column.shape[-1], columns.shape[-1]))
-            np.add.at(products, group, column.transpose(0, 2, 1) @ white)
+            products = group_sums(column.transpose(0, 2, 1) @ white, group)
             white = white - column @ (inner @ products)[group]
         return white
 
     def _add(self, column: np.ndarray, group: np.ndarray) -> None:
         """Add random effects of variance 1 with columns ``(S, K, Q)``, in groups of segments."""
-        gram = np.zeros((int(group.max()) + 1, *[column.shape[-1]] * 2))
-        np.add.at(gram, group, column.transpose(0, 2, 1) @ column)
+        gram = group_sums(column.transpose(0, 2, 1) @ column, group)
         values, vectors = np.linalg.eigh(gram)
         # (1 + B B')^(-1/2) = 1 - B M B', M of the eigenvalues s of B'B: (1 - (1 + s)^(-1/2)) / s
         root = np.sqrt(1 + np.maximum(values, 0.0))
@@ -384,6 +394,9 @@ class Marginal:
     Attributes:
         loglik: log likelihood, or the restricted one if requested.
         each: ``(D,)`` the agents' terms of it, without the REML term.
+        by_spread: ``(D, Q)`` derivatives of the log likelihood by the logarithms of the standard
+            deviations of the agents' deviations; they are sums over agents.
+        by_start: ``(D, H)`` the same of the starts' deviations.
         change: ``(P,)`` change of the parameters, by generalised least squares.
         information: ``(P, P)`` X' V^-1 X.
         agents: ``(D, 1 + P, 1 + P)`` products of w and X by V^-1, of the agents.
@@ -395,6 +408,8 @@ class Marginal:
 
     loglik: float
     each: np.ndarray
+    by_spread: np.ndarray
+    by_start: np.ndarray
     change: np.ndarray
     information: np.ndarray
     agents: np.ndarray
@@ -430,36 +445,86 @@ def marginal(
         low, high: ``(P,)`` bounds of the change of the parameters.
         restricted: whether to use the restricted likelihood (REML).
     """
-    number = int(data.agent.max()) + 1
-    without_start = segments.without(start)
-    agents = without_start.summed(data.agent, number)
+    agents = segments.without(start).summed(data.agent)
     without_agents = agents.without(spread)
     total = without_agents.gram.sum(0)
     information, score = total[1:, 1:], total[1:, 0]
     change = flat_solve(information, score)
     if low is not None and high is not None and ((change < low) | (change > high)).any():
         change = _bounded_solve(information, score, low, high)
+    loglik, each = _log_likelihood(data, without_agents, change, restricted)
     weights = np.concatenate([[1.0], -change])
-    square = np.einsum("i,dij,j->d", weights, without_agents.gram, weights)
-    observed = np.bincount(data.agent, data.observed.sum(1), number)
-    each = -0.5 * (without_agents.logdet + square + observed * np.log(2 * np.pi))
-    loglik = float(each.sum())
-    if restricted and len(change):
-        loglik += 0.5 * (len(change) * np.log(2 * np.pi) - np.linalg.slogdet(information)[1])
-    b, posterior_variances = agents.factors(spread, np.tile(weights, (number, 1)))
-    all_weights = np.concatenate([np.tile(weights, (len(data.agent), 1)), -b[data.agent]], 1)
-    h, _ = segments.factors(start, all_weights)
+    by_weights, covariance = agents.posterior(spread)
+    by_all_weights, start_covariance = segments.posterior(start)
+    # means of the starts' deviations depend on w, X and the agents' deviations
+    by_agents = by_all_weights[..., len(weights) :]
+    by_start_weights = by_all_weights[..., : len(weights)] - by_agents @ by_weights[data.agent]
+    start_covariance = start_covariance + _moved(by_agents, covariance[data.agent])
+    b, h = by_weights @ weights, by_start_weights @ weights
+    uncertain = np.zeros_like(information)
+    if restricted:
+        uncertain = np.linalg.pinv(information, rcond=FLAT, hermitian=True)
+    second = b**2 + _diagonal(covariance + _moved(by_weights[..., 1:], uncertain))
+    start_second = h**2 + _diagonal(start_covariance + _moved(by_start_weights[..., 1:], uncertain))
+    variances = _diagonal(covariance)
     return Marginal(
         loglik=loglik,
         each=each,
+        by_spread=second / spread**2 - 1,
+        by_start=group_sums(start_second / start**2 - 1, data.agent),
         change=change,
         information=information,
         agents=without_agents.gram,
         deviations=b,
-        variances=posterior_variances,
-        shrinkage=posterior_variances / spread**2,
+        variances=variances,
+        shrinkage=variances / spread**2,
         start=h,
     )
+
+
+def log_likelihood(
+    data: Linearised,
+    segments: Products,
+    spread: np.ndarray,
+    start: np.ndarray,
+    change: np.ndarray,
+    *,
+    restricted: bool = False,
+) -> tuple[float, np.ndarray]:
+    """The log likelihood and the agents' terms of it, for a given change of the parameters.
+
+    Args:
+        data, segments, spread, start, restricted: see :func:`marginal`.
+        change: ``(P,)``.
+    """
+    agents = segments.without(start).summed(data.agent)
+    return _log_likelihood(data, agents.without(spread), change, restricted)
+
+
+def _log_likelihood(
+    data: Linearised, agents: Products, change: np.ndarray, restricted: bool
+) -> tuple[float, np.ndarray]:
+    """See :func:`log_likelihood`; ``agents`` are products of w and X by V^-1."""
+    weights = np.concatenate([[1.0], -change])
+    square = np.einsum("i,dij,j->d", weights, agents.gram, weights)
+    observed = np.bincount(data.agent, data.observed.sum(1), len(square))
+    each = -0.5 * (agents.logdet + square + observed * np.log(2 * np.pi))
+    loglik = float(each.sum())
+    if restricted and len(change):
+        information = agents.gram.sum(0)[1:, 1:]
+        loglik += 0.5 * (len(change) * np.log(2 * np.pi) - np.linalg.slogdet(information)[1])
+    return loglik, each
+
+
+def _moved(derivatives: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """The covariance ``(S, Q, Q)`` of linear functions with derivatives ``(S, Q, C)``."""
+    moved: np.ndarray = derivatives @ covariance @ derivatives.transpose(0, 2, 1)
+    return moved
+
+
+def _diagonal(matrices: np.ndarray) -> np.ndarray:
+    """``(S, Q)`` diagonals of ``(S, Q, Q)``."""
+    return np.diagonal(matrices, axis1=1, axis2=2)
 
 
 def _bounded_solve(

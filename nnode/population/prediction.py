@@ -110,6 +110,6 @@ def _covariance(
     time = data.dt * np.arange(samples)
     correlation = np.exp(-np.abs(time[:, None] - time) / tau)
     positions = sigma * response[:, 0]
-    columns = np.concatenate([data.random[f] * spread, data.start[f] * start], -1)
+    columns = np.concatenate([data.by_deviation[f] * spread, data.start[f] * start], -1)
     covariance: np.ndarray = positions @ correlation @ positions.T + columns @ columns.T
     return covariance

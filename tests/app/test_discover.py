@@ -21,11 +21,11 @@ from nnode.app.python.inputs import model_options
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.readers.table import TableOptions
+from nnode.discover import thresholds
 from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report import page
-from nnode.discover.rules import Rules
 from nnode.errors import ConfigError
 from nnode.model import System
 from tests.app.conftest import Script, composed
@@ -274,13 +274,14 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
 @pytest.mark.usefixtures("by_hand")
 def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(nearest_law, "with_effects", lambda laws, effects: laws)
+    monkeypatch.setattr(thresholds, "STRICT", 0.5)
     table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
     report = app.diagnose_table(
         table,
         "traffic",
         model={"term": "lin"},
         folder=tmp_path / "run",
-        options=DiscoverOptions(page=False, compare=["idm"], rules=Rules(sure=0.5)),
+        options=DiscoverOptions(page=False, compare=["idm"]),
     )
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert report.nearest is not None

@@ -39,7 +39,7 @@ class Kink:
         return Linearised(
             residual=errors - 1 - abs(theta[0]),
             fixed=np.full((*shape, 1), np.sign(theta[0])),
-            random=np.zeros((*shape, 0)),
+            random=np.zeros(0, dtype=int),
             start=np.zeros((*shape, 0)),
             observed=np.ones(shape, dtype=bool),
             agent=np.arange(DRIVERS),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from nnode.population.likelihood import Linearised, PushNoise, marginal
+from nnode.population.likelihood import Linearised, Marginal, PushNoise, marginal
 
 #: Pushes: standard deviation, time (s); sampling interval, s; errors of measurement, m.
 SIGMA, TAU, DT, ERROR = 0.4, 1.7, 0.2, 0.05
@@ -23,8 +23,8 @@ def example(seed: int, states: int) -> Linearised:
     step = 0.9 * np.eye(states) + 0.05 * rng.normal(size=(segments, samples - 1, states, states))
     return Linearised(
         residual=rng.normal(size=(segments, samples)),
-        fixed=rng.normal(size=(segments, samples, 2)),
-        random=rng.normal(size=(segments, samples, 2)),
+        fixed=rng.normal(size=(segments, samples, 3)),
+        random=np.array([2, 0]),
         start=rng.normal(size=(segments, samples, 1)),
         observed=observed,
         agent=np.array([0, 1, 0]),
@@ -59,7 +59,7 @@ def covariance(data: Linearised, lasting: tuple[float, ...]) -> np.ndarray:
         whole[own, own] += start @ start.T
         if lasting:
             whole[own, own] += lasting[0] ** 2 * np.exp(-apart / lasting[1])
-    random = (data.random * SPREAD).reshape(segments * samples, -1)
+    random = (data.by_deviation * SPREAD).reshape(segments * samples, -1)
     same = np.equal.outer(*[np.repeat(data.agent, samples)] * 2)
     found: np.ndarray = whole + same * (random @ random.T)
     return found
@@ -72,12 +72,12 @@ def test_the_filter_is_a_dense_gaussian(seed: int, states: int, lasting: tuple[f
     data = example(seed, states)
     observed = data.observed.ravel()
     v = covariance(data, lasting)[np.ix_(observed, observed)]
-    x, w = data.fixed.reshape(-1, 2)[observed], data.residual.ravel()[observed]
+    x, w = data.fixed.reshape(-1, 3)[observed], data.residual.ravel()[observed]
     information = x.T @ np.linalg.solve(v, x)
     change = np.linalg.solve(information, x.T @ np.linalg.solve(v, w))
     loglik = multivariate_normal(np.zeros(len(w)), v).logpdf(w - x @ change)
     # Harville 1977
-    loss = np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
+    loss = 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
 
     noise = PushNoise()
     products = noise.products(data, np.array([SIGMA, TAU, ERROR, *lasting]))
@@ -90,7 +90,7 @@ def test_the_filter_is_a_dense_gaussian(seed: int, states: int, lasting: tuple[f
     np.testing.assert_allclose(found.change, change, rtol=1e-8)
     np.testing.assert_allclose(found.information, information, rtol=1e-8)
     agent = np.repeat(data.agent, data.observed.shape[1])[observed]
-    z, rest = data.random.reshape(-1, 2)[observed], np.linalg.solve(v, w - x @ change)
+    z, rest = data.by_deviation.reshape(-1, 2)[observed], np.linalg.solve(v, w - x @ change)
     for d in range(2):
         own = z * (agent == d)[:, None]
         np.testing.assert_allclose(found.deviations[d], SPREAD**2 * (own.T @ rest), rtol=1e-7)
@@ -98,14 +98,36 @@ def test_the_filter_is_a_dense_gaussian(seed: int, states: int, lasting: tuple[f
         np.testing.assert_allclose(found.variances[d], left, rtol=1e-7)
 
 
+@pytest.mark.parametrize("restricted", [False, True])
+def test_derivatives_by_standard_deviations(restricted: bool) -> None:
+    data, number = example(4, 2), len(SPREAD)
+    products = PushNoise().products(data, np.array([SIGMA, TAU, ERROR]))
+    logs = np.log([*SPREAD, *START])
+
+    def likelihood(shifted: np.ndarray) -> Marginal:
+        deviations = np.exp(shifted)
+        return marginal(
+            data, products, deviations[:number], deviations[number:], restricted=restricted
+        )
+
+    calculated = likelihood(logs)
+    derivatives = np.concatenate([calculated.by_spread.sum(0), calculated.by_start.sum(0)])
+    step = 1e-5
+    differences = [
+        (likelihood(logs + change).loglik - likelihood(logs - change).loglik) / (2 * step)
+        for change in step * np.eye(len(logs))
+    ]
+    np.testing.assert_allclose(derivatives, differences, rtol=1e-5)
+
+
 def test_bounded_changes_are_the_most_likely_ones_within_the_bounds() -> None:
     data = example(5, 2)
     products = PushNoise().products(data, np.array([SIGMA, TAU, ERROR]))
     free = marginal(data, products, SPREAD, START)
-    low, high = free.change - 1.0, free.change + np.array([-0.2, 1.0])
+    low, high = free.change - 1.0, free.change + np.array([-0.2, 1.0, 1.0])
     found = marginal(data, products, SPREAD, START, low=low, high=high)
     assert found.change[0] == pytest.approx(high[0])
-    fixed = found.change + np.outer(np.linspace(-1e-3, 1e-3, 3), [0.0, 1.0])
+    fixed = found.change + np.outer(np.linspace(-1e-3, 1e-3, 3), [0.0, 1.0, 0.0])
     values = [marginal(data, products, SPREAD, START, low=c, high=c).loglik for c in fixed]
     assert values[1] == pytest.approx(found.loglik)
     assert max(values) == values[1] < free.loglik

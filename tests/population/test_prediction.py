@@ -55,7 +55,7 @@ def test_the_next_sample_has_the_density_of_the_marginal_likelihood(seconds: flo
         spread=np.array([0.15]),
     )
     data = fit_deviations(model, noise, model.start, variances).data
-    data = replace(data, fixed=data.fixed[..., :0])
+    unchanged = np.zeros(data.fixed.shape[-1])
     more = replace(data, observed=data.observed.copy())
     more.observed[:, following] = paths.observed[:, following]
     likelihoods = [
@@ -64,6 +64,8 @@ def test_the_next_sample_has_the_density_of_the_marginal_likelihood(seconds: flo
             noise.products(samples, variances.noise),
             variances.spread,
             variances.start,
+            low=unchanged,
+            high=unchanged,
         ).each
         for samples in (data, more)
     ]

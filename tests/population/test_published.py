@@ -51,7 +51,7 @@ class Curves:
         return Linearised(
             residual=residual,
             fixed=fixed,
-            random=fixed[..., self.random],
+            random=np.array(self.random),
             start=np.zeros((*self.y.shape, 0)),
             observed=np.ones(self.y.shape, dtype=bool),
             agent=np.arange(len(self.y)),

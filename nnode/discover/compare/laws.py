@@ -24,6 +24,7 @@ import numpy as np
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import better
 from nnode.data.sequence import Domain, Sequence
+from nnode.discover import thresholds
 from nnode.discover.division import divide, spacing, without_starts
 from nnode.discover.eligibility import check_model, not_offered
 from nnode.discover.judge.model_comparison import engine_of, windows_of
@@ -33,7 +34,6 @@ from nnode.discover.options import DiscoverOptions
 from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import ComparedLaw, Laws
-from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.errors import ConfigError, SimulationError
 from nnode.model.effects import CATALOGUE, Effect
@@ -253,7 +253,7 @@ def explained_by_law(
         with suppress(SimulationError, np.linalg.LinAlgError):
             of_law, of_effects = (engine.log_likelihoods(system)[0] for system in systems)
             p_value = better(of_law - of_effects)
-    if p_value > rules().level:
+    if p_value > thresholds.LEVEL:
         return [], p_value
     shared = {effect.name for effect in effects_of(nearer.system)}
     steps = [

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.sequence import Sequence, collate
+from nnode.discover import thresholds
 from nnode.discover.crowds.variables import crowd_variables
 from nnode.discover.crowds.whitening import Whitening
 from nnode.discover.crowds.windows import Windows
@@ -20,7 +21,6 @@ from nnode.discover.eligibility import check_model
 from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
-from nnode.discover.rules import rules
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
 from nnode.model.system import Crowd, System
 from nnode.model.term import State
@@ -63,7 +63,7 @@ class CrowdEngine:
         window: float = 1.5,
         clusters: np.ndarray | None = None,
     ) -> None:
-        self.sequences, self.smallest_share = list(sequences), rules().least
+        self.sequences, self.smallest_share = list(sequences), thresholds.SMALLEST_SHARE
         self.batch = collate(sequences)
         self.windows = Windows(sequences, window)
         window_of, place_of = self.windows.person.T

@@ -12,6 +12,7 @@ import numpy as np
 
 from nnode.data.clusters import better
 from nnode.data.sequence import Sequence
+from nnode.discover import thresholds
 from nnode.discover.crowds.indirect_inference import bias_corrected
 from nnode.discover.judge.held_out import MODELS, HeldOutErrors, held_out_errors
 from nnode.discover.judge.model_comparison import ModelComparison, engine_of, too_few
@@ -21,7 +22,6 @@ from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.result import Agents, Confirmation, Gap, NamedEffect
-from nnode.discover.rules import rules
 from nnode.discover.statistics.bias import corrected_for_bias
 from nnode.discover.statistics.combination import combined
 from nnode.discover.statistics.paired import gains
@@ -60,7 +60,7 @@ class _ModelTest:
 
     @property
     def confirmed(self) -> bool:
-        significant = self.p_value <= self.alpha and self.confirmation <= rules().each
+        significant = self.p_value <= self.alpha and self.confirmation <= thresholds.EACH
         return significant and self.likelihood_rises and self.errors_fall
 
     def weakness(self) -> tuple[bool, float]:
@@ -69,10 +69,10 @@ class _ModelTest:
 
     @property
     def reason(self) -> str:
-        if self.confirmation > rules().each:
+        if self.confirmation > thresholds.EACH:
             return (
                 "the residuals of the confirmation clusters do not correlate with its predicted "
-                f"change (one-sided p = {self.confirmation:.3f}, required {rules().each:g})"
+                f"change (one-sided p = {self.confirmation:.3f}, required {thresholds.EACH:g})"
             )
         if self.p_value > self.alpha:
             return (
@@ -396,7 +396,7 @@ def _not_confirmed_reason(p_value: float, errors: HeldOutErrors | None, clusters
     """Why the confirmation clusters do not confirm them; empty if they do."""
     if errors is None:
         return "the confirmation sequences are too short to be divided"
-    if p_value > rules().level:
+    if p_value > thresholds.LEVEL:
         return too_few(clusters) or (
             "agent-specific parameters do not predict the last part of the confirmation sequences "
             f"better than none, or than one per sequence (one-sided p = {p_value:.3f})"

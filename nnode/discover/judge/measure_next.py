@@ -22,11 +22,10 @@ import torch
 from scipy import stats
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.data.clusters import least_number
+from nnode.data.clusters import group_sums, least_number
 from nnode.data.paths import velocity
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import TrafficEngine
-from nnode.discover.residuals.fit import sums
 from nnode.discover.result import Profile
 from nnode.errors import SimulationError
 from nnode.model.system import System
@@ -138,7 +137,7 @@ def _excess(engine: TrafficEngine, first: System, second: System) -> float:
     """The overdispersion of the clusters' scores, relative to independent residuals."""
     rows = {s: ParameterVector(s).row[None] for s in (first, second)}
     r_first, r_second = (engine.residuals(s, row)[0].numpy() for s, row in rows.items())
-    scores = sums(r_first * (r_first - r_second), engine.cluster)
+    scores = group_sums(r_first * (r_first - r_second), engine.cluster)
     expected = float(((r_first - r_second) ** 2).sum())
     if len(scores) < 2 or not expected > 0:
         return 1.0

@@ -19,13 +19,13 @@ from __future__ import annotations
 import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.data.clusters import group_sums
 from nnode.data.sequence import Sequence
 from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Engine
-from nnode.discover.residuals.fit import sums
 from nnode.discover.statistics.combination import least_confirmation
 from nnode.discover.statistics.paired import score_toward
 from nnode.model.system import System
@@ -108,7 +108,7 @@ class ModelComparison:
     def scores(self, system: System) -> np.ndarray:
         """``(G,)`` sums of squared (Huber) residuals of the clusters: twice the negative logarithm
         of the predictive likelihood, up to a constant."""
-        return sums(self._residuals(system) ** 2, self._engine.cluster)
+        return group_sums(self._residuals(system) ** 2, self._engine.cluster)
 
     def _residuals(self, system: System) -> np.ndarray:
         residuals = self._engine.residuals(system, ParameterVector(system).row[None])[0].numpy()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from nnode.discover import thresholds
 from nnode.discover.judge.measure_next import best_profile
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.locate.curves import tail
@@ -26,7 +27,6 @@ from nnode.discover.result import (
     Profile,
     Structure,
 )
-from nnode.discover.rules import rules
 from nnode.discover.statistics.paired import clusters_to_tell
 from nnode.discover.statistics.power import PowerSimulation
 from nnode.discover.statistics.profile import intervals as edge_intervals
@@ -185,8 +185,8 @@ def _absence(score: Score, power: PowerSimulation) -> Absence:
         reason=where
         if testable
         else (
-            f"{name} would not be named with these data with a probability of {rules().power:.0%} "
-            f"even if it were off by {expected:.3g}{unit}"
+            f"{name} would not be named with these data with a probability of "
+            f"{thresholds.POWER:.0%} even if it were off by {expected:.3g}{unit}"
         ),
     )
 
@@ -198,7 +198,7 @@ def _without_strength(score: Score, power: PowerSimulation) -> Absence:
     detectable_settings = [
         evidence
         for evidence in score.evidence
-        if evidence.grams.sum() > 0 and power.power(score, evidence, 1.0) >= rules().power
+        if evidence.grams.sum() > 0 and power.power(score, evidence, 1.0) >= thresholds.POWER
     ]
     weakest = min(detectable_settings, key=_information, default=None)
     value = None if weakest is None else float(weakest.options[name])
@@ -233,8 +233,9 @@ def agents_absent(estimate: IndividualEstimate, alpha: float, enough_clusters: b
         ""
         if testable
         else (
-            f"{name} would not be significant with a probability of {rules().power:.0%} even if it "
-            f"were {strength.expected:.3g}{'' if strength.unit == '1' else ' ' + strength.unit}"
+            f"{name} would not be significant with a probability of "
+            f"{thresholds.POWER:.0%} even if it were {strength.expected:.3g}"
+            f"{'' if strength.unit == '1' else ' ' + strength.unit}"
         ),
     )
 
@@ -254,7 +255,7 @@ def places(curves: list[Curves], excess: float) -> list[Place]:
     number = sum(len(curve.heights) for curve in curves)
     for curve in curves:
         p_values = tail(curve, number)
-        significant = p_values <= rules().sure
+        significant = p_values <= thresholds.STRICT
         if not significant.any() or curve.removed <= 0:
             continue
         best = int(np.argmax(np.where(significant, np.abs(curve.heights), 0.0)))

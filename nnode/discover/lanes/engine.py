@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence, collate
+from nnode.discover import thresholds
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
 from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
-from nnode.discover.rules import rules
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.expression import symbols
 from nnode.model.extend import effects_of, extended, without
@@ -76,7 +76,8 @@ class TrafficEngine:
         clusters: np.ndarray | None = None,
         large: float = LARGE,
     ) -> None:
-        self.sequences, self.large, self.smallest_share = sequences, large, rules().least
+        self.sequences, self.large = sequences, large
+        self.smallest_share = thresholds.SMALLEST_SHARE
         self.names = [sequence.name for sequence in sequences]
         parts = [_windows(sequence, window) for sequence in sequences]
         self.batch = collate(part[0] for each in parts for part in each)

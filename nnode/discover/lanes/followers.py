@@ -373,7 +373,7 @@ class FollowersEngine(TrafficEngine):
             )
             if agents.size:
                 difference = difference + np.einsum(
-                    "fkq,fq->fk", data.random, agents[model.paths.agent]
+                    "fkq,fq->fk", data.by_deviation, agents[model.paths.agent]
                 )
         return difference, model, states
 
@@ -393,12 +393,15 @@ class FollowersEngine(TrafficEngine):
             return errors
         variances = self.population.estimate.variances
         data = self.population.estimate.data
-        data = replace(data, residual=errors, fixed=data.fixed[..., :0])
+        data = replace(data, residual=errors)
         products = PushNoise().products(data, variances.noise)
-        posterior = marginal(data, products, variances.spread, variances.start)
+        unchanged = np.zeros(data.fixed.shape[-1])
+        posterior = marginal(
+            data, products, variances.spread, variances.start, low=unchanged, high=unchanged
+        )
         errors = errors - np.einsum("fkh,fh->fk", data.start, posterior.start)
         driver_deviations = posterior.deviations[model.paths.agent]
-        return np.asarray(errors - np.einsum("fkq,fq->fk", data.random, driver_deviations))
+        return np.asarray(errors - np.einsum("fkq,fq->fk", data.by_deviation, driver_deviations))
 
     def _whitened(self, columns: np.ndarray) -> Tensor:
         """``(C, n)`` of columns ``(K, F, C)``."""

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.discover.rules import rules
+from nnode.discover import thresholds
 
 
 @dataclass
@@ -50,7 +50,7 @@ class PlatoonFilter:
         columns = _lagged(centred, order)
         e, design = centred[valid].numpy(), torch.stack(columns, -1)[valid].numpy()
         gram = design.T @ design
-        gram += max(rules().trust ** 2 * np.trace(gram) / len(gram), 1e-12) * np.eye(len(gram))
+        gram += max(thresholds.RIDGE**2 * np.trace(gram) / len(gram), 1e-12) * np.eye(len(gram))
         weights = np.linalg.solve(gram, design.T @ e)
         unscaled = cls(weights[:order], weights[order:], 1.0)
         scale = float(unscaled(residual)[valid].square().mean().sqrt())

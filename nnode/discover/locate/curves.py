@@ -12,10 +12,11 @@ from scipy import stats
 from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.data.clusters import group_sums
+from nnode.discover import thresholds
 from nnode.discover.residuals.engine import Engine, square_of
-from nnode.discover.residuals.fit import ROUGH, Fit, grams, refine, sums
+from nnode.discover.residuals.fit import ROUGH, Fit, grams, refine
 from nnode.discover.residuals.variables import Curve, Curves, Variable
-from nnode.discover.rules import rules
 from nnode.discover.statistics.bias import mean_scores, simulated_fits
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import Screen, at_least
@@ -74,7 +75,7 @@ def _curves(engine: Engine, fit: Fit, variables: list[Variable], seed: int) -> l
         p_curve = share[offset : offset + len(variable_fit.squares), 0].min()
         offset += len(variable_fit.squares)
         p_value = float((smallest <= p_curve + 1e-12).mean())
-        if p_value < rules().sure and not variable_fit.variable.lengths:
+        if p_value < thresholds.STRICT and not variable_fit.variable.lengths:
             simulated = simulated_fits(engine, fit, seed) if simulated is None else simulated
             columns = partial(columns_of, variable=variable_fit.variable)
             bias = mean_scores(simulated, columns, engine.cluster)
@@ -123,7 +124,7 @@ class _CurveFits:
 
     def _store_scores(self, columns: np.ndarray) -> None:
         """Store the scores of the coefficients with these columns."""
-        self.parts = sums(self.z, self.engine.cluster, self.fit.residual) - self.bias
+        self.parts = group_sums(self.z, self.engine.cluster, self.fit.residual) - self.bias
         self.absorbed = np.linalg.lstsq(self.fit.jacobian, columns, rcond=1e-9)[0]
 
     def _fit_smooth_curves(self) -> None:
@@ -174,7 +175,7 @@ class _CurveFits:
             p_value: corrected for all variables.
         """
         label = self.engine.cluster
-        plain = sums(self.fit.residual**2, label)
+        plain = group_sums(self.fit.residual**2, label)
         count, number = len(plain), self.grams.shape[1]
         gram, score = self.grams, -self.parts
         whole, total = gram.sum(0), score.sum(0)

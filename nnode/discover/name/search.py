@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.discover import thresholds
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.locate.curves import curves
 from nnode.discover.name.candidate import Candidate, calibrated
@@ -19,7 +20,6 @@ from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.engine import Engine, square_of
 from nnode.discover.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.discover.residuals.variables import Variable
-from nnode.discover.rules import rules
 from nnode.discover.statistics.bias import SimulatedFits, mean_scores, simulated_fits
 from nnode.discover.statistics.paired import compare, heldout, j_test, presence_pvalue
 from nnode.discover.statistics.profile import refined_edges
@@ -201,7 +201,7 @@ def _screened(
     within((n_steps + 0.5) / (n_steps + 2))
     selection.screen = Screen(selection.fit, engine.cluster, seed + n_steps, levels=levels)
     selection.scores = selection.screen.scores(effect_traces)
-    significant = {score.effect.name for score in selection.scores if score.p_value <= rules().each}
+    significant = {s.effect.name for s in selection.scores if s.p_value <= thresholds.EACH}
     if significant and (simulated := simulated_fits(engine, selection.fit, seed)):
         for effect in candidates:
             if effect.name in significant:
@@ -237,11 +237,11 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
     if not scores:
         return None
     scores = sorted(scores, key=lambda score: -score.gain)
-    significant = min(score.p_value for score in scores) <= rules().each
+    significant = min(score.p_value for score in scores) <= thresholds.EACH
     if not significant and isinstance(engine, FollowersEngine):
         return None  # the variances were already fitted with the most likely extension
     hinted = {effect.name for hint in hints for effect in effects_of(hint)}
-    ranked = [s for s in scores if s.gain >= rules().rival * scores[0].gain][:RIVALS]
+    ranked = [s for s in scores if s.gain >= thresholds.RIVAL * scores[0].gain][:RIVALS]
     ranked += [score for score in scores if score.effect.name in hinted and score not in ranked]
     candidates = _ranked(engine, selection, ranked, hints, significant)
     eligible = [
@@ -249,17 +249,17 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
         for c in candidates
         if c.removed >= engine.smallest_share
         and c.gain.gain > 0
-        and c.presence_pvalue < rules().level
+        and c.presence_pvalue < thresholds.LEVEL
         and c.strength_excludes_neutral(screen.label(c.name))
         and c.ordered
     ]
-    passing = [c for c in eligible if c.score.p_value <= rules().each]
+    passing = [c for c in eligible if c.score.p_value <= thresholds.EACH]
     if not passing and not isinstance(engine, FollowersEngine):
         passing = [c for c in eligible if _significant_held_out(c, screen, len(scores))]
     if not passing:
         return None
     best = _simplest(passing, screen)
-    if best.score.p_value > rules().each:
+    if best.score.p_value > thresholds.EACH:
         best.score = replace(best.score, p_value=best.presence_pvalue * len(scores))
     tests = [(rival, _j_test(rival, best, screen)) for rival in candidates if rival is not best]
     return Step(best, [(rival, test) for rival, test in tests if _is_rival(best, rival, test)])
@@ -332,16 +332,15 @@ def _significant_held_out(candidate: Candidate, screen: Screen, n_tried: int) ->
     """Whether the held-out score of one of ``n_tried`` effects is significant, and its interval
     excludes all negligible strengths."""
     label = screen.label(candidate.name)
-    significant = candidate.presence_pvalue * n_tried <= rules().sure
+    significant = candidate.presence_pvalue * n_tried <= thresholds.STRICT
     return significant and candidate.strength_excludes_neutral(label, minimal=True)
 
 
 def apart_at(first: Candidate, second: Candidate) -> float:
     """The level of the test between two effects."""
     group = first.score.effect.confusable_group
-    return (
-        rules().sure if group and group == second.score.effect.confusable_group else rules().level
-    )
+    same_group = group and group == second.score.effect.confusable_group
+    return thresholds.STRICT if same_group else thresholds.LEVEL
 
 
 def _hinted(hints: Sequence[System], system: System, name: str) -> list[System]:
@@ -391,9 +390,9 @@ def _curve_predicts_better(
 ) -> bool:
     """Whether a nonparametric curve predicts better than an effect."""
     for curve in curves(engine, fit, variables) if variables else []:
-        if curve.p_value < rules().level:
+        if curve.p_value < thresholds.LEVEL:
             test = compare(heldout(best.fit, engine.cluster), curve.losses)
-            if test.p_value < rules().level:
+            if test.p_value < thresholds.LEVEL:
                 return True
     return False
 
@@ -405,7 +404,7 @@ def _simplest(candidates: list[Candidate], screen: Screen) -> Candidate:
     for candidate in candidates[1:]:
         sizes = len(candidate.fit.row), len(best.fit.row)
         likelier = sizes[0] == sizes[1] and candidate.fit.cost < best.fit.cost
-        comparable = candidate.gain.gain >= rules().near * best.gain.gain
+        comparable = candidate.gain.gain >= thresholds.AS_GOOD * best.gain.gain
         distinguishable = _j_test(candidate, best, screen).p_value <= apart_at(candidate, best)
         if (sizes[0] < sizes[1] or likelier) and comparable and not distinguishable:
             best = candidate
@@ -450,7 +449,7 @@ def _eliminated(engine: Engine, selection: Selection) -> Selection:
             item
             for item in reduced
             if item[0].gain <= 0
-            or presence_pvalue(item[2], selection.fit, engine.cluster) > rules().level
+            or presence_pvalue(item[2], selection.fit, engine.cluster) > thresholds.LEVEL
         ]
         if not needless:
             break

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from scipy import stats
-from scipy.sparse import csr_array
 
 from nnode.calibrate.intervals import LEVEL, ClusterInfluence
 from nnode.calibrate.least_squares import Quadratic, least_squares
 from nnode.calibrate.parameters import ParameterVector
+from nnode.data.clusters import group_sums
 from nnode.discover.residuals.engine import Engine
 from nnode.errors import SimulationError
 from nnode.model.system import System
@@ -63,7 +63,7 @@ class Fit:
     def influence(self, cluster: np.ndarray) -> ClusterInfluence:
         """The influence of the clusters on the free parameters."""
         columns = self.tangents
-        scores = sums(columns * self.residual[:, None], cluster)
+        scores = group_sums(columns * self.residual[:, None], cluster)
         return ClusterInfluence(grams(columns, cluster), scores)
 
     def errors(self, cluster: np.ndarray, power: float = 1.0) -> np.ndarray:
@@ -99,16 +99,6 @@ class Fit:
         half = self._errors(influence, cluster, 0.5)
         half[self.free] *= stats.t.ppf(0.5 + level / 2, influence.degrees())
         return np.stack([self.row - half, self.row + half], 1)
-
-
-def sums(values: np.ndarray, label: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
-    """``(G, ...)`` sums of ``values`` ``(n, ...)`` over the rows of each label 0 ... G - 1, each
-    times its ``weight`` ``(n,)``."""
-    number, count = int(label.max()) + 1, len(label)
-    weight = np.ones(count) if weight is None else weight
-    member = csr_array((weight, (label, np.arange(count))), (number, count))
-    totals: np.ndarray = member @ values
-    return totals
 
 
 def members(label: np.ndarray) -> list[np.ndarray]:

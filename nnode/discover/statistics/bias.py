@@ -16,9 +16,10 @@ import numpy as np
 import torch
 
 from nnode.calibrate.parameters import ParameterVector, with_parameters
+from nnode.data.clusters import group_sums
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.residuals.engine import Engine
-from nnode.discover.residuals.fit import Fit, evaluated, sums
+from nnode.discover.residuals.fit import Fit, evaluated
 from nnode.discover.statistics.leverage import orthonormal
 from nnode.errors import SimulationError
 from nnode.model.extend import effects_of, place_of
@@ -57,7 +58,9 @@ def mean_scores(
     parts = []
     for engine, fit in simulated:
         basis, effect_columns = orthonormal(fit.tangents), columns(engine, fit)
-        parts.append(sums(effect_columns - basis @ (basis.T @ effect_columns), label, fit.residual))
+        parts.append(
+            group_sums(effect_columns - basis @ (basis.T @ effect_columns), label, fit.residual)
+        )
     return np.asarray(np.mean(parts, 0)) if parts else 0.0
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from nnode.data.clusters import least_number
-from nnode.discover.rules import rules
+from nnode.discover import thresholds
 
 
 def combined(
@@ -43,4 +43,4 @@ def combined(
 def least_confirmation() -> int:
     """The number of confirmation clusters whose sign flips can reach the level that each part must
     reach on its own."""
-    return least_number(rules().each, sided=1)
+    return least_number(thresholds.EACH, sided=1)

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from nnode.data.clusters import better
+from nnode.data.clusters import better, group_sums
 from nnode.discover.residuals.comparison import Comparison
-from nnode.discover.residuals.fit import Fit, sums
+from nnode.discover.residuals.fit import Fit
 
 #: A direction in which the other clusters hold less than this share of the information is not
 #: changed by leaving a cluster out.
@@ -22,7 +22,7 @@ def heldout(fit: Fit, cluster: np.ndarray) -> np.ndarray:
 
     See :meth:`~nnode.calibrate.intervals.ClusterInfluence.moved`.
     """
-    return sums(_left_out(fit, cluster) ** 2, cluster)
+    return group_sums(_left_out(fit, cluster) ** 2, cluster)
 
 
 def presence_pvalue(before: Fit, after: Fit, cluster: np.ndarray) -> float:
@@ -59,8 +59,8 @@ def score_toward(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> 
     Source: Rao 1948 (scores).
     """
     with np.errstate(invalid="ignore"):
-        scores = 2 * sums(first * (first - second), cluster)
-        larger = np.maximum(sums(first**2, cluster), sums(second**2, cluster))
+        scores = 2 * group_sums(first * (first - second), cluster)
+        larger = np.maximum(group_sums(first**2, cluster), group_sums(second**2, cluster))
         relative: np.ndarray = scores / np.where(larger > 0, larger, 1)
     return relative
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 
 from nnode.data.clusters import every_sign
-from nnode.discover.rules import rules
+from nnode.discover import thresholds
 from nnode.discover.statistics.combination import combined, least_confirmation
 from nnode.discover.statistics.score import Evidence, Score, Screen
 
@@ -50,13 +50,13 @@ class PowerSimulation:
         parts = rng.choice([-1.0, 1.0], (number, RUNS)) * null_parts[:, None] - size * grams
         name = score.effect.name
         exploration = self.screen.p_values(name, self.screen.statistic(evidence, parts))
-        passed = exploration <= rules().each
+        passed = exploration <= thresholds.EACH
         costs = _with_effect(self.screen.costs(name)[:, None], parts, grams, size)
         left_out_amounts = -(parts.sum(0) - parts) / np.maximum(information - grams, 1e-300)
         gain = _gain(left_out_amounts, parts, grams, costs)
         score_toward = _score_toward(left_out_amounts, parts, grams, costs)
         passed &= (gain.mean(0) > 0) & (
-            _t(score_toward) > stats.t.ppf(1 - rules().level, number - 1)
+            _t(score_toward) > stats.t.ppf(1 - thresholds.LEVEL, number - 1)
         )
         amount = -parts.sum(0) / information
         error = np.sqrt(
@@ -65,7 +65,7 @@ class PowerSimulation:
         passed &= np.abs(amount) > stats.t.ppf(0.975, number - 1) * error
         costs = self.screen.costs(name)
         confirmation = self._confirmation(rng, null_parts, evidence.grams, costs, size, amount)
-        passed &= confirmation <= rules().each
+        passed &= confirmation <= thresholds.EACH
         p_value = combined(exploration, confirmation, number, self.confirmation_clusters)
         return float((passed & (p_value <= self.alpha)).mean())
 
@@ -98,13 +98,13 @@ class PowerSimulation:
         """The smallest size with a power of 80 %; infinite if there is none."""
         sizes = expected * SIZES
         powers = np.array([self.power(score, evidence, size) for size in sizes])
-        sufficient = np.flatnonzero(powers >= rules().power)
+        sufficient = np.flatnonzero(powers >= thresholds.POWER)
         if not len(sufficient):
             return float("inf")
         k = int(sufficient[0])
         if k == 0:
             return float(sizes[0])
-        share = (rules().power - powers[k - 1]) / (powers[k] - powers[k - 1])
+        share = (thresholds.POWER - powers[k - 1]) / (powers[k] - powers[k - 1])
         return float(sizes[k - 1] * (sizes[k] / sizes[k - 1]) ** share)
 
 

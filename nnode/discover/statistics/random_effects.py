@@ -18,8 +18,9 @@ import numpy as np
 import torch
 from scipy import stats
 
+from nnode.data.clusters import group_sums
 from nnode.discover.residuals.engine import Engine
-from nnode.discover.residuals.fit import Fit, evaluated, grams, sums
+from nnode.discover.residuals.fit import Fit, evaluated, grams
 from nnode.discover.statistics.variance_components import (
     LONGEST,
     Curve,
@@ -133,7 +134,7 @@ def agent_parameters(
         z = _directions(engine, fit, estimate.effect, estimate.options)
         if common and len(engine.people[0]) > 1:
             z = z.sum(1, keepdims=True)
-        gram, score = grams(z, label), -sums(z * fit.residual[:, None], label)
+        gram, score = grams(z, label), -group_sums(z * fit.residual[:, None], label)
         gram, score = _with_transient_variance(
             gram, score, _mean_transient_variance(engine, estimate)
         )

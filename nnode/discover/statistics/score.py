@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from nnode.data.clusters import signs
+from nnode.data.clusters import group_sums, signs
+from nnode.discover import thresholds
 from nnode.discover.residuals.engine import Engine
-from nnode.discover.residuals.fit import Fit, sums
+from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.fit import grams as grams_of
-from nnode.discover.rules import rules
 from nnode.discover.statistics.leverage import leverage_adjusted, orthonormal
 from nnode.discover.statistics.standard import cluster_variance_of, joint, standardised
 from nnode.model.effects import Effect, Probe
@@ -212,7 +212,10 @@ class Screen:
                 label,
             )
         raw = z.T @ self.residual
-        scores, size = sums(z, label, self._adjusted_residuals[key][0]), sums(z**2, label)
+        scores, size = (
+            group_sums(z, label, self._adjusted_residuals[key][0]),
+            group_sums(z**2, label),
+        )
         share = size / np.maximum(size.sum(0), 1e-300)
         balanced: np.ndarray = scores + (raw - scores.sum(0)) * share
         return balanced
@@ -276,7 +279,7 @@ class Screen:
 
     def costs(self, name: str) -> np.ndarray:
         """``(G,)`` sums of squared residuals of the clusters of an effect's test."""
-        return sums(self.residual**2, self.label(name))
+        return group_sums(self.residual**2, self.label(name))
 
     def _store_null(self, name: str, statistics: np.ndarray) -> None:
         """Update an effect's largest statistics ``(F,)`` under the flips."""
@@ -310,7 +313,7 @@ class Screen:
         if len(probe.steps) == 1 and value != 0:
             # an implausible strength indicates another effect
             share = float(np.clip((options[name] - strength.neutral) / value, 0.0, 1.0))
-            if share < rules().forbidden:
+            if share < thresholds.PLAUSIBLE:
                 statistic, gain = statistic * share, gain * share * (2 - share)
         self._store_null(trace.effect.name, chance)
         # the trace of an effect with memory is that of a finite strength
@@ -356,7 +359,7 @@ class Screen:
         amount = -total / size
         residual_square = ((interval_parts + amount * sizes) ** 2).sum(0)
         blocks = size**2 / (sizes**2).sum(0)
-        prior = rules().prior
+        prior = thresholds.PRIOR
         variance = (blocks * residual_square + prior * cluster_variance * size) / (blocks + prior)
         error = np.sqrt(variance) / size
 
@@ -409,7 +412,7 @@ class Screen:
 def negligible_strengths(effect: type[Effect], number: int) -> np.ndarray:
     """``(k,)`` the largest negligible strengths of an effect; 0 if it declares no minimum size."""
     negligible = [
-        rules().minimal * (strength.min_effect_size or 0.0)
+        thresholds.NEGLIGIBLE * (strength.min_effect_size or 0.0)
         for strength in effect.strengths.values()
     ]
     return np.array(negligible or [0.0] * number)[:number]

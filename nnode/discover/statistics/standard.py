@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from nnode.discover.rules import rules
+from nnode.discover import thresholds
 
 #: Median of the square of a standard normal variable.
 MEDIAN = 0.4549
@@ -48,7 +48,7 @@ def standardised(
         squares - 2 * amount * (signs @ (parts * sizes)) + amount**2 * (sizes**2).sum(0)
     )
     blocks = size**2 / (sizes**2).sum(0)
-    prior = rules().prior
+    prior = thresholds.PRIOR
     variance = (blocks * np.maximum(residual_squares, 0) + prior * cluster_variance * size) / (
         blocks + prior
     )
@@ -69,7 +69,7 @@ def joint(parts: np.ndarray, grams: np.ndarray, signs: np.ndarray, variance: flo
     blocks = float(size.sum() ** 2 / (size**2).sum())
     spread = np.einsum("fbi,fbj->fij", residual_parts, residual_parts)
     cluster_variance = cluster_variance_of(parts, np.einsum("bii->bi", grams), variance)
-    prior = rules().prior
+    prior = thresholds.PRIOR
     spread = (blocks * spread + prior * cluster_variance * information) / (blocks + prior)
     spread += 1e-12 * np.trace(information) * np.eye(k)
     squares = np.einsum("fi,fi->f", total, np.linalg.solve(spread, total[..., None])[..., 0])

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from nnode.data.clusters import group_sums
 from nnode.discover.residuals.engine import Engine
-from nnode.discover.residuals.fit import Fit, grams, sums
+from nnode.discover.residuals.fit import Fit, grams
 
 #: Number of parts of a sequence's time in which parameters are estimated.
 PARTS = 6
@@ -64,7 +65,7 @@ def period_estimates(engine: Engine, fit: Fit, z: np.ndarray) -> PeriodEstimates
     elapsed = (engine.clock - begin[engine.sequence]) / duration[engine.sequence]
     part = np.minimum((PARTS * elapsed).astype(int), PARTS - 1)
     present, label = np.unique(PARTS * engine.unit + part, return_inverse=True)
-    gram, score = grams(z, label), -sums(z * fit.residual[:, None], label)
+    gram, score = grams(z, label), -group_sums(z * fit.residual[:, None], label)
     count = np.bincount(label)
     time = np.bincount(label, engine.clock) / count
     start = np.unique(label, return_index=True)[1]

@@ -15,7 +15,7 @@ from benchmarks.discovery import rules, synthetic, tables
 from benchmarks.discovery.run import benchmark_discovery
 from benchmarks.synthetic_cases.arms import first_seed
 from nnode.app import discover
-from nnode.discover.rules import Rules
+from nnode.discover import thresholds
 from nnode.errors import ConfigError, DataError
 
 CALLS: list[dict[str, Any]] = []
@@ -25,7 +25,8 @@ ONE = {"domains": ["traffic"], "arms": ["single"]}
 def relative_speed(path: Path, domain: str, **given: Any) -> SimpleNamespace:
     """Names relative speed always, and refuses data with jumps."""
     assert {p.name for p in path.parent.iterdir()} <= {"trajectories.csv", "walls.csv"}
-    CALLS.append({"domain": domain, **given})
+    values = {name: v for name, v in vars(thresholds).items() if name.isupper()}
+    CALLS.append({"domain": domain, "thresholds": values, **given})
     table = pd.read_csv(path)
     names = sorted(f"trajectories/{name}" for name in table["sequence"].unique())
     if table["x"].groupby([table["sequence"], table["agent"]]).diff().abs().max() > 6.5:
@@ -211,15 +212,13 @@ def test_the_default_has_all_arms():
         assert len({case["effects"][0] for case in part if case["arm"] == "outside"}) >= 4
 
 
-def test_each_option_of_the_rules_is_halved_and_doubled(tmp_path):
+def test_each_threshold_is_halved_and_doubled(tmp_path):
     options = DiscoveryBenchmarkOptions(**ONE, effects=["inertia"], seeds=1, baseline_seeds=0)
     every = rules.cases("rules", options, 0)
-    assert len(every) == 1 + 2 * len(vars(Rules()))
-    for arguments in every.values():
-        Rules(**arguments["rules"])
+    assert len(every) == 1 + 2 * sum(name.isupper() for name in vars(thresholds))
     rows = run(tmp_path, **ONE, kinds=["rules"], effects=["inertia"])
     assert (rows["cases"] == 1).all()
-    assert len({str(call["options"].rules) for call in CALLS}) == len(CALLS) == len(every)
+    assert len({str(call["thresholds"]) for call in CALLS}) == len(CALLS) == len(every)
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.data.clusters import group_sums
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import FORGET, LARGE, TrafficEngine, huber_residuals
 from nnode.discover.locate.curves import curves, significant_curves
 from nnode.discover.name.search import converged_fit, search
-from nnode.discover.residuals.fit import Fit, refine, sums
+from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.statistics.paired import compare, heldout
 from nnode.discover.statistics.score import traces
 from nnode.model import System
@@ -189,7 +190,7 @@ def test_what_one_sequence_knows_alone_is_not_judged_by_the_others() -> None:
     residual = rng.normal(size=200)
     fit = Fit(System([]), ["a", "b"], np.zeros(2), residual, jacobian, np.ones(2, dtype=bool))
     losses = heldout(fit, sequence)
-    assert losses[2] == pytest.approx(sums(residual**2, sequence)[2], rel=0.1)
+    assert losses[2] == pytest.approx(group_sums(residual**2, sequence)[2], rel=0.1)
     fit.jacobian = jacobian[:, :1]
     fit.free = np.ones(1, dtype=bool)
     np.testing.assert_allclose(losses, heldout(fit, sequence), rtol=1e-3)

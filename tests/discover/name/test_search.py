@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.discover import thresholds
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name import search as searching
 from nnode.discover.name.search import converged_fit, search
-from nnode.discover.rules import rules
 from nnode.discover.statistics.score import Score, Screen, Trace
 from nnode.model import build_model
 from nnode.model.effects import CATALOGUE
@@ -42,7 +42,7 @@ def test_held_out_clusters_may_be_sure_of_what_no_score_shows(
     fit = converged_fit(engine, build_model(LIN))
     found = search(engine, fit, [CATALOGUE.effects[n] for n in ("relative_speed", "inertia")])
     assert [step.chosen.name for step in found.steps] == names
-    assert all(step.chosen.score.p_value <= rules().sure for step in found.steps)
+    assert all(step.chosen.score.p_value <= thresholds.STRICT for step in found.steps)
 
 
 def test_what_a_curve_outdoes_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nnode.data.clusters import better
-from nnode.discover.residuals.fit import Fit, sums
-from nnode.discover.rules import Rules
+from nnode.data.clusters import better, group_sums
+from nnode.discover import thresholds
+from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.combination import combined
 from nnode.discover.statistics.paired import gains, heldout, presence_pvalue, score_toward
 from nnode.discover.statistics.power import RUNS, PowerSimulation
@@ -16,7 +16,7 @@ from nnode.model import System
 from nnode.model.effects import Probe
 from nnode.model.effects.lane import RelativeSpeed
 
-OPEN, EACH, ALPHA, LEVEL = 30, 12, 0.05, Rules().level
+OPEN, EACH, ALPHA, LEVEL = 30, 12, 0.05, thresholds.LEVEL
 
 #: What one parameter of a model and the effect do to the residuals of open and sealed clusters.
 RNG = np.random.default_rng(8)
@@ -57,7 +57,7 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
     nearer = heldout(fit, LABEL).sum() > heldout(wider, LABEL).sum()
     low, high = wider.intervals(LABEL)[1]
     if (
-        score.p_value > Rules().each
+        score.p_value > thresholds.EACH
         or not nearer
         or presence_pvalue(fit, wider, LABEL) >= LEVEL
         or low <= 0 <= high
@@ -69,10 +69,10 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
     seen = drawn(rng, label) - size * columns[picked, 1]
     before = seen + columns[picked, 0] * fit.row[0]
     after = seen + columns[picked] @ wider.row
-    likelier = gains(sums(before**2, label), sums(after**2, label)).mean() > 0
+    likelier = gains(group_sums(before**2, label), group_sums(after**2, label)).mean() > 0
     p_value = better(score_toward(before, after, label))
     together = combined(score.p_value, p_value, OPEN, sealed)
-    return bool(likelier and p_value <= Rules().each and together <= ALPHA)
+    return bool(likelier and p_value <= thresholds.EACH and together <= ALPHA)
 
 
 @pytest.mark.parametrize(("size", "sealed"), [(0.15, 5), (0.15, 16)])
