@@ -59,11 +59,12 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Studies on the real recordings (downloaded, or from NNODE_DATA; following: from there), pages into docs/.
+# Studies on the real recordings (downloaded, or from NNODE_DATA; following and prediction:
+# from there), pages into docs/.
 study: setup
-	for name in traffic crowd following; do \
+	for name in traffic crowd following walking prediction; do \
 	  $(BIN)/nnode study study=$$name || exit $$?; \
-	  rm -rf docs/studies/$$name && mkdir -p docs/studies/$$name && \
+	  rm -rf docs/studies/$$name && mkdir -p docs/studies/$$name runs/study/$$name/figures && \
 	  cp -r runs/study/$$name/study.html runs/study/$$name/study.md runs/study/$$name/*.csv \
 	    runs/study/$$name/figures docs/studies/$$name/ || exit $$?; \
 	done
