@@ -14,7 +14,6 @@ from nnode.calibrate.interrupt import BreakingGuard
 from nnode.errors import unknown_value
 from nnode.machine import cores, how_made
 from nnode.pages.page import Block, Provenance, write_page
-from studies.cluster import on_cluster
 from studies.options import StudyOptions, checked
 from studies.runner import KEPT
 
@@ -70,8 +69,7 @@ def study(config: DictConfig, folder: Path) -> None:
     start, before = time.monotonic(), len(list((folder / KEPT).glob("*.json")))
     with BreakingGuard(f": what is done is kept in {folder}; the same command goes on from there"):
         module = cast(Study, import_module(STUDIES[options.name]))
-        with on_cluster(options.cluster):
-            blocks = module.run(options, folder)
+        blocks = module.run(options, folder)
         made = _made(time.monotonic() - start, options.workers, before)
         paths = write_page(
             [*blocks, made],

@@ -38,7 +38,12 @@ def computed(
         Interrupted, StudyError: as :func:`studies.runner.run_tasks`.
     """
     results = run_tasks(
-        tasks, folder, workers=options.workers or 1, fingerprint=hash_of(stores), title=title
+        tasks,
+        folder,
+        workers=options.workers or 1,
+        fingerprint=hash_of(stores),
+        cluster=options.cluster,
+        title=title,
     )
     return tidy(tasks, results)
 

@@ -25,7 +25,7 @@ from nnode.data.store import Store
 from nnode.errors import StudyError
 from nnode.files import write_json, write_text
 from nnode.version import VERSION
-from studies.cluster import calls_by_joblib, elsewhere
+from studies.cluster import calls_on_cluster
 from studies.progress import TaskProgress
 from studies.workers import Call, Outcome, calls_here, calls_in_processes
 
@@ -87,7 +87,13 @@ def hash_of(stores: Mapping[str, Store]) -> str:
 
 
 def run_tasks(
-    tasks: list[Task], folder: Path, *, workers: int, fingerprint: str, title: str = "tasks"
+    tasks: list[Task],
+    folder: Path,
+    *,
+    workers: int,
+    fingerprint: str,
+    cluster: str | None = None,
+    title: str = "tasks",
 ) -> dict[str, dict[str, Any]]:
     """The results of all tasks.
 
@@ -98,16 +104,16 @@ def run_tasks(
     Args:
         tasks: independent of each other.
         folder: of the study.
-        workers: number of processes, each with one thread; 1 works in this process. A backend of
-            joblib that reaches beyond this machine takes their place, see
-            :mod:`studies.cluster`.
+        workers: number of processes, each with one thread; 1 works in this process.
         fingerprint: of all that the tasks read beside their arguments, such as the data's hash.
+        cluster: address of a Dask scheduler, whose workers do the work instead; or None.
         title: of the progress shown.
 
     Returns:
         Results by key, in the order of the tasks, as JSON gives them back.
 
     Raises:
+        ConfigError: no scheduler answers at the address of the cluster.
         Interrupted: a signal asked to stop.
         StudyError: tasks failed; all others were finished first. Or results cannot be written.
     """
@@ -127,8 +133,8 @@ def run_tasks(
 
     def outcomes(guard: InterruptGuard) -> Generator[tuple[str, Outcome], None, None]:
         calls = [(task.key, task.call()) for task in missing]
-        if elsewhere():
-            return calls_by_joblib(calls, guard, progress.tick)
+        if cluster is not None:
+            return calls_on_cluster(calls, cluster, guard, progress.tick)
         if workers == 1:
             return calls_here(calls, guard)
         return calls_in_processes(calls, workers, guard, progress.tick)

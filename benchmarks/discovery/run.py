@@ -21,7 +21,6 @@ from benchmarks.synthetic_cases.arms import first_seed
 from nnode.errors import ConfigError
 from nnode.machine import cores, how_made
 from nnode.pages.page import Block, Provenance, write_page
-from studies.cluster import on_cluster
 from studies.runner import Task, kept_results, run_tasks
 
 #: Modules of this folder by the kinds of cases.
@@ -98,8 +97,14 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     ]
     if not tasks:
         raise ConfigError("the benchmark has no case: check its domains, arms, variants, effects")
-    with on_cluster(options.cluster):
-        run_tasks(tasks, folder, workers=workers, fingerprint=code, title="cases")
+    run_tasks(
+        tasks,
+        folder,
+        workers=workers,
+        fingerprint=code,
+        cluster=options.cluster,
+        title="cases",
+    )
     rows = [
         row
         for row in kept_results(folder, evaluate, code).values()

@@ -1,4 +1,4 @@
-"""Tasks on a Dask cluster of this machine, through joblib."""
+"""Tasks on a Dask cluster of this machine."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from nnode.calibrate.interrupt import Interrupted
 from nnode.errors import ConfigError, StudyError
-from studies.cluster import elsewhere, on_cluster
 from studies.runner import Task, run_tasks
 from tests.studies import work
 
@@ -35,10 +33,7 @@ def test_tasks_run_in_its_workers_and_are_kept(scheduler: str, tmp_path: Path) -
         Task(f"square-{x:g}", work.square, {"x": x, "log": log}) for x in (1.0, 2.0, 3.0)
     ]
     tasks.append(Task("where", work.conditions, {}))
-    with on_cluster(scheduler):
-        assert elsewhere()
-        found = run_tasks(tasks, tmp_path, workers=1, fingerprint="f")
-    assert not elsewhere()
+    found = run_tasks(tasks, tmp_path, workers=1, fingerprint="f", cluster=scheduler)
     assert [found[f"square-{x}"]["y"] for x in (1, 2, 3)] == [1.0, 4.0, 9.0]
     assert found["where"]["process"] != os.getpid()
     assert found["where"]["threads"] == 1
@@ -53,8 +48,8 @@ def test_a_failure_there_says_why_and_loses_no_other(scheduler: str, tmp_path: P
         Task("wrong", work.fail, {"kind": "data"}),
         Task("right", work.square, {"x": 2.0, "log": log}),
     ]
-    with on_cluster(scheduler), pytest.raises(StudyError, match="no rows"):
-        run_tasks(tasks, tmp_path, workers=1, fingerprint="f")
+    with pytest.raises(StudyError, match="no rows"):
+        run_tasks(tasks, tmp_path, workers=1, fingerprint="f", cluster=scheduler)
     assert (tmp_path / "tasks" / "right.json").exists()
 
 
@@ -68,20 +63,13 @@ def test_a_request_to_stop_waits_for_no_task(scheduler: str, tmp_path: Path) -> 
 
     threading.Thread(target=stop, daemon=True).start()
     start = time.monotonic()
-    with pytest.raises(Interrupted, match="0 of 1 tasks"), on_cluster(scheduler):
-        run_tasks(tasks, tmp_path, workers=1, fingerprint="f")
+    with pytest.raises(Interrupted, match="0 of 1 tasks"):
+        run_tasks(tasks, tmp_path, workers=1, fingerprint="f", cluster=scheduler)
     assert time.monotonic() - start < 30
 
 
-def test_nobody_at_the_address_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_at_the_address_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("studies.cluster.ANSWER", 0.5)
-    with pytest.raises(ConfigError, match="no scheduler answers"), on_cluster("tcp://127.0.0.1:9"):
-        pass
-
-
-def test_no_address_changes_nothing() -> None:
-    def here() -> Any:
-        with on_cluster(None):
-            return elsewhere()
-
-    assert here() is False
+    tasks = [Task("where", work.conditions, {})]
+    with pytest.raises(ConfigError, match="no scheduler answers"):
+        run_tasks(tasks, tmp_path, workers=1, fingerprint="f", cluster="tcp://127.0.0.1:9")
