@@ -16,17 +16,14 @@ import pandas as pd
 from nnode.calibrate.resampling import DRAWS, group_weights, paired
 from nnode.data.store import Store
 from studies.options import StudyOptions
-from studies.runner import Task, hash_of, run_tasks
+from studies.runner import Task, run_tasks
+from studies.stores import hash_of
 
 
 def tidy(tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """A row per task: its function's name as ``task``, its arguments and its results."""
-    return pd.DataFrame(
-        [
-            {"key": t.key, "task": t.function.__name__, **t.arguments, **results[t.key]}
-            for t in tasks
-        ]
-    )
+    """A row per task, by its key: its function's name as ``task``, its arguments and results."""
+    rows = {t.key: {"task": t.function.__name__, **t.arguments, **results[t.key]} for t in tasks}
+    return pd.DataFrame(list(rows.values()), index=list(rows))
 
 
 def computed(
@@ -115,8 +112,21 @@ def versus(costs: pd.DataFrame, reference: str, seed: int) -> pd.DataFrame:
     return means(costs, seed).join(away)
 
 
-def numbers(parameters: Mapping[str, Any]) -> list[tuple[str, str, float]]:
-    """Every number of parameters that may be arrays: name, place in the array, value."""
+def by_number(fits: pd.DataFrame, column: str) -> pd.DataFrame:
+    """A row per number of a column of parameters that may be arrays.
+
+    Args:
+        fits: whose rows have different labels.
+
+    Returns:
+        The other columns, and ``parameter``, ``index`` in its array and ``value``.
+    """
+    each = fits[column].map(_numbers).explode()
+    table = pd.DataFrame(list(each), index=each.index, columns=["parameter", "index", "value"])
+    return fits.drop(columns=column).join(table).reset_index(drop=True)
+
+
+def _numbers(parameters: Mapping[str, Any]) -> list[tuple[str, str, float]]:
     return [
         (name, " ".join(map(str, place)), float(value))
         for name, array in parameters.items()

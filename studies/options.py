@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from omegaconf import MISSING
 
 from nnode.errors import ConfigError
-
-Options = TypeVar("Options", bound="StudyOptions")
 
 
 def option(default: Any, *, quick: Any = None, least: float = 0.0, above: bool = False) -> Any:
@@ -98,25 +96,25 @@ class PredictionStudyOptions(StudyOptions):
     restarts: int = 6  # starts of every law of car following beside its own
 
 
-def checked(options: Options) -> Options:
+def checked(options: StudyOptions) -> StudyOptions:
     """Options within their limits, those of a quick study where it is one; lists ascend.
 
     Raises:
         ConfigError: an option out of its range.
     """
-    found = copy.copy(options)
+    changed: dict[str, Any] = {}
     for one in fields(options):
         value, limit = getattr(options, one.name), one.metadata
         if not limit or value is None:
             continue
-        values = sorted(set(value)) if isinstance(value, list) else value
+        values = sorted(set(value)) if isinstance(value, list) else [value]
         least, above = limit["least"], limit["above"]
-        each = values if isinstance(values, list) else [values]
-        if not each or min(each) < least or (above and min(each) == least):
+        if not values or values[0] < least or (above and values[0] == least):
             what = "positive" if above else f"at least {least:g}"
             raise ConfigError(f"study.{one.name}={value} must be {what}")
         quick = limit["quick"] if options.quick else None
-        if isinstance(quick, slice):
-            values = values[quick]
-        setattr(found, one.name, values if quick is None or isinstance(quick, slice) else quick)
-    return found
+        if isinstance(value, list):
+            changed[one.name] = values if quick is None else values[quick]
+        elif quick is not None:
+            changed[one.name] = quick
+    return replace(options, **changed)

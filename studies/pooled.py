@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -19,39 +18,28 @@ from nnode.simulation.fused import FusedSolver
 STEPS, BEST = 12, 2
 
 
-@dataclass(frozen=True)
-class Pooled:
-    """What a calibration found; the system has these parameters.
-
-    Attributes:
-        row: parameters by name.
-        error: mean squared distance over agents and samples, m².
-        starts: the same reached from every start that went on.
-        evaluations: simulations of the first batch.
-    """
-
-    row: dict[str, float]
-    error: float
-    starts: list[float]
-    evaluations: int
+def parameters_of(system: System) -> dict[str, float]:
+    """The parameters of a model of one term by name."""
+    return {name: value.item() for name, value in system.terms[0].named_parameters()}
 
 
-def start_of(system: System, batch: Batch) -> dict[str, float]:
-    """A model's parameters by name, as it has them."""
-    vector = ResidualProblem(system, batch, FusedSolver(), Convention.sum).vector
-    names = [name for name, _ in system.terms[0].named_parameters()]
-    return dict(zip(names, vector.row.tolist(), strict=True))
+def filled(system: System, row: Mapping[str, float]) -> System:
+    """The same model with other parameters."""
+    return ParameterVector(system).fill_(np.array([row[name] for name in parameters_of(system)]))
 
 
 def pooled_fit(
-    system: System, batches: Sequence[Batch], starts: Sequence[dict[str, float]]
-) -> Pooled:
+    system: System, batches: Sequence[Batch], starts: Sequence[Mapping[str, float]]
+) -> tuple[dict[str, float], float]:
     """Calibrate a model of one term.
 
     Args:
-        system: is filled with what is found.
+        system: is filled with the result.
         batches: all their samples count alike.
         starts: parameters by name, of which the best go on.
+
+    Returns:
+        Parameters by name, and the mean squared distance over agents and samples, m².
     """
     problems = [ResidualProblem(system, batch, FusedSolver(), Convention.sum) for batch in batches]
     first = problems[0]
@@ -73,11 +61,7 @@ def pooled_fit(
         )
         for row in rows[:BEST]
     ]
-    found = min(minima, key=lambda one: float(one.cost[0]))
-    ParameterVector(system).fill_(found.row[0])
-    return Pooled(
-        row=dict(zip(starts[0], found.row[0].tolist(), strict=True)),
-        error=float(found.cost[0]),
-        starts=[float(one.cost[0]) for one in minima],
-        evaluations=first.simulations,
-    )
+    best = min(minima, key=lambda one: float(one.cost[0]))
+    found = dict(zip(starts[0], best.row[0].tolist(), strict=True))
+    filled(system, found)
+    return found, float(best.cost[0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from collections.abc import Sequence as Many
 
 import numpy as np
 import torch
@@ -13,11 +12,6 @@ from nnode.errors import SimulationError
 from nnode.model.system import System
 from nnode.pages.replay import ReplayBlock, Scene
 from nnode.simulation.fused import FusedSolver
-
-
-def spread(items: Many[Sequence], number: int) -> list[Sequence]:
-    """At most so many of some sequences, evenly chosen."""
-    return list(items[:: max(1, -(-len(items) // number))])
 
 
 def scenes(
@@ -44,15 +38,15 @@ def _simulated(system: System, s: Sequence, solver: FusedSolver) -> np.ndarray:
         return np.concatenate([s.x[:1], np.full_like(s.x[1:], np.nan)])
 
 
-def player(name: str, every: list[Scene], what: str, total: int) -> ReplayBlock:
-    """The player of some scenes.
+def player(every: list[Scene], what: str, total: int) -> ReplayBlock:
+    """The player of some scenes, as :mod:`studies.page` places it under the name ``replay``.
 
     Args:
         what: which sequences and models they are, as a sentence.
         total: sequences that they were chosen from.
     """
     return ReplayBlock(
-        name,
+        "replay",
         every,
         f"{what} Outlines are measured agents. Arrows lead from the simulated to the measured "
         "position. The player opens on the sequence with the median error.",

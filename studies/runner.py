@@ -7,21 +7,19 @@ again with some options changed, computes only what it has not computed before.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import re
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from nnode.calibrate.interrupt import Interrupted, InterruptGuard
-from nnode.data.store import Store
 from nnode.errors import StudyError
 from nnode.files import write_json, write_text
 from nnode.version import VERSION
@@ -61,10 +59,6 @@ class Task:
     def __post_init__(self) -> None:
         if not _KEY.fullmatch(self.key):
             raise ValueError(f"a task's key must be usable as a file name, got {self.key!r}")
-        if "<" in self.function.__qualname__:
-            raise ValueError(f"task {self.key}: {self.function.__qualname__} is not of a module")
-        if not self.cost > 0:
-            raise ValueError(f"task {self.key}: its cost must be positive, got {self.cost}")
 
     def identity(self, fingerprint: str) -> dict[str, Any]:
         """What a result depends on."""
@@ -78,12 +72,6 @@ class Task:
     def call(self) -> Call:
         """The function, and the arguments as JSON gives them back: the same in any process."""
         return self.function, json.loads(json.dumps(self.arguments))
-
-
-def hash_of(stores: Mapping[str, Store]) -> str:
-    """Of the content of all files of prepared data: a fingerprint of tasks that read them."""
-    content = {name: store.manifest["files"] for name, store in stores.items()}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def run_tasks(

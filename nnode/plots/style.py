@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axes._secondary_axes import SecondaryAxis
 from matplotlib.cm import ScalarMappable
@@ -103,8 +102,8 @@ def legend_above(figure: Figure, handles: list[Any], columns: int = 3) -> None:
     )
 
 
-def thinned(points: np.ndarray, number: int) -> np.ndarray:
-    """At most ``number`` of the points, at equal steps."""
+def thinned(points: Any, number: int) -> Any:
+    """At most ``number`` of the points of an array or a list, at equal steps."""
     return points[:: max(1, -(-len(points) // number))]
 
 

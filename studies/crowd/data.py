@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,8 @@ from nnode.data.prepare import prepare
 from nnode.data.readers.juelich import JuelichOptions
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.store import Store
-from nnode.errors import ConfigError
+from studies.options import StudyOptions
+from studies.stores import sequences
 
 #: The recording that the paper calibrates on, and its walls, m.
 RECORDING, WALLS = "bi_corr_400_b_03", {"*": [0.0, 4.0]}
@@ -38,57 +38,34 @@ GROUP = 10.0
 ALL = "all"
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where sequences come from: a prepared folder, and which of them train.
-
-    Attributes:
-        folder: of the store.
-        scope: ``all``, or ``fold-<n>``: everything but the n-th block of time.
-        folds: number of blocks.
-    """
-
-    folder: str
-    scope: str = ALL
-    folds: int = 4
-
-
-def prepare_horizon(
-    source: str | None, download: str | None, horizon: float, folder: Path, *, others: bool = False
-) -> Store:
+def prepared(options: StudyOptions, folder: Path, kind: str, horizon: float, **more: Any) -> Store:
     """Cut the paper's recording, or the other runs, into sequences of ``horizon`` seconds.
 
     Only people who are tracked through a whole sequence are part of it: the longer it is, the
     fewer and the slower they are.
-    """
-    options = corridor(others, source=source, download=download, t_seq=horizon)
-    return prepare(options, folder)
-
-
-def corridor(others: bool, **more: Any) -> JuelichOptions:
-    """Options of the paper's recording, or of the other runs.
 
     Args:
+        folder: of the study.
+        kind: ``main`` or ``others``.
         more: further options of the data source.
     """
-    if not others:
-        return JuelichOptions(recording=RECORDING, walls=WALLS, **more)
-    return JuelichOptions(
-        name="hermes",
-        recording=list(OTHERS),
-        frame_rate=16.0,
-        unit="cm",
-        walking_axis="y",
-        walls=OTHER_WALLS,
-        view=VIEW,
-        **more,
+    chosen: dict[str, Any] = {"recording": RECORDING, "walls": WALLS}
+    if kind == "others":
+        chosen = {
+            "name": "hermes",
+            "recording": list(OTHERS),
+            "frame_rate": 16.0,
+            "unit": "cm",
+            "walking_axis": "y",
+            "walls": OTHER_WALLS,
+            "view": VIEW,
+        }
+    data = folder / "data"
+    download = options.download or str(data / "raw")
+    source = JuelichOptions(
+        source=options.source, download=download, t_seq=horizon, **chosen, **more
     )
-
-
-@lru_cache(maxsize=8)
-def sequences(folder: str) -> tuple[Sequence, ...]:
-    """All sequences of a prepared folder."""
-    return tuple(Store(folder))
+    return prepare(source, data / f"{kind}-{horizon:g}s")
 
 
 def fold_of(
@@ -100,8 +77,6 @@ def fold_of(
         starts, ends: ``(S,)`` s.
         span: first and last time of the recording, s; it is divided into equal blocks.
     """
-    if folds < 2:
-        raise ConfigError(f"study.folds={folds}: expected at least 2 blocks of time")
     width = (span[1] - span[0]) / folds
     tiny = 1e-6 * width
     first = np.floor((starts - span[0] + tiny) / width).astype(int)
@@ -109,18 +84,26 @@ def fold_of(
     return np.where(first == last, first.clip(0, folds - 1), -1)
 
 
-def parts(place: Place, span: tuple[float, float]) -> tuple[list[int], list[int]]:
+def parts(
+    folder: str, scope: str, folds: int, span: tuple[float, float]
+) -> tuple[list[int], list[int]]:
     """Positions of the sequences that train and of those that are held out.
 
     Whoever shares a person with a held-out sequence does not train. The blocks are the same
     spans of time at every horizon.
+
+    Args:
+        folder: of the prepared sequences.
+        scope: ``all``, or ``fold-<n>``: everything but the n-th block of time.
+        folds: number of blocks.
+        span: first and last time of the recording, s.
     """
-    every = sequences(place.folder)
-    if place.scope == ALL:
+    every = sequences(folder)
+    if scope == ALL:
         return list(range(len(every))), []
-    number = int(place.scope.removeprefix("fold-"))
+    number = int(scope.removeprefix("fold-"))
     starts, ends = (np.array([s.time[k] for s in every]) for k in (0, -1))
-    held = np.flatnonzero(fold_of(starts, ends, place.folds, span) == number).tolist()
+    held = np.flatnonzero(fold_of(starts, ends, folds, span) == number).tolist()
     people = {agent for i in held for agent in every[i].agents}
     out = set(held)
     return [i for i, s in enumerate(every) if i not in out and people.isdisjoint(s.agents)], held
@@ -130,12 +113,6 @@ def chosen(folder: str, index: Iterable[int]) -> Batch:
     """Some sequences of a folder as one batch."""
     every = sequences(folder)
     return collate(every[i] for i in index)
-
-
-def cut(batch: Batch, samples: int) -> Batch:
-    """The first ``samples`` samples of every sequence; destinations stay what they are."""
-    k = min(samples, batch.n_samples)
-    return replace(batch, x=batch.x[:k], v=batch.v[:k], valid=batch.valid[:k])
 
 
 def time_groups(items: Iterable[Sequence]) -> np.ndarray:

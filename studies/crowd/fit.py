@@ -7,7 +7,7 @@ therefore begins with the first samples of every sequence and follows the minimu
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -54,21 +54,6 @@ def row_of(system: System) -> np.ndarray:
     return ParameterVector(system).row.numpy()
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """Where a calibration ended.
-
-    Attributes:
-        row: ``(K,)`` all parameters of the model.
-        cost: of training, m² s.
-        evaluations: simulations.
-    """
-
-    row: np.ndarray
-    cost: float
-    evaluations: int
-
-
 def calibrate(
     model: str,
     batch: Batch,
@@ -78,7 +63,7 @@ def calibrate(
     grow: bool = True,
     weights: np.ndarray | None = None,
     steps: int = 30,
-) -> Fitted:
+) -> tuple[np.ndarray, int]:
     """Damped least squares within the model's bounds.
 
     Args:
@@ -90,6 +75,9 @@ def calibrate(
         grow: begin with the first samples of every sequence.
         weights: ``(B,)`` weight of each sequence, of sum 1; None takes the mean.
         steps: on whole sequences, at most.
+
+    Returns:
+        ``(K,)`` all parameters of the model, and the number of simulations.
     """
     system = system_of(model, start)
     if not people:
@@ -102,9 +90,9 @@ def calibrate(
         begin = problem.initial_fit(
             begin, GROWTH[model], steps=min(steps, SHORT_STEPS[model]), **options
         )
-    found = pooled(problem, begin, steps=steps, **options)
-    row = row_of(problem.vector.fill_(found.row).requires_grad_())  # those that were held, too
-    return Fitted(row, float(found.cost), problem.simulations)
+    best = pooled(problem, begin, steps=steps, **options).row
+    row = row_of(problem.vector.fill_(best).requires_grad_())  # those that were held, too
+    return row, problem.simulations
 
 
 def silence(system: System) -> None:

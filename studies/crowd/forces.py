@@ -115,9 +115,8 @@ def away_by_distance(system: System, measured: Measured) -> pd.DataFrame:
 def likeness(first: np.ndarray, second: np.ndarray) -> float:
     """Correlation of two ``(M, 2)`` fields of vectors about their means; NaN where one is
     constant."""
-    a, b = first - first.mean(0), second - second.mean(0)
-    size = np.sqrt((a**2).sum() * (b**2).sum())
-    return float((a * b).sum() / size) if size > 0 else float("nan")
+    fields = pd.DataFrame([(field - field.mean(0)).ravel() for field in (first, second)])
+    return float(fields.T.corr().to_numpy()[0, 1])
 
 
 def size(field: np.ndarray) -> float:

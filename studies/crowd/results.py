@@ -10,26 +10,22 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from nnode.data.sequence import collate
 from nnode.data.store import Store
 from nnode.model.system import System
 from nnode.pages.replay import ReplayBlock
 from nnode.plots.crowd import force_contours
 from nnode.plots.settings import SETTINGS, Setting, six_settings
+from nnode.plots.style import thinned
 from studies.crowd import figures, forces, printed
-from studies.crowd.data import (
-    ALL,
-    GROUP,
-    RECORDING,
-    chosen,
-    mean_speed,
-    sequences,
-    time_groups,
-)
+from studies.crowd.data import ALL, GROUP, RECORDING, mean_speed, time_groups
 from studies.crowd.fit import NAMES, named, system_of
 from studies.crowd.tasks import KINDS
-from studies.frame import by_unit, differences, labelled, means, numbers
+from studies.figures import horizon_costs
+from studies.frame import by_number, by_unit, differences, labelled, means
 from studies.options import CrowdStudyOptions
-from studies.replay import player, scenes, spread
+from studies.replay import player, scenes
+from studies.stores import sequences
 
 #: How the page calls what was simulated.
 LABELS = {
@@ -56,7 +52,7 @@ class Crowd:
 
     options: CrowdStudyOptions
     stores: dict[tuple[str, float], Store]
-    found: pd.DataFrame = field(default_factory=pd.DataFrame)
+    found: Any = field(default_factory=pd.DataFrame)
 
     def add(self, horizon: float, results: pd.DataFrame) -> None:
         """The results of tasks at a horizon."""
@@ -243,13 +239,15 @@ class Crowd:
     def _every_parameter(self) -> pd.DataFrame:
         """All calibrations, one row per number: what is needed to compute their costs again."""
         fits = self.found[self.found["task"] == "fit"]
-        rows = [
-            [*(one[k] for k in ("kind", "scope", "horizon", "seed")), name, place, value]
-            for one in fits.to_dict("records")
-            for name, place, value in numbers(named(KINDS[one["kind"]], one["row"]))
-        ]
-        names = ["model", "trained on", "horizon (s)", "start", "parameter", "index", "value"]
-        return pd.DataFrame(rows, columns=names).set_index(names[:4])
+        values = [named(KINDS[k], row) for k, row in zip(fits["kind"], fits["row"], strict=True)]
+        names = {
+            "kind": "model",
+            "scope": "trained on",
+            "horizon": "horizon (s)",
+            "seed": "start",
+        }
+        table = fits[list(names)].rename(columns=names).assign(values=values)
+        return by_number(table, "values").set_index(list(names.values()))
 
     # -- forces at the first horizon, all sequences training -----------------------------------
 
@@ -257,34 +255,38 @@ class Crowd:
     def measured(self) -> forces.Measured:
         """States and pairs of the people at the first horizon."""
         folder = self.folder("main", self.options.horizons[0])
-        return forces.Measured.of(chosen(folder, range(len(sequences(folder)))))
+        return forces.Measured.of(collate(sequences(folder)))
 
     @cached_property
-    def starts(self) -> dict[str, list[tuple[Any, System, dict[str, np.ndarray]]]]:
-        """By kind, all calibrations, least cost first, with system and people's accelerations."""
-        found: dict[str, list[tuple[Any, System, dict[str, np.ndarray]]]] = {}
-        for kind in MODELS:
-            fits = self.fits(kind, ALL, self.options.horizons[0]).to_dict("records")
-            for one in fits:
-                system = system_of(KINDS[kind], one["row"])
-                parts = forces.accelerations(system, self.measured)
-                found.setdefault(kind, []).append((one, system, parts))
-        return found
+    def starts(self) -> Any:
+        """Calibrations of every kind, least cost first, with the model as ``system`` and the
+        accelerations of people as ``parts``."""
+        fits = pd.concat(self.fits(kind, ALL, self.options.horizons[0]) for kind in MODELS)
+        models = fits["kind"].map(KINDS)
+        systems = [system_of(m, row) for m, row in zip(models, fits["row"], strict=True)]
+        parts = [forces.accelerations(system, self.measured) for system in systems]
+        return fits.assign(system=systems, parts=parts)
+
+    @property
+    def best_parts(self) -> Any:
+        """Accelerations of people by the best start of every kind."""
+        return self.starts.groupby("kind", sort=False)["parts"].first()
 
     def _restarts(self) -> pd.DataFrame:
         rows = {}
-        for kind, every in self.starts.items():
-            for one, _, parts in every:
-                row = {"J (m² s)": one["J"], "evaluations": one["evaluations"]}
-                row |= dict(zip(NAMES, one["row"], strict=True)) if kind == "sf" else {}
-                for part in ("pair", "wall", "sum"):
-                    row[f"size, {part}"] = forces.size(parts[part])
-                    row[f"likeness, {part}"] = forces.likeness(parts[part], every[0][2][part])
-                rows[LABELS[kind], one["seed"]] = row
+        for one in self.starts.to_dict("records"):
+            kind, parts = one["kind"], one["parts"]
+            row = {"J (m² s)": one["J"], "evaluations": one["evaluations"]}
+            row |= dict(zip(NAMES, one["row"], strict=True)) if kind == "sf" else {}
+            for part in ("pair", "wall", "sum"):
+                row[f"size, {part}"] = forces.size(parts[part])
+                best = self.best_parts[kind][part]
+                row[f"likeness, {part}"] = forces.likeness(parts[part], best)
+            rows[LABELS[kind], one["seed"]] = row
         return labelled(rows, "model", "start")
 
     def _pull(self) -> pd.DataFrame:
-        rows = {LABELS[kind]: forces.slope(every[0][2]) for kind, every in self.starts.items()}
+        rows = {LABELS[kind]: forces.slope(parts) for kind, parts in self.best_parts.items()}
         return pd.DataFrame(rows, index=["rate (1/s)", "to the speed (m/s)"]).T
 
     def _settings(self, model: str) -> tuple[Figure, pd.DataFrame]:
@@ -314,12 +316,13 @@ class Crowd:
 
     def figures(self) -> dict[str, Figure | ReplayBlock]:
         """By their names in the template."""
-        first, starts = self.options.horizons[0], self.starts
+        first = self.options.horizons[0]
+        systems = self.starts.groupby("kind")["system"].agg(list)
         curves = {
-            LABELS[k]: [forces.away_by_distance(system, self.measured) for _, system, _ in every]
-            for k, every in (("sf", starts["sf"][:1]), ("nn", starts["nn"]))
+            LABELS[kind]: [forces.away_by_distance(system, self.measured) for system in every]
+            for kind, every in (("sf", systems["sf"][:1]), ("nn", systems["nn"]))
         }
-        speeds = {LABELS[k]: forces.along_by_speed(every[0][2]) for k, every in starts.items()}
+        speeds = {LABELS[k]: forces.along_by_speed(parts) for k, parts in self.best_parts.items()}
         found: dict[str, Figure | ReplayBlock] = {
             "crowd_horizons": self._by_horizon(),
             "crowd_range": figures.forces_by_distance(curves),
@@ -345,7 +348,7 @@ class Crowd:
             pd.DataFrame({h: table[what] for h, table in found.items()})
             for what in ("mean", "low", "high")
         )
-        return figures.horizon_costs(self.options.horizons, mean, low, high)
+        return horizon_costs(self.options.horizons, mean, low, high)
 
     def _replay(self) -> ReplayBlock:
         horizon = self.options.horizons[-1]
@@ -355,7 +358,7 @@ class Crowd:
             f"Sequences of {horizon:g} s of the paper's recording, as measured and as simulated by "
             f"{' and '.join(systems)}, which are calibrated to all sequences."
         )
-        return player("replay", scenes(spread(every, FEW), systems), what, len(every))
+        return player(scenes(thinned(every, FEW), systems), what, len(every))
 
     def values(self) -> dict[str, Any]:
         """What else the template refers to."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from nnode.pages.page import Block
 from studies.crowd import tasks
-from studies.crowd.data import ALL, prepare_horizon
+from studies.crowd.data import ALL, prepared
 from studies.crowd.results import Crowd
 from studies.frame import computed
 from studies.options import CrowdStudyOptions
@@ -35,11 +35,8 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
         DataError: recordings that cannot be read, or a horizon longer than anyone is in view.
         StudyError: tasks failed.
     """
-    download = options.download or str(folder / "data" / "raw")
     stores = {
-        (kind, h): prepare_horizon(
-            options.source, download, h, folder / "data" / f"{kind}-{h:g}s", others=kind == "others"
-        )
+        (kind, h): prepared(options, folder, kind, h)
         for h in options.horizons
         for kind in ("main", "others")
     }

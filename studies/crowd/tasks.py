@@ -13,9 +13,10 @@ from nnode.calibrate.resampling import group_weights
 from nnode.data.sequence import Batch, collate
 from nnode.simulation.base import Trajectory
 from nnode.simulation.fused import FusedSolver
-from studies.crowd.data import Place, chosen, parts, sequences, time_groups, turned
+from studies.crowd.data import chosen, parts, time_groups, turned
 from studies.crowd.fit import calibrate, costs, new_system, row_of
 from studies.crowd.printed import PARAMETERS
+from studies.stores import sequences
 
 Result = dict[str, Any]
 
@@ -42,32 +43,29 @@ def fit(
 
     Args:
         kind: of KINDS.
-        folder, scope, folds: see :class:`studies.crowd.data.Place`.
-        span: first and last time of the recording, s.
+        folder, scope, folds, span: see :func:`studies.crowd.data.parts`.
         seed: of the random start, as the paper draws it.
         start: parameters found at a shorter horizon, to go on from; None starts afresh.
         steps: of the networks, see :func:`studies.crowd.fit.calibrate`.
     """
-    place = Place(folder, scope, folds)
-    train, held = parts(place, (span[0], span[1]))
+    train, held = parts(folder, scope, folds, (span[0], span[1]))
     batch, model = chosen(folder, train), KINDS[kind]
     begin = row_of(new_system(model, seed)) if start is None else np.array(start)
-    fresh = start is None
-    found = calibrate(
+    row, evaluations = calibrate(
         model,
         batch,
         begin,
         people=kind != "wall",
-        grow=fresh,
+        grow=start is None,
         steps=SF_STEPS if kind == "sf" else steps,
     )
-    each = costs(model, found.row, batch)
+    each = costs(model, row, batch)
     return {
-        "row": found.row.tolist(),
+        "row": row.tolist(),
         "J": float(each.mean()),
-        "evaluations": found.evaluations,
+        "evaluations": evaluations,
         "train": _by_name(batch, each),
-        "heldout": _of(model, found.row, chosen(folder, held)) if held else {},
+        "heldout": _of(model, row, chosen(folder, held)) if held else {},
     }
 
 
@@ -84,17 +82,16 @@ def resample(folder: str, row: list[float], draws: int, first: int, last: int, s
     for weights in group_weights(time_groups(every), draws, rng)[first:last]:
         drawn = np.flatnonzero(weights)
         batch = collate(every[i] for i in drawn)
-        found = calibrate(
+        refit, _ = calibrate(
             "sf", batch, np.array(row), grow=False, weights=weights[drawn], steps=REFIT
         )
-        rows.append(found.row.tolist())
+        rows.append(refit.tolist())
     return {"rows": rows}
 
 
 def baselines(folder: str) -> Result:
     """Costs by sequence of simulations that calibrate nothing, and of the printed parameters."""
-    batch = chosen(folder, range(len(sequences(folder))))
-    return {"costs": _simple(batch), "people": batch.agent.sum(1).tolist()}
+    return {"costs": _simple(collate(sequences(folder)))}
 
 
 def transfer(folder: str, rows: dict[str, list[float]]) -> Result:

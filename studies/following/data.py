@@ -19,6 +19,7 @@ from nnode.data.split import TEST, TRAIN
 from nnode.data.store import Store
 from nnode.errors import ConfigError
 from studies.options import FollowingStudyOptions
+from studies.stores import sequences
 
 #: Names of the prepared stores.
 PAIRS, PLATOONS, LEADERS = "pairs", "platoons", "leaders"
@@ -66,13 +67,6 @@ def stores(options: FollowingStudyOptions, folder: Path) -> dict[str, Store]:
     }
 
 
-@lru_cache(maxsize=4)
-def sequences(folder: str) -> tuple[Sequence, ...]:
-    """All sequences of a prepared folder."""
-    return tuple(Store(folder))
-
-
-@lru_cache(maxsize=4)
 def pairs(folder: str, test: bool = False) -> tuple[Sequence, ...]:
     """The pairs of one side of the published division."""
     return tuple(s for s in sequences(folder) if s.split == (TEST if test else TRAIN))

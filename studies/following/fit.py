@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
 
 from nnode.calibrate.cost import Convention
+from nnode.calibrate.intervals import at_bounds
 from nnode.calibrate.least_squares import Minimum
 from nnode.calibrate.pooling import best_alone
 from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import Batch
-from nnode.model.build import build_model
-from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulation.fused import FusedSolver
 from studies.following import data, printed
 from studies.following.candidates import EVERY, Candidate, decay, starts
@@ -25,8 +23,6 @@ Result = dict[str, Any]
 OBJECTIVES = ("spacing", "gap", "relative_gap", "log_gap", "speed")
 #: A calibration ends after so many steps, or when one lowers the cost by less than this share.
 STEPS, TOLERANCE = 60, 1e-7
-#: Share of a limit's range within which a parameter counts as at it.
-TOUCHES = 1e-6
 
 
 def costs_of(candidate: Candidate, batch: Batch, objective: str = "spacing") -> ResidualProblem:
@@ -61,9 +57,8 @@ def named(cost: ResidualProblem, row: np.ndarray) -> dict[str, float]:
 
 def at_limits(cost: ResidualProblem, row: np.ndarray) -> list[str]:
     """Names of the parameters that ended at a limit."""
-    span = np.where(np.isfinite(cost.high - cost.low), cost.high - cost.low, 0.0)
-    near = (row - cost.low <= TOUCHES * span) | (cost.high - row <= TOUCHES * span)
-    return [name for name, at in zip(named(cost, row), near & (span > 0), strict=True) if at]
+    low, high = at_bounds(cost, row)
+    return [name for name, at in zip(named(cost, row), low | high, strict=True) if at]
 
 
 def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int) -> Result:
@@ -72,7 +67,6 @@ def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int)
     Returns:
         Costs by objective of all training pairs, and of those that were held out.
     """
-    begin = time.perf_counter()
     candidate, batch = EVERY[name], data.batch(folder)
     label = data.labels(data.pairs(folder))
     fold = by_cluster(label, folds, seed)
@@ -93,7 +87,6 @@ def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int)
         "train": {one: others[one].costs(whole.row).tolist() for one in OBJECTIVES},
         "heldout": {one: values.tolist() for one, values in held.items()},
         "clusters": label.tolist(),
-        "seconds": time.perf_counter() - begin,
     }
 
 
@@ -143,10 +136,6 @@ def reproduced(folder: str) -> Result:
     for law, parameters in printed.PARAMETERS.items():
         for k, objective in enumerate(printed.OBJECTIVES):
             values = {name: each[k] for name, each in parameters.items()}
-            described = printed.clipped(CAR_FOLLOWING_LAWS[law], printed.CLIPPED[law], values)
-            system = build_model(
-                {"term": "formula", "name": law, "leader": "measured", "law": described}
-            )
-            cost = ResidualProblem(system, batch, FusedSolver(), Convention.spacing)
+            cost = costs_of(Candidate(law, given=printed.published(law, values)), batch)
             found[f"{law} {objective}"] = (cost.costs(cost.start) * first).tolist()
     return found

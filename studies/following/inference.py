@@ -91,13 +91,6 @@ def halves(
     found = pooling.halves(first, second, np.array(row), others, fold)
     return {
         "names": list(named(first, found.centre)),
-        "centre": found.centre.tolist(),
-        "spread": found.spread.tolist(),
-        "between": found.between.tolist(),
-        "pooled": found.pooled.tolist(),
-        "alone": found.alone.tolist(),
-        "shrunk": found.shrunk.tolist(),
-        "strengths": found.strengths,
-        "by_strength": found.by_strength.tolist(),
+        **{field: np.array(values).tolist() for field, values in vars(found).items()},
         "clusters": label.tolist(),
     }

@@ -8,17 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from nnode.calibrate.cost import Convention
 from nnode.calibrate.pooling import best_alone
 from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.model.build import build_model
-from nnode.model.laws import CAR_FOLLOWING_LAWS
-from nnode.simulation.fused import FusedSolver
 from studies.following import data, printed
 from studies.following.candidates import Candidate, decay, starts
 from studies.following.data import gap_of
-from studies.following.fit import at_limits, costs_of, named
+from studies.following.fit import STEPS, TOLERANCE, at_limits, costs_of, named
+from studies.stores import sequences
 
 Result = dict[str, Any]
 
@@ -33,16 +30,13 @@ CANDIDATES = {
         *(Candidate(law, (e,)) for e in LATE if law not in ("krauss", "newell", "a2", "a4")),
     )
 }
-#: Steps of one calibration.
-STEPS = 60
 
 
 def followers(folder: str, run: str | None = None) -> list[Sequence]:
     """Pairs of all followers of a run, or of all runs."""
-    every = data.sequences(folder)
     return [
         pair
-        for platoon in every
+        for platoon in sequences(folder)
         if run is None or platoon.recording == run
         for pair in data.behind(platoon)
     ]
@@ -54,7 +48,7 @@ def own_rows(
     """Every pair by itself: the cost, ``(B, P)`` best rows of several starts, ``(B,)`` costs."""
     cost = costs_of(candidate, batch)
     begin = starts(candidate, cost, restarts, seed)
-    rows, _ = best_alone(cost, begin, steps=STEPS, tolerance=1e-7, penalty=decay(cost))
+    rows, _ = best_alone(cost, begin, steps=STEPS, tolerance=TOLERANCE, penalty=decay(cost))
     return cost, rows, cost.costs(rows)
 
 
@@ -65,14 +59,11 @@ def reproduced(folder: str) -> Result:
     for pair in followers(folder, printed.PLATOON):
         make = pair.agents[0]
         values = printed.PLATOON_PARAMETERS[make]
-        described = printed.clipped(CAR_FOLLOWING_LAWS["ovm"], printed.CLIPPED["ovm"], values)
-        system = build_model(
-            {"term": "formula", "name": "ovm", "leader": "measured", "law": described}
-        )
-        rest = pair.part(printed.FIRST, 1.0)
-        cost = ResidualProblem(system, collate([rest]), FusedSolver(), Convention.spacing)
+        law = Candidate("ovm", given=printed.published("ovm", values))
+        last_part = pair.part(printed.FIRST, 1.0)
+        cost = costs_of(law, collate([last_part]))
         found["law"][make] = float(cost.costs(cost.start)[0])
-        found["stopped"][make] = collided(rest, values)
+        found["stopped"][make] = collided(last_part, values)
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from nnode.model.laws import CAR_FOLLOWING_LAWS
 from studies.printed import told
 
 _TOLD = told(__package__)
@@ -20,18 +21,14 @@ PLATOON_PARAMETERS = _TOLD["platoon_parameters"]
 UNITS = _TOLD["units"]
 
 
-def clipped(
-    law: dict[str, Any], limits: tuple[float, float], values: dict[str, float]
-) -> dict[str, Any]:
-    """A law of the shelf with published parameters, its acceleration clipped, in the published
-    steps, ballistic ones.
+def published(name: str, values: dict[str, float]) -> dict[str, Any]:
+    """A law of :data:`nnode.model.laws.CAR_FOLLOWING_LAWS` with published parameters, its
+    acceleration clipped, in the published steps, ballistic ones.
 
     Args:
-        law: its description, see :data:`nnode.model.laws.CAR_FOLLOWING_LAWS`.
-        limits: m/s².
         values: by parameter, SI units.
     """
-    low, high = limits
+    law, (low, high) = CAR_FOLLOWING_LAWS[name], CLIPPED[name]
     ends = {"least_rate": f"{low} m/s²", "most_rate": f"{high} m/s²"}
     return {
         **law,
@@ -40,3 +37,8 @@ def clipped(
         "rate": {"v": f"clip({law['rate']['v']}, least_rate, most_rate)"},
         "step": "ballistic",
     }
+
+
+def units(names: list[str]) -> list[str]:
+    """The units of parameters; 1 where there is none."""
+    return [UNITS.get(name, "1") for name in names]

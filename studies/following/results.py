@@ -5,25 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
 from nnode.model.system import System
 from nnode.pages.replay import ReplayBlock
-from nnode.simulation.fused import FusedSolver
-from studies.following import data, figures, leaders, platoons, printed, stability
+from nnode.plots.style import thinned
+from studies.following import data, figures, leaders, printed, stability
 from studies.following.candidates import DECAY, EVERY, REFERENCE, key
 from studies.following.data import gap_of
-from studies.following.fit import OBJECTIVES
-from studies.frame import by_unit, differences, labelled, versus
+from studies.following.fit import OBJECTIVES, costs_of
+from studies.frame import by_number, by_unit, differences, labelled, versus
 from studies.options import FollowingStudyOptions
-from studies.replay import player, scenes, spread
+from studies.replay import player, scenes
 
 #: Objectives on a page.
 WITH_UNITS = {
@@ -49,22 +49,22 @@ FEW = 10
 
 @dataclass
 class Study:
-    """Options, prepared data, and results of tasks by key."""
+    """Options, prepared data, and a row of results per task, by its key."""
 
     options: FollowingStudyOptions
     stores: dict[str, Store]
-    found: dict[str, dict[str, Any]]
+    found: Any
 
-    def one(self, kind: str, name: str) -> dict[str, Any]:
-        """The result of a task of a candidate."""
-        return self.found[f"{kind}-{key(name)}"]
+    def of(self, task: str) -> Any:
+        """The results of a function that many candidates are given to, a row per candidate."""
+        return self.found[self.found["task"] == task].set_index("name")
 
     @property
     def names(self) -> list[str]:
         """Candidates that were cross-validated."""
-        return [name for name in EVERY if f"cv-{key(name)}" in self.found]
+        return list(self.of("cross_validate").index)
 
-    @property
+    @cached_property
     def order(self) -> list[str]:
         """Candidates by cross-validated error: no test pair has a say in it."""
         return list(self.heldout().mean().sort_values().index)
@@ -76,12 +76,12 @@ class Study:
 
     def heldout(self, objective: str = "spacing") -> pd.DataFrame:
         """Cross-validated costs of the training pairs, a column per candidate."""
-        costs = {name: self.one("cv", name)["heldout"][objective] for name in self.names}
-        return by_unit(costs, self.one("cv", REFERENCE)["clusters"])
+        one = self.of("cross_validate")
+        return by_unit(one["heldout"].map(itemgetter(objective)), one.loc[REFERENCE, "clusters"])
 
     def tested(self) -> pd.DataFrame:
         """Costs of the test pairs, each a cluster of its own."""
-        costs = {name: self.one("test", name)["spacing"] for name in self.names}
+        costs = self.of("tested")["spacing"]
         return by_unit(costs, range(len(costs[REFERENCE])))
 
     def away(self, costs: pd.DataFrame) -> pd.DataFrame:
@@ -95,22 +95,18 @@ class Study:
 
     def system(self, name: str) -> System:
         """A candidate with its parameters from all training pairs."""
-        system = EVERY[name].system()
-        vector = ResidualProblem(system, collate(self.pairs()[:1]), FusedSolver()).vector
-        return vector.fill_(np.array(self.one("cv", name)["row"]))
+        row = self.of("cross_validate").loc[name, "row"]
+        return costs_of(EVERY[name], collate(self.pairs()[:1])).vector.fill_(np.array(row))
 
     # -- tables ------------------------------------------------------------------------------
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """By their names in the template."""
+        objectives = {label: self.heldout(o).mean() for o, label in WITH_UNITS.items()}
         found = {
             "published": self._published(),
             "candidates": self._candidates(),
-            "objectives_heldout": pd.DataFrame(
-                {label: self.heldout(o).mean() for o, label in WITH_UNITS.items()}
-            )
-            .loc[self.order]
-            .rename_axis("candidate"),
+            "objectives_heldout": pd.DataFrame(objectives).loc[self.order].rename_axis("candidate"),
             "test": self._test(),
             "sides": self._sides().groupby("side", sort=False).mean(),
             "equilibrium_gaps": self._equilibrium_gaps(),
@@ -131,7 +127,7 @@ class Study:
         return found
 
     def _published(self) -> pd.DataFrame:
-        here = self.found["reproduced-pairs"]
+        here = self.found.loc["reproduced-pairs"]
         rows = {
             (law, objective): {"printed": told, "here": float(np.mean(here[f"{law} {objective}"]))}
             for law, errors in printed.ERRORS.items()
@@ -141,13 +137,12 @@ class Study:
         return table.assign(difference=table["here"] - table["printed"])
 
     def _candidates(self) -> pd.DataFrame:
-        one = {name: self.one("cv", name) for name in self.order}
+        one = self.of("cross_validate").loc[self.order]
         table = versus(self.heldout(), REFERENCE, self.options.seed).loc[self.order]
         table = table.rename(columns={"mean": "held out"}).drop(columns="p")
-        train = {name: float(np.mean(each["train"]["spacing"])) for name, each in one.items()}
-        table.insert(0, "train", pd.Series(train))
-        table.insert(0, "numbers", pd.Series({n: len(each["row"]) for n, each in one.items()}))
-        return table.assign(**{"at a limit": [", ".join(each["limits"]) for each in one.values()]})
+        table.insert(0, "train", one["train"].map(lambda costs: np.mean(costs["spacing"])))
+        table.insert(0, "numbers", one["row"].map(len))
+        return table.assign(**{"at a limit": one["limits"].map(", ".join)})
 
     def _test(self) -> pd.DataFrame:
         table = versus(self.tested(), REFERENCE, self.options.seed).loc[self.order]
@@ -158,8 +153,8 @@ class Study:
             for law, errors in printed.ERRORS.items()
             for objective, value in zip(printed.OBJECTIVES, errors, strict=True)
         }
-        both = pd.concat([table, pd.DataFrame.from_dict(told, orient="index")])
-        return both.rename_axis("candidate")
+        table = pd.concat([table, pd.DataFrame.from_dict(told, orient="index")])
+        return table.rename_axis("candidate")
 
     def _sides(self) -> pd.DataFrame:
         """Mean speed of the follower (m/s) and mean gap (m) of every pair, by side."""
@@ -171,39 +166,34 @@ class Study:
         return pd.DataFrame(rows, columns=["side", "speed (m/s)", "gap (m)"])
 
     def _objectives(self, name: str) -> pd.DataFrame:
-        one = self.one("objectives", name)
         rows = {}
-        for objective in OBJECTIVES:
-            part = one[objective]
-            shown = {k: v for k, v in part["parameters"].items() if not _weight(k)}
-            limits = {"at a limit": ", ".join(part["limits"])}
-            rows[objective] = {**part["reached"], **shown, **limits}
+        for objective, one in self.of("objectives").loc[name, list(OBJECTIVES)].items():
+            shown = {k: v for k, v in one["parameters"].items() if not _weight(k)}
+            limits = {"at a limit": ", ".join(one["limits"])}
+            rows[objective] = {**one["reached"], **shown, **limits}
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis("minimised")
 
     def _precision(self, name: str) -> pd.DataFrame:
-        one, limits = self.one("precision", name), self.one("cv", name)["limits"]
+        one = self.of("precision").loc[name]
         names, row, half = one["names"], np.array(one["row"]), np.array(one["half"])
-        table = pd.DataFrame(
+        limits = self.of("cross_validate").loc[name, "limits"]
+        table = _by_parameter(
+            names,
             {
                 "value": row,
                 "from": row - half,
                 "to": row + half,
-                "unit": [printed.UNITS.get(n, "1") for n in names],
+                "unit": printed.units(names),
                 "at a limit": [n in limits for n in names],
-                "closed below": [
-                    _rises(one["profiles"][n], v, -1) for n, v in zip(names, row, strict=True)
-                ],
-                "closed above": [
-                    _rises(one["profiles"][n], v, 1) for n, v in zip(names, row, strict=True)
-                ],
             },
-            index=pd.Index(names, name="parameter"),
         )
+        for side, sign in (("below", -1), ("above", 1)):
+            closed = [_rises(one["profiles"][n], v, sign) for n, v in zip(names, row, strict=True)]
+            table[f"closed {side}"] = closed
         if len(names) > MANY:
             return table
-        return table.assign(
-            **{f"r({n})": c for n, c in zip(names, one["correlation"], strict=True)}
-        )
+        correlation = dict(zip((f"r({n})" for n in names), one["correlation"], strict=True))
+        return table.assign(**correlation)
 
     def _equilibrium_gaps(self) -> pd.DataFrame:
         v, s = self._even_driving
@@ -219,41 +209,37 @@ class Study:
         return pd.DataFrame(found, index=pd.Index(SPEEDS, name="speed (m/s)"))
 
     def _stability(self) -> pd.DataFrame:
-        rows: dict[str, dict[str, float]] = {}
+        rows: dict[str, dict[str, float]] = {name: {} for name in self.systems}
         for name, v, _, slope in self._slopes():
             gain = stability.passed(
                 slope, stability.FREQUENCIES, **stability.lateness(self.systems[name])
             )
-            row = {f"margin at {v:g} m/s": slope.margin, f"most at {v:g} m/s": float(gain.max())}
-            rows[name] = rows.get(name, {}) | row
+            rows[name][f"margin at {v:g} m/s"] = slope.margin
+            rows[name][f"most at {v:g} m/s"] = float(gain.max())
         columns = [f"{what} at {v:g} m/s" for v in SPEEDS for what in ("margin", "most")]
-        found = pd.DataFrame.from_dict(rows, orient="index").reindex(
-            list(self.systems), columns=columns
-        )
-        return found.rename_axis("candidate")
+        return pd.DataFrame(rows, index=columns, dtype=float).T.rename_axis("candidate")
 
     def _drivers(self) -> pd.DataFrame:
-        one = self.found["halves"]
-        names = ("pooled", "alone", "shrunk")
-        costs = by_unit({name: one[name] for name in names}, one["clusters"])
+        one = self.found.loc["halves"]
+        costs = by_unit(one[["pooled", "alone", "shrunk"]], one["clusters"])
         table = versus(costs, "pooled", self.options.seed).drop(columns=["low", "high", "p"])
         table.insert(1, "median (m)", costs.median())
         return table.rename(columns={"mean": "second half (m)"}).rename_axis("calibrated")
 
     def _spread(self) -> pd.DataFrame:
-        one = self.found["halves"]
-        return pd.DataFrame(
+        one = self.found.loc["halves"]
+        return _by_parameter(
+            one["names"],
             {
                 "pooled": one["centre"],
                 "spread of single pairs": one["between"],
                 "spread that lasts": one["spread"],
-                "unit": [printed.UNITS.get(n, "1") for n in one["names"]],
+                "unit": printed.units(one["names"]),
             },
-            index=pd.Index(one["names"], name="parameter"),
         )
 
     def _platoon_published(self) -> pd.DataFrame:
-        again = self.found["reproduced-platoon"]
+        again = self.found.loc["reproduced-platoon"]
         table = pd.DataFrame({"printed": printed.PLATOON_ERRORS, "here": again["stopped"]})
         table["difference"] = table["here"] - table["printed"]
         table["the law alone"] = pd.Series(again["law"])
@@ -262,34 +248,35 @@ class Study:
 
     def _platoon(self) -> pd.DataFrame:
         """Laws by the error inside the first 70 %, and the best law of each follower."""
-        names = [n for n in platoons.CANDIDATES if f"platoon-{key(n)}" in self.found]
-        found = {n: self.one("platoon", n) for n in names}
-        makes = found[names[0]]["makes"]
-        fold = pd.DataFrame({n: one["chosen"] for n, one in found.items()}, index=makes)
-        held = pd.DataFrame({n: one["heldout"] for n, one in found.items()}, index=makes)
-        table = pd.DataFrame({"fold": fold.mean(), "last 30 %": held.mean()})
-        train = pd.Series({n: float(np.mean(one["train"])) for n, one in found.items()})
-        table.insert(1, "first 70 %", train)
-        table = table.join(held.T)
-        table["at a limit"] = pd.Series(
-            {n: sum(map(len, one["limits"])) for n, one in found.items()}
+        found = self.of("compare")
+        makes = found["makes"].iloc[0]
+        fold: Any
+        held: Any
+        fold, held = (
+            pd.DataFrame(found[part].to_list(), found.index, makes)
+            for part in ("chosen", "heldout")
         )
-        own = {make: str(fold.loc[make].idxmin()) for make in makes}
-        each = pd.Series({make: held.loc[make, own[make]] for make in makes})
-        inside = float(np.mean([fold.loc[make, own[make]] for make in makes]))
+        table = pd.DataFrame(
+            {
+                "fold": fold.mean(axis=1),
+                "first 70 %": found["train"].map(np.mean),
+                "last 30 %": held.mean(axis=1),
+                **held,
+                "at a limit": found["limits"].map(lambda each: sum(map(len, each))),
+            }
+        )
+        best = pd.Series({make: held.loc[law, make] for make, law in fold.idxmin().items()})
         told = pd.Series(printed.PLATOON_ERRORS)
         more = {
-            "chosen by follower": {"fold": inside, "last 30 %": each.mean(), **each},
+            "chosen by follower": {"fold": fold.min().mean(), "last 30 %": best.mean(), **best},
             "ovm, printed": {"last 30 %": told.mean(), **told},
         }
-        found_ = pd.concat(
-            [table.sort_values("fold"), pd.DataFrame.from_dict(more, orient="index")]
-        )
-        return found_.rename_axis("law")
+        table = pd.concat([table.sort_values("fold"), pd.DataFrame.from_dict(more, orient="index")])
+        return table.rename_axis("law")
 
     def _runs(self) -> pd.DataFrame:
         """Every follower of every run by itself."""
-        one = self.found["runs"]
+        one = self.found.loc["runs"]
         frame = pd.DataFrame({"run": one["runs"], "make": one["makes"]})
         frame["setting"] = [SETTINGS.get(s, s) for s in one["settings"]]
         frame["error (m)"] = one["costs"]
@@ -298,52 +285,46 @@ class Study:
 
     def _time_gaps(self) -> pd.DataFrame:
         by = self._runs().groupby("setting")
-        table = (
-            by["T"]
-            .agg(["count", "min", "median", "max"])
-            .assign(**{"error (m)": by["error (m)"].mean()})
-        )
+        table = by["T"].agg(["count", "min", "median", "max"]).join(by["error (m)"].mean())
         return table.rename(columns={"count": "followers"}).loc[self._settings]
 
     @property
     def _settings(self) -> list[str]:
-        there = set(self._runs()["setting"])
-        return [s for s in SETTINGS.values() if s in there]
+        measured = set(self._runs()["setting"])
+        return [setting for setting in SETTINGS.values() if setting in measured]
 
     def _leaders(self) -> pd.DataFrame:
-        one = self.found["leaders"]
-        row = {k: np.array(one["rows"][k]) for k in leaders.KINDS}
-        out = {k: np.array(one["without"][k]) for k in leaders.KINDS}
-        columns: dict[str, Any] = {"unit": [printed.UNITS.get(n, "1") for n in one["names"]]}
-        for k in leaders.KINDS:
-            columns |= {k: row[k], f"± {k}": leaders.jackknifed(row[k], out[k])[1]}
-        away = row["CAV"] - row["HV"]
-        half = leaders.jackknifed(away, out["CAV"] - out["HV"])[1]
+        one = self.found.loc["leaders"]
+        rows, without = (
+            {kind: np.array(one[part][kind]) for kind in leaders.KINDS}
+            for part in ("rows", "without")
+        )
+        columns: dict[str, Any] = {"unit": printed.units(one["names"])}
+        for kind, row in rows.items():
+            columns |= {kind: row, f"± {kind}": leaders.jackknifed(without[kind])}
+        away = rows["CAV"] - rows["HV"]
+        half = leaders.jackknifed(without["CAV"] - without["HV"])
         columns |= {"CAV minus HV": away, "from": away - half, "to": away + half}
-        return pd.DataFrame(columns, index=pd.Index(one["names"], name="parameter"))
+        return _by_parameter(one["names"], columns)
 
     def _leaders_heldout(self) -> pd.DataFrame:
-        one = self.found["leaders"]
+        one = self.found.loc["leaders"]
         costs = by_unit(one["heldout"], one["clusters"])
-        kind = np.array(one["kinds"])
         parts = {}
-        for k in leaders.KINDS:
-            table = versus(costs[kind == k], "both", self.options.seed)
+        for kind in leaders.KINDS:
+            chosen = np.array(one["kinds"]) == kind
+            table = versus(costs[chosen], "both", self.options.seed)
             table = table.rename(columns={"mean": "held out (m)"}).drop(columns=["p", "better"])
             for name, what in (("gap (m)", "gap"), ("speed (m/s)", "speed")):
-                table.insert(0, name, float(np.array(one[what])[kind == k].mean()))
-            table.insert(0, "pairs", int((kind == k).sum()))
-            parts[f"behind {k}"] = table
+                table.insert(0, name, float(np.array(one[what])[chosen].mean()))
+            table.insert(0, "pairs", int(chosen.sum()))
+            parts[f"behind {kind}"] = table
         return pd.concat(parts, names=["pairs", "calibrated on"])
 
     def _parameters(self) -> pd.DataFrame:
-        order = [*self.chosen, *(n for n in self.names if n not in self.chosen)]
-        rows = [
-            (name, parameter, value)
-            for name in order
-            for parameter, value in self.one("cv", name)["parameters"].items()
-        ]
-        return pd.DataFrame(rows, columns=["candidate", "parameter", "value"])
+        order = list(dict.fromkeys((*self.chosen, *self.names)))
+        found = self.of("cross_validate").loc[order, ["parameters"]].rename_axis("candidate")
+        return by_number(found.reset_index(), "parameters").drop(columns="index")
 
     # -- equilibria ----------------------------------------------------------------------------
 
@@ -387,22 +368,9 @@ class Study:
 
     def figures(self) -> dict[str, Figure | ReplayBlock]:
         """By their names in the template."""
-        ends = ["difference", "low", "high"]
         away = {
-            "held out, clusters resampled": self.away(self.heldout())[ends].to_numpy(),
-            "test, pairs resampled": self.away(self.tested())[ends].to_numpy(),
-        }
-        sides = {
-            str(side): (part["speed (m/s)"].to_numpy(), part["gap (m)"].to_numpy())
-            for side, part in self._sides().groupby("side", sort=False)
-        }
-        runs = self._runs()
-        gaps = {
-            s: {
-                str(m): part["T"].to_numpy()
-                for m, part in runs[runs["setting"] == s].groupby("make")
-            }
-            for s in self._settings
+            "held out, clusters resampled": self.away(self.heldout()),
+            "test, pairs resampled": self.away(self.tested()),
         }
         v = self._even_driving[0]
         speeds = np.linspace(0.25, float(np.quantile(v, 0.995)), 60)
@@ -410,28 +378,23 @@ class Study:
             n: stability.equilibrium(self.systems[n], speeds, self.length) for n in self.figured
         }
         found: dict[str, Figure | ReplayBlock] = {
-            "candidates": figures.errors(self.order, away, "m", REFERENCE),
-            "sides": figures.sides(sides),
+            "candidates": figures.errors(self.order, away, REFERENCE),
+            "sides": figures.sides(self._sides()),
             "equilibria": figures.equilibria(speeds, curves, self._even_driving, self.length),
             "amplification": self._amplification(),
-            "time_gaps": figures.by_group(gaps, "time gap T (s)"),
+            "time_gaps": figures.time_gaps(self._runs(), self._settings),
             "replay": self._replay(),
         }
         for name in self.profiled:
-            one = self.one("precision", name)
-            profiles = {
-                n: {k: np.array(x) for k, x in one["profiles"][n].items()}
-                | {"best": np.array(best)}
-                for n, best in zip(one["names"], one["row"], strict=True)
-            }
-            units = {n: printed.UNITS.get(n, "1") for n in one["names"]}
-            found[f"profiles_{key(name)}"] = figures.profiles(profiles, units)
+            one = self.of("precision").loc[name]
+            best = dict(zip(one["names"], one["row"], strict=True))
+            found[f"profiles_{key(name)}"] = figures.profiles(one["profiles"], best, printed.UNITS)
         return found
 
     @property
     def profiled(self) -> list[str]:
         """Candidates whose profiles are drawn."""
-        return [n for n in self.chosen if len(self.one("precision", n)["names"]) <= MANY]
+        return [n for n in self.chosen if len(self.of("precision").loc[n, "names"]) <= MANY]
 
     def _amplification(self) -> Figure:
         speed, period = SWING
@@ -454,13 +417,13 @@ class Study:
             f"Test pairs with the measured leader, as measured and as simulated by "
             f"{' and '.join(systems)}, which are calibrated to all training pairs."
         )
-        return player("replay", scenes(spread(pairs, FEW), systems), what, len(pairs))
+        return player(scenes(thinned(pairs, FEW), systems), what, len(pairs))
 
     def values(self) -> dict[str, Any]:
         """What else the template refers to."""
         train, test = self.pairs(), self.pairs(test=True)
         label = data.labels((*train, *test))
-        limits = self.found["floor"]["limits"]
+        floor = self.found.loc["floor"]
         tested = self.tested()
         paired = (tested[self.order[0]] - tested[REFERENCE]).std() / np.sqrt(len(tested))
         return {
@@ -472,20 +435,24 @@ class Study:
             "left": [name for name in EVERY if name not in self.names],
             "pairs": len(train),
             "tests": len(test),
-            "clusters": len(set(self.one("cv", REFERENCE)["clusters"])),
+            "clusters": len(set(self.of("cross_validate").loc[REFERENCE, "clusters"])),
             "shared": int(np.isin(label[len(train) :], label[: len(train)]).sum()),
             "half": 1.96 * float(tested[REFERENCE].std() / np.sqrt(len(tested))),
             "seen": 2.8 * float(paired),
             "decay": DECAY,
-            "floor": float(np.mean(self.found["floor"]["costs"])),
-            "touched": sum(map(bool, limits)),
-            "strengths": sorted(set(self.found["halves"]["strengths"])),
+            "floor": float(np.mean(floor["costs"])),
+            "touched": sum(map(bool, floor["limits"])),
+            "strengths": sorted(set(self.found.loc["halves", "strengths"])),
             "even": EVEN,
             "length": self.length,
             "swing": SWING,
             "objectives": list(OBJECTIVES),
             "run": printed.PLATOON,
         }
+
+
+def _by_parameter(names: list[str], columns: dict[str, Any]) -> pd.DataFrame:
+    return pd.DataFrame(columns, index=pd.Index(names, name="parameter"))
 
 
 def _weight(name: str) -> bool:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+
+import pandas as pd
 
 from nnode.data.store import Store
 from nnode.pages.page import Block
@@ -12,9 +13,10 @@ from studies.following import fit, inference, leaders, platoons
 from studies.following.candidates import EVERY, REFERENCE, key
 from studies.following.data import LEADERS, PAIRS, PLATOONS, stores
 from studies.following.results import Study
+from studies.frame import computed
 from studies.options import FollowingStudyOptions
 from studies.page import page
-from studies.runner import Task, hash_of, run_tasks
+from studies.runner import Task
 
 TITLE = "Car following: laws, effects, drivers"
 SUBTITLE = (
@@ -36,12 +38,13 @@ def run(options: FollowingStudyOptions, folder: Path) -> list[Block]:
         StudyError: tasks failed.
     """
     prepared = stores(options, folder)
-    assert options.workers is not None
-    how: dict[str, Any] = {"workers": options.workers, "fingerprint": hash_of(prepared)}
-    first = training(options, prepared)
-    study = Study(options, prepared, run_tasks(first, folder, title="cross-validation", **how))
-    rest = after(study)
-    study.found |= run_tasks(rest, folder, title="test, precision, platoons", **how)
+
+    def run_all(tasks: list[Task], title: str) -> pd.DataFrame:
+        return computed(tasks, folder, options, prepared, title)
+
+    study = Study(options, prepared, run_all(training(options, prepared), "cross-validation"))
+    more = run_all(after(study), "test, precision, platoons")
+    study.found = pd.concat([study.found, more])
     return page("following", study.tables(), study.figures(), prepared.values(), **study.values())
 
 
@@ -69,7 +72,7 @@ def after(study: Study) -> list[Task]:
     )
     search = {"restarts": options.restarts, "seed": options.seed}
     idm = {"name": REFERENCE, **search}
-    rows = {name: study.one("cv", name)["row"] for name in study.names}
+    rows = study.of("cross_validate")["row"]
     folds = {"row": rows[REFERENCE], "folds": options.folds}
     tasks = [
         Task("reproduced-pairs", fit.reproduced, pairs),

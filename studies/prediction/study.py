@@ -18,6 +18,7 @@ from studies.prediction import printed, tasks
 from studies.prediction.data import AHEAD, SCENES, SEEN, STEP, stores
 from studies.runner import Task
 from studies.walking import tasks as walking
+from studies.walking.study import errors_by_run
 
 TITLE = "Prediction: laws and published results"
 SUBTITLE = (
@@ -60,10 +61,10 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
             one = {"law": law, "desired": "direction", **where}
             every.append(Task(f"{law}-{name}", walking.fit, one, cost=10.0))
     found = computed(every, folder, options, prepared, "prediction study")
-    distances = _distances(found)
+    distances = errors_by_run(found[found["task"] != "follow"], SIMPLE | PEOPLE)
     tables = {"following": _following(found, options.seed)}
     tables |= {what: _by_scene(distances, what) for what in ("ade", "fde")}
-    people = distances.groupby("scene", sort=False)["people"].first().to_dict()
+    people = distances.groupby("run", sort=False)["people"].first().to_dict()
     times = {"people": people, "seen": SEEN, "ahead": AHEAD, "step": STEP}
     return page("prediction", tables, {}, prepared.values(), **times)
 
@@ -73,33 +74,25 @@ def _following(found: pd.DataFrame, seed: int) -> pd.DataFrame:
     rows: dict[str, dict[str, Any]] = {}
     for one in found[found["task"] == "follow"].to_dict("records"):
         test = one["test"]
-        number = len(test["error"])
-        weights = group_weights(np.arange(number), DRAWS, np.random.default_rng(seed))
+        clusters = np.arange(len(test["error"]))
+        weights = group_weights(clusters, DRAWS, np.random.default_rng(seed))
         low, high = np.quantile([tasks.rmspe(test, w) for w in weights], [0.025, 0.975])
-        rows[one["law"]] = {"training": tasks.rmspe(one["train"]), "test": tasks.rmspe(test)}
-        rows[one["law"]] |= {"low": low, "high": high}
-        rows[one["law"]]["parameters"] = ", ".join(f"{k} = {v:.3g}" for k, v in one["row"].items())
+        rows[one["law"]] = {
+            "training": tasks.rmspe(one["train"]),
+            "test": tasks.rmspe(test),
+            "low": low,
+            "high": high,
+            "parameters": ", ".join(f"{name} = {value:.3g}" for name, value in one["row"].items()),
+        }
     rows["idm, published"] = dict(zip(("training", "test"), printed.IDM, strict=True))
     rows["learned, published"] = {"test": printed.LEARNED}
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("law")
 
 
-def _distances(found: pd.DataFrame) -> pd.DataFrame:
-    """A row per law and held-out scene, with the number of people."""
-    rows = []
-    for one in found[found["task"] != "follow"].to_dict("records"):
-        laws = {label: one[name] for name, label in SIMPLE.items()}
-        if one["task"] == "fit":
-            laws = {PEOPLE[one["law"]]: one["errors"]}
-        for law, scenes in laws.items():
-            rows += [{"law": law, "scene": scene, **errors} for scene, errors in scenes.items()]
-    return pd.DataFrame(rows)
-
-
 def _by_scene(distances: pd.DataFrame, what: str) -> pd.DataFrame:
     """A distance (m) by law and held-out scene, the published one last."""
-    order = distances["law"].unique(), distances["scene"].unique()
-    table = distances.pivot(index="law", columns="scene", values=what).loc[*order]
+    order = distances["law"].unique(), distances["run"].unique()
+    table = distances.pivot(index="law", columns="run", values=what).loc[*order]
     place = ("ade", "fde").index(what)
     told = {scene: printed.CONSTANT_VELOCITY[scene][place] for scene in map(str, table)}
     table.loc["constant velocity, published"] = pd.Series(told)

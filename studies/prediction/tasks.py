@@ -15,7 +15,7 @@ from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.system import System
 from nnode.simulation.fused import FusedSolver
 from studies.following.data import gap_of
-from studies.pooled import pooled_fit, start_of
+from studies.pooled import parameters_of, pooled_fit
 
 #: Standard deviation of the logarithm of parameters at a start.
 SPREAD = 0.4
@@ -37,13 +37,13 @@ def follow(law: str, folder: str, starts: int, seed: int) -> dict[str, Any]:
     )
     sides = {side: [s for s in Store(folder) if s.split == side] for side in (TRAIN, TEST)}
     train, rng = collate(sides[TRAIN]), np.random.default_rng(seed)
-    own = start_of(system, train)
+    own = parameters_of(system)
     drawn = [
         {name: value * float(np.exp(SPREAD * rng.normal())) for name, value in own.items()}
         for _ in range(starts)
     ]
-    found = pooled_fit(system, [train], [own, *drawn])
-    return {"row": found.row, **{side: squares(system, pairs) for side, pairs in sides.items()}}
+    row, _ = pooled_fit(system, [train], [own, *drawn])
+    return {"row": row, **{side: squares(system, pairs) for side, pairs in sides.items()}}
 
 
 @torch.no_grad()

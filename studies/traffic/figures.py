@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from nnode.data.sequence import Sequence as Recorded
-from nnode.plots.style import GREY, SMALL_FONT, curve_style, dress, new_figure
+from nnode.plots.style import GREY, SMALL_FONT, curve_style, dress, legend_above, new_figure
+from studies.figures import error_bars
 
 #: Speeds outside are cut, m/s.
 LIMITS = (-8.0, 38.0)
@@ -27,38 +29,17 @@ def leader_speeds(speeds: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -
     """
     figure = new_figure(7.2, 4.0)
     ax = figure.subplots()
-    place = np.arange(speeds.shape[1])
+    error_bars(ax, speeds, low, high, 0.14, linestyle="")
     handles = []
-    for i, model in enumerate(speeds.index):
+    for i, (model, mean) in enumerate(speeds.mean(axis=1).items()):
         style = curve_style(i)
-        x = place + 0.14 * (i - (len(speeds) - 1) / 2)
-        y = speeds.loc[model].to_numpy(float)
-        ends = np.stack([y - low.loc[model].to_numpy(float), high.loc[model].to_numpy(float) - y])
-        ax.errorbar(
-            x,
-            y,
-            yerr=np.nan_to_num(ends).clip(min=0),
-            fmt=style["marker"],
-            color=style["color"],
-            markersize=4.5,
-            elinewidth=0.8,
-        )
-        mean = float(np.nanmean(y))
         ax.axhline(mean, color=style["color"], linestyle=style["linestyle"], linewidth=1)
-        handles.append(
-            Line2D([], [], **style, markersize=4.5, label=f"{model}: mean {mean:.0f} km/h")
-        )
-    ax.set_xticks(place, [f"{n}\n{name}" for n, name in enumerate(speeds.columns, 1)])
+        label = f"{model}: mean {mean:.0f} km/h"
+        handles.append(Line2D([], [], **style, markersize=4.5, label=label))
+    numbered = [f"{n}\n{name}" for n, name in enumerate(speeds.columns, 1)]
+    ax.set_xticks(range(len(numbered)), numbered)
     dress(ax, x="recording", y="leader's speed v0 (km/h)")
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=3,
-        frameon=False,
-        fontsize=SMALL_FONT,
-        handlelength=2.6,
-        columnspacing=1.2,
-    )
+    legend_above(figure, handles)
     return figure
 
 
@@ -107,7 +88,7 @@ def law_panels(
         Line2D([], [], **{**curve_style(i), "marker": ""}, label=m) for i, m in enumerate(models)
     ]
     handles.append(Line2D([], [], color=GREY, linewidth=4, label="middle 90 % of measured gaps"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    legend_above(figure, handles, len(handles))
     return figure
 
 
@@ -150,18 +131,8 @@ def space_time(
         k = int(np.abs(sequence.time - time).argmin())
         ax.plot(t[k], sequence.x[k, agent, 0], "s", color="black", fillstyle="none", markersize=10)
     if marked:
-        handles.append(
-            Line2D(
-                [],
-                [],
-                color="black",
-                marker="s",
-                fillstyle="none",
-                markersize=8,
-                linestyle="",
-                label="fault of the measurement",
-            )
-        )
+        box: dict[str, Any] = {"marker": "s", "fillstyle": "none", "markersize": 8, "linestyle": ""}
+        handles.append(Line2D([], [], color="black", **box, label="fault of the measurement"))
     dress(ax, x="time in the sequence (s)", y="position along the lane (m)", title=sequence.name)
     ax.legend(handles=handles, fontsize=SMALL_FONT)
     return figure

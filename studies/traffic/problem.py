@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from nnode.model.build import build_model
 from nnode.model.system import System
 from nnode.plots.traffic import follow_law
 from nnode.simulation.fused import FusedSolver
+from studies.stores import sequences
 
 #: Step of the first search, s; the best of its finds are then followed at the study's own step.
 COARSE = 0.02
@@ -47,17 +47,9 @@ def system_of(model: str, parameters: dict[str, Any]) -> System:
     return system
 
 
-@lru_cache(maxsize=4)
-def _recordings(folder: str) -> dict[str, list[Sequence]]:
-    found: dict[str, list[Sequence]] = {}
-    for sequence in Store(folder):
-        found.setdefault(sequence.recording, []).append(sequence)
-    return found
-
-
 def recording(folder: str, name: str) -> list[Sequence]:
     """The sequences of one recording in a prepared folder, in the order of the store."""
-    return _recordings(folder)[name]
+    return [sequence for sequence in sequences(folder) if sequence.recording == name]
 
 
 def groups(folder: str, name: str) -> np.ndarray:
@@ -69,9 +61,9 @@ def groups(folder: str, name: str) -> np.ndarray:
 class Problem:
     """One model on some sequences, at any step and precision."""
 
-    def __init__(self, sequences: list[Sequence], model: str, box: float | None = None) -> None:
+    def __init__(self, items: list[Sequence], model: str, box: float | None = None) -> None:
         self.options = model_options(model, box)
-        self.batch = collate(sequences)
+        self.batch = collate(items)
 
     def cost(self, dt: float, dtype: torch.dtype) -> EnsembleCost:
         """The cost with steps of ``dt`` (s)."""

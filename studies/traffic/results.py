@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -16,18 +17,18 @@ from nnode.calibrate.resampling import average_interval, holm
 from nnode.data.sequence import collate
 from nnode.data.store import Store
 from nnode.pages.replay import ReplayBlock
+from nnode.plots.style import thinned
 from nnode.plots.traffic import measured_gaps
 from nnode.simulation.fused import FusedSolver
-from studies.frame import by_unit, differences, labelled, numbers
+from studies.frame import by_number, by_unit, differences
 from studies.options import TrafficStudyOptions
-from studies.replay import player, scenes, spread
-from studies.traffic import figures, printed
+from studies.replay import player, scenes
+from studies.traffic import figures, printed, tasks
 from studies.traffic.problem import GAPS, recording, system_of
 
 LAWS, NETWORKS = ("lin", "log"), ("n2", "n4", "n10")
 MODELS = (*NETWORKS, *LAWS)
 AVERAGE, KMH = "average", 3.6
-BASELINES = ("no_interaction", "constant_velocity")
 #: Sequences named per recording, and the models whose costs are taken apart.
 NAMED, SPLIT = 3, ("lin", "n4")
 #: Models in the player, and how many sequences of each recording.
@@ -61,7 +62,7 @@ class Study:
 
     options: TrafficStudyOptions
     stores: dict[str, Store]
-    found: pd.DataFrame
+    found: Any
 
     def __post_init__(self) -> None:
         policy = {str(store.folder): name for name, store in self.stores.items()}
@@ -93,21 +94,14 @@ class Study:
     @cached_property
     def heldout(self) -> dict[str, pd.DataFrame]:
         """By treatment of faults, a column of held-out costs (m² s) per model and baseline."""
-        every = self.found[self.found["task"] == "cross_validate"]
+        every = self.found[self.found["task"] == "cross_validate"].dropna(subset="groups")
+        every = every.explode(["costs", "groups", *tasks.BASELINES])
         found = {}
-        for faults, part in every[every["names"].notna()].groupby("faults"):
-            columns: dict[str, list[float]] = {}
-            for law, rows in part.groupby("law", sort=False):
-                columns[str(law)] = np.concatenate(rows["costs"].to_list()).tolist()
-            base = part[part["law"] == "lin"]
-            for name in BASELINES:
-                columns[name] = np.concatenate(base[name].to_list()).tolist()
-            groups = [
-                f"{name} {g}"
-                for name, one in zip(base["recording"], base["groups"], strict=True)
-                for g in one
-            ]
-            found[str(faults)] = by_unit(columns, groups)
+        for faults, part in every.groupby("faults"):
+            columns = {str(law): rows["costs"] for law, rows in part.groupby("law", sort=False)}
+            lin = part[part["law"] == "lin"]
+            columns |= {name: lin[name] for name in tasks.BASELINES}
+            found[str(faults)] = by_unit(columns, lin["recording"] + " " + lin["groups"].map(str))
         return found
 
     # -- tables ------------------------------------------------------------------------------
@@ -179,29 +173,23 @@ class Study:
 
     def _lower(self, ours: Any, theirs: Any, lengths: Any) -> pd.DataFrame:
         """The printed costs that are lower, with all that the searches found."""
-        starts, before = self.take("starts"), self.found.get("before")
-        scans = {
-            (s["model"], s["recording"]): s
-            for s in self.found[self.found["task"] == "scan"].to_dict("records")
-        }
-        rows = {}
-        for model, name in ours.drop(columns=AVERAGE).stack().index:
-            told, here = theirs.loc[model, name], ours.loc[model, name]
-            if told > here - 0.005:
-                continue
-            row = {"printed": told, "here": here, "best tenth of starts": starts[name][model][1]}
-            if scan := scans.get((model, name)):
-                away = np.abs(np.array(scan["lengths"]) - lengths.loc[model, name])
-                row |= {"grid": scan["cost"]}
-                row |= {"grid, printed L": scan["by_length"][int(away.argmin())]}
-            if before is not None:
-                row["first search"] = self.take("before").loc[model, name]
-            rows[model, name] = row
-        columns = ["printed", "here", "first search", "best tenth of starts"]
-        columns += ["grid", "grid, printed L"]
-        if not rows:
-            return pd.DataFrame(columns=columns)
-        return labelled(rows, "model", "recording").reindex(columns=columns)
+        here = ours.drop(columns=AVERAGE).stack()
+        table = pd.DataFrame({"printed": theirs.stack().reindex(here.index), "here": here})
+        table = table[table["printed"] <= table["here"] - 0.005]
+        again = "before" in self.found
+        table["first search"] = self.take("before").stack() if again else np.nan
+        table["best tenth of starts"] = self.take("starts").stack().map(itemgetter(1))
+        scans = self.found[self.found["task"] == "scan"].set_index(["model", "recording"])
+        table["grid"] = scans["cost"]
+        table["grid, printed L"] = pd.Series(
+            {
+                (model, name): scan["by_length"][
+                    int(np.abs(np.array(scan["lengths"]) - lengths.loc[model, name]).argmin())
+                ]
+                for (model, name), scan in scans.iterrows()
+            }
+        )
+        return table
 
     def _speeds_by_gap(self, box: bool) -> dict[str, pd.DataFrame]:
         """By recording, a column of speeds (m/s) per model."""
@@ -228,7 +216,7 @@ class Study:
             for faults, costs in self.heldout.items()
         }
         found = pd.concat(parts, names=["faults", "model"])
-        order = [*BASELINES, *LAWS, *(m + s for m in NETWORKS for s in ("-box", ""))]
+        order = [*tasks.BASELINES, *LAWS, *(m + s for m in NETWORKS for s in ("-box", ""))]
         return found.reindex([(f, m) for f in ("keep", "drop") for m in order])
 
     def _significance(self) -> pd.DataFrame:
@@ -256,54 +244,58 @@ class Study:
             found[f"{step:g} s"] = 100 * (ratio.astype(float).median(axis=1) - 1)
         return pd.DataFrame(found)
 
-    def _faulty(self, ours: Any, dropped: Any) -> pd.DataFrame:
-        """What faulty sequences are of all, of the cost, and how much lower it is without them."""
-        store = self.stores["keep"]
-        faulty = {fault["sequence"] for fault in store.manifest["faults"]}
-        costs = self.take("costs")
-        rows = {}
-        for model in MODELS:
-            shares = []
-            for name in costs.columns:
-                hit = [s.name in faulty for s in recording(str(store.folder), name)]
-                each = np.array(costs.loc[model, name])
-                shares.append(100 * each[hit].sum() / each.sum())
-            rows[model] = {
-                "faulty sequences": len(faulty),
-                "all sequences": len(store),
-                "their share of the cost (%)": float(np.mean(shares)),
-                "cost over that without them": ours.loc[model, AVERAGE]
-                / dropped.loc[model, AVERAGE],
-            }
-        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("model")
-
-    def _dominating(self) -> Any:
-        store = self.stores["keep"]
+    @cached_property
+    def by_sequence(self) -> pd.DataFrame:
+        """A row per sequence, and by model its share of the recording's cost (%)."""
+        store, costs = self.stores["keep"], self.take("costs")
         kinds: dict[str, set[str]] = {}
         for fault in store.manifest["faults"]:
             kinds.setdefault(fault["sequence"], set()).add(fault["kind"])
-        costs = self.take("costs").loc[list(SPLIT)].map(np.array)
-        rows = []
-        for number, name in enumerate(costs.columns, 1):
-            sequences = recording(str(store.folder), name)
-            for i in np.argsort(-costs.loc["lin", name])[:NAMED]:
-                one = sequences[i]
-                shares = {f"share {m} (%)": 100 * c[i] / c.sum() for m, c in costs[name].items()}
-                faults = ", ".join(sorted(kinds.get(one.name, ()))) or "none found"
-                rows.append(
-                    {"number": number, "sequence": one.name, "vehicles": one.n_agents}
-                    | {"start (s)": float(one.time[0]), **shares, "faults": faults}
-                )
-        return pd.DataFrame(rows).set_index("number")
+        rows = [
+            {
+                "number": number,
+                "sequence": s.name,
+                "vehicles": s.n_agents,
+                "start (s)": float(s.time[0]),
+                "faults": ", ".join(sorted(kinds.get(s.name, ()))) or "none found",
+            }
+            for number, name in enumerate(costs.columns, 1)
+            for s in recording(str(store.folder), name)
+        ]
+        shares = costs.map(lambda each: 100 * np.array(each) / np.sum(each))
+        return pd.DataFrame(rows).assign(
+            **{f"share {model} (%)": np.concatenate(list(shares.loc[model])) for model in MODELS}
+        )
+
+    def _faulty(self, ours: Any, dropped: Any) -> pd.DataFrame:
+        """What faulty sequences are of all, of the cost, and how much lower it is without them."""
+        every = self.by_sequence
+        faulty = every["faults"] != "none found"
+        shares = every.filter(like="share ").mul(faulty, axis=0).groupby(every["number"]).sum()
+        return pd.DataFrame(
+            {
+                "faulty sequences": int(faulty.sum()),
+                "all sequences": len(every),
+                "their share of the cost (%)": shares.mean().to_numpy(),
+                "cost over that without them": (ours[AVERAGE] / dropped[AVERAGE])[list(MODELS)],
+            },
+            index=pd.Index(MODELS, name="model"),
+        )
+
+    def _dominating(self) -> Any:
+        shares = [f"share {model} (%)" for model in SPLIT]
+        columns = ["sequence", "vehicles", "start (s)", *shares, "faults"]
+        table = self.by_sequence.sort_values(shares[0], ascending=False)
+        table = table.groupby("number").head(NAMED).sort_values("number", kind="stable")
+        return table.set_index("number")[columns]
 
     def _parameters(self) -> pd.DataFrame:
-        rows = []
-        for one in self.found[self.found["parameters"].notna()].to_dict("records"):
-            optimizer = {"fit": "bfgs", "descend": "adadelta"}[one["task"]]
-            where = [optimizer, *(one[k] for k in ("faults", "recording", "model", "box"))]
-            rows += [[*where, *number, one["cost"]] for number in numbers(one["parameters"])]
-        names = ["optimizer", "faults", "recording", "model", "box", "parameter", "index", "value"]
-        return pd.DataFrame(rows, columns=[*names, "J"])
+        optimizers = {"fit": "bfgs", "descend": "adadelta"}
+        fits = self.found.dropna(subset="parameters")
+        fits = fits.assign(optimizer=fits["task"].map(optimizers), J=fits["cost"])
+        names = ["optimizer", "faults", "recording", "model", "box"]
+        table = by_number(fits[[*names, "parameters", "J"]], "parameters")
+        return table[[*names, "parameter", "index", "value", "J"]]
 
     # -- figures -----------------------------------------------------------------------------
 
@@ -342,8 +334,7 @@ class Study:
     @property
     def dominating(self) -> str:
         """The sequence of the greatest share of its recording's cost under the linear law."""
-        table = self._dominating()
-        return str(table["sequence"].iloc[table["share lin (%)"].to_numpy(float).argmax()])
+        return str(self.by_sequence.set_index("sequence")["share lin (%)"].idxmax())
 
     def _drawn(self) -> Figure:
         name = self.dominating.rsplit("/", 1)[0]
@@ -369,13 +360,13 @@ class Study:
         for name in parameters.columns:
             sequences = recording(str(self.stores["drop"].folder), name)
             systems = {m: system_of(m, parameters.loc[m, name]) for m in SHOWN}
-            every += scenes(spread(sequences, FEW), systems, self.options.dt)
+            every += scenes(thinned(sequences, FEW), systems, self.options.dt)
             number += len(sequences)
         what = (
             "Sequences without a fault of every recording, as measured and as simulated by "
             f"{' and '.join(SHOWN)}, which are calibrated to the recording."
         )
-        return player("replay", every, what, number)
+        return player(every, what, number)
 
     def values(self) -> dict[str, Any]:
         """What else the template refers to."""

@@ -6,16 +6,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from nnode.data.options import Faults
 from nnode.data.prepare import prepare
 from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.store import Store
 from nnode.errors import ConfigError
 from nnode.pages.page import Block
-from studies.frame import tidy
+from studies.frame import computed
 from studies.options import TrafficStudyOptions
 from studies.page import page
-from studies.runner import Task, hash_of, run_tasks
+from studies.runner import Task
 from studies.traffic import printed, tasks
 from studies.traffic.results import LAWS, MODELS, NETWORKS, Study
 
@@ -50,29 +52,27 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
                 f"study.{name}={step} s must divide the sampling interval of {SAMPLING} s"
             )
     stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
-    assert options.workers is not None
-    how: dict[str, Any] = {"workers": options.workers, "fingerprint": hash_of(stores)}
     every = list(_tasks(options, stores))
-    found = run_tasks(every, folder, title="traffic study", **how)
-    again = {} if options.quick else wider(every, found)
+    found = computed(every, folder, options, stores, "traffic study")
+    again = {} if options.quick else wider(every, found["cost"])
     if again:
-        more = run_tasks(list(again.values()), folder, title="wider search", **how)
-        for key, task in again.items():
-            if more[task.key]["cost"] < found[key]["cost"]:
-                found[key] = {**more[task.key], "before": found[key]["cost"]}
-    study = Study(options, stores, tidy(every, found))
+        more = computed(list(again.values()), folder, options, stores, "wider search")
+        more = more.set_axis(list(again)).assign(before=found["cost"])
+        more = more[more["cost"] < more["before"]]
+        found = pd.concat([found.drop(more.index), more]).loc[found.index]
+    study = Study(options, stores, found)
     return page("traffic", study.tables(), study.figures(), [stores["keep"]], **study.values())
 
 
-def wider(every: list[Task], found: dict[str, dict[str, Any]]) -> dict[str, Task]:
+def wider(every: list[Task], costs: Any) -> dict[str, Task]:
     """Twice the search, from other starts, by the task whose printed cost of a network is lower."""
     again = {}
     for task in every:
-        how, result = task.arguments, found[task.key]
+        how = task.arguments
         if not task.key.startswith("fit-keep-") or how["box"] or how["model"] in LAWS:
             continue
         theirs = printed.COSTS[how["model"]][printed.RECORDINGS.index(how["recording_name"])]
-        if theirs < result["cost"]:
+        if theirs < costs[task.key]:
             more = {key: 2 * how[key] for key in ("restarts", "iterations")}
             more = {**how, **more, "seed": how["seed"] + 1}
             key = task.key.replace("fit-", "wider-", 1)

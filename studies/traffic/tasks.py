@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,17 @@ from torch import Tensor
 
 from nnode.calibrate.bfgs import minimise, optimality_residual
 from nnode.calibrate.cost import sequence_costs
-from nnode.calibrate.evaluate import best_common_speed, constant_velocity, no_interaction
+from nnode.calibrate.evaluate import baselines, best_common_speed
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.parameters import ParameterVector
 from nnode.calibrate.resampling import group_weights
-from nnode.data.sequence import Batch
 from nnode.simulation.fused import FusedSolver
 from studies.traffic.problem import COARSE, Problem, groups, named, recording, speeds
 
 Result = dict[str, Any]
+
+#: Predictions that need no calibration but a common speed.
+BASELINES = ("no_interaction", "constant_velocity")
 
 
 def fit(
@@ -43,7 +44,6 @@ def fit(
         bootstrap: resamples of groups of sequences.
         steps: other steps (s) at which the solution is evaluated.
     """
-    begin = time.perf_counter()
     sequences = recording(folder, recording_name)
     problem = Problem(sequences, model, box)
     found, judged = problem.search(problem.starts(restarts, seed), dt, iterations)
@@ -71,7 +71,6 @@ def fit(
         result["bootstrap"] = _bootstrap(
             problem, best, found.inverses[found.best], weights, dt, iterations // 3
         )
-    result["seconds"] = time.perf_counter() - begin
     return result
 
 
@@ -132,32 +131,20 @@ def cross_validate(
     rows = problem.search_folds(fold, problem.starts(restarts, seed + 1), dt, iterations)
     each = problem.cost(dt, torch.float64).costs(rows).numpy()
     costs = each[fold, np.arange(len(sequences))]
-    common, kept = np.empty(len(sequences)), np.empty(len(sequences))
+    simple = {name: np.empty(len(sequences)) for name in BASELINES}
     for k in range(int(fold.max()) + 1):
-        out = np.flatnonzero(fold == k)
-        train = problem.batch.select(np.flatnonzero(fold != k).tolist())
-        common[out], kept[out] = _simple(train, problem.batch.select(out.tolist()), problem, dt)
+        train, test = (
+            problem.batch.select(np.flatnonzero(part).tolist()) for part in (fold != k, fold == k)
+        )
+        speed = best_common_speed([train])
+        with torch.no_grad():
+            for name, simulate in baselines(problem.system(), FusedSolver(dt), speed).items():
+                simple[name][fold == k] = sequence_costs(simulate(test), test)
     return {
         "costs": costs.tolist(),
-        "no_interaction": common.tolist(),
-        "constant_velocity": kept.tolist(),
+        **{name: values.tolist() for name, values in simple.items()},
         "groups": group.tolist(),
-        "names": [s.name for s in sequences],
     }
-
-
-def _simple(
-    train: Batch, test: Batch, problem: Problem, dt: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Costs of the baselines, the common speed taken from the training sequences."""
-    system, solver = problem.system(), FusedSolver(dt)
-    speed = best_common_speed([train])
-    with torch.no_grad():
-        found = [
-            sequence_costs(simulate(test), test).numpy()
-            for simulate in (no_interaction(system, solver, speed), constant_velocity(system))
-        ]
-    return found[0], found[1]
 
 
 def descend(
@@ -210,17 +197,13 @@ def descend(
         optimizer.step()
         with torch.no_grad():
             rows.clamp_(cost.low, cost.high)
-    return _ended(problem, dt, best_rows[int(best.argmin())], history)
-
-
-def _ended(problem: Problem, dt: float, row: Tensor, history: list[Any]) -> Result:
-    """The end of a run, evaluated in float64."""
+    end = best_rows[[int(best.argmin())]]
     cost = problem.cost(dt, torch.float64)
-    value, gradient = cost(row[None])
-    residual = optimality_residual(row[None], value, gradient, cost.low, cost.high)
+    value, gradient = cost(end)
+    residual = optimality_residual(end, value, gradient, cost.low, cost.high)
     return {
         "cost": float(value[0]),
-        "parameters": named(cost, row),
+        "parameters": named(cost, end[0]),
         "residual": float(residual[0]),
         "history": history,
     }
@@ -238,10 +221,8 @@ def scan(folder: str, recording_name: str, model: str, points: int, dt: float) -
     }
     grid = torch.cartesian_prod(*(axes[name] for name in names))
     costs = torch.cat([cost.costs(part).mean(1) for part in grid.split(256)])
-    least = int(costs.argmin())
     return {
-        "cost": float(costs[least]),
-        **dict(zip(names, grid[least].tolist(), strict=True)),
+        "cost": float(costs.min()),
         "lengths": axes["L"].tolist(),
         "by_length": costs.reshape(points, points).amin(names.index("v0")).tolist(),
     }

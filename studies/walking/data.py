@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
-from nnode.data.prepare import prepare
 from nnode.data.readers.juelich import Velocity
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.store import Store
-from studies.crowd.data import OTHERS, RECORDING, corridor
+from studies.crowd.data import OTHERS, RECORDING, prepared
+from studies.options import StudyOptions
+from studies.stores import sequences
 
 #: Recordings of both experiments; frame rates differ, so that they are two batches.
 RUNS = {"main": (RECORDING,), "others": OTHERS}
@@ -19,38 +19,27 @@ RUNS = {"main": (RECORDING,), "others": OTHERS}
 HISTORY = 1.0
 
 
-def prepare_runs(
-    kind: str, source: str | None, download: str | None, horizon: float, folder: Path
-) -> Store:
+def prepare_runs(options: StudyOptions, folder: Path, kind: str, horizon: float) -> Store:
     """The recordings of one experiment as sequences of ``horizon`` seconds.
 
     Velocities at the start are backward differences, so that nothing of what is predicted is in
     them. Sequences of one person, and the first one of a recording, which nothing went before,
-    are left out by :func:`sequences`.
+    are left out by :func:`measured_before`.
     """
-    options = corridor(
-        kind != "main",
-        source=source,
-        download=download,
-        t_seq=horizon,
-        history=HISTORY,
-        velocity=Velocity.backward,
-        min_agents=2,
-    )
-    return prepare(options, folder)
+    more = {"history": HISTORY, "velocity": Velocity.backward, "min_agents": 2}
+    return prepared(options, folder, kind, horizon, **more)
 
 
-@lru_cache(maxsize=8)
-def sequences(folder: str) -> tuple[Sequence, ...]:
-    """Those of a prepared folder before which somebody was measured."""
-    return tuple(s for s in Store(folder) if s.preferred is not None)
+def measured_before(folder: str) -> list[Sequence]:
+    """The sequences of a prepared folder before which somebody was measured."""
+    return [s for s in sequences(folder) if s.preferred is not None]
 
 
 def chosen(folders: Iterable[str], held: Iterable[str], *, test: bool) -> list[Batch]:
     """The sequences of some runs, or of all others, as one batch of each experiment."""
     found, runs = [], set(held)
     for folder in folders:
-        mine = [s for s in sequences(folder) if (s.recording in runs) == test]
+        mine = [s for s in measured_before(folder) if (s.recording in runs) == test]
         if mine:
             batch = collate(mine)
             assert batch.preferred is not None

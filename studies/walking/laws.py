@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-
 from nnode.model.build import build_model
 from nnode.model.laws import PEDESTRIAN_LAWS
 from nnode.model.system import System
@@ -67,11 +65,3 @@ def new_system(law: str, desired: str) -> System:
     """A law of LAWS at its start."""
     options = {"term": "formula", "name": law, "law": LAWS[law], "desired": desired}
     return build_model({**options, "leader": "measured"})
-
-
-def filled(system: System, row: Mapping[str, float]) -> System:
-    """The same system with a law's parameters by name."""
-    with torch.no_grad():
-        for name, value in system.terms[0].named_parameters():
-            value.fill_(row[name])
-    return system

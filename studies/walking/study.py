@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,17 @@ import pandas as pd
 from nnode.errors import ConfigError
 from nnode.pages.page import Block
 from nnode.pages.replay import ReplayBlock
-from studies.crowd.figures import horizon_costs
-from studies.frame import by_unit, computed, differences, numbers
+from nnode.plots.style import thinned
+from studies.figures import horizon_costs
+from studies.frame import by_number, by_unit, computed, differences
 from studies.options import WalkingStudyOptions
 from studies.page import page
-from studies.replay import player, scenes, spread
+from studies.pooled import filled
+from studies.replay import player, scenes
 from studies.runner import Task
 from studies.walking import tasks
-from studies.walking.data import RUNS, prepare_runs, sequences
-from studies.walking.laws import DESIRED, LABELS, LAWS, SIMPLE, filled, new_system
+from studies.walking.data import RUNS, measured_before, prepare_runs
+from studies.walking.laws import DESIRED, LABELS, LAWS, SIMPLE, new_system
 
 TITLE = "Walking: pedestrian laws in two-way flows"
 SUBTITLE = (
@@ -49,19 +52,16 @@ def run(options: WalkingStudyOptions, folder: Path) -> list[Block]:
     """
     if options.folds > sum(map(len, RUNS.values())):
         raise ConfigError(f"study.folds={options.folds}: expected 2 to 7 groups of runs")
-    download = options.download or str(folder / "data" / "raw")
     parts = []
     for horizon in options.horizons:
-        stores = {}
-        for kind in RUNS:
-            name = f"{kind}-{horizon:g}s"
-            where = folder / "data" / name
-            stores[name] = prepare_runs(kind, options.source, download, horizon, where)
+        stores = {
+            f"{kind}-{horizon:g}s": prepare_runs(options, folder, kind, horizon) for kind in RUNS
+        }
         folders = [str(store.folder) for store in stores.values()]
         every, title = _tasks(options, horizon, folders), f"walking study, {horizon:g} s"
         found = computed(every, folder, options, stores, title)
         parts.append(found.assign(horizon=horizon))
-    study = Walking(options, pd.concat(parts, ignore_index=True))
+    study = Walking(options, pd.concat(parts))
     figures = {f"walking_{desired}": study.figure(desired) for desired in DESIRED}
     return page(
         "walking", study.tables(), {**figures, "replay": study.replay(folders)}, desired=DESIRED
@@ -86,6 +86,29 @@ def _tasks(options: WalkingStudyOptions, horizon: float, folders: list[str]) -> 
     return every
 
 
+def errors_by_run(found: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
+    """A row per law and held-out run in which somebody is predicted.
+
+    Args:
+        found: results of :mod:`studies.walking.tasks`.
+        labels: of the laws.
+
+    Returns:
+        ``law``, ``run``, ``people``, and their mean errors, see :func:`studies.walking.tasks.fit`.
+    """
+    rows = []
+    for one in found.to_dict("records"):
+        fitted = one["task"] == "fit"
+        laws = {one["law"]: one["errors"]} if fitted else {name: one[name] for name in SIMPLE}
+        rows += [
+            {"law": labels[law], "run": run, **errors}
+            for law, runs in laws.items()
+            for run, errors in runs.items()
+            if errors["people"]
+        ]
+    return pd.DataFrame(rows)
+
+
 @dataclass
 class Walking:
     """Options, and a row of results per task."""
@@ -93,39 +116,29 @@ class Walking:
     options: WalkingStudyOptions
     found: Any
 
-    def errors(self, desired: str) -> pd.DataFrame:
-        """A row per law, horizon (s) and held-out run: ``people``, and mean squared distances (m²)
-        over a sequence, ``mean``, and at its ``end``."""
-        rows = []
-        for one in self.found.to_dict("records"):
-            if one["task"] == "fit":
-                laws = {one["law"]: one["errors"]} if one["desired"] == desired else {}
-            else:
-                laws = {name: one[name] for name in SIMPLE} if desired == DESIRED[0] else {}
-            rows += [
-                {"law": LABELS[law], "horizon": one["horizon"], "run": run, **errors}
-                for law, runs in laws.items()
-                for run, errors in runs.items()
-                if errors["people"]
-            ]
-        return pd.DataFrame(rows)
-
     def costs(self, desired: str, horizon: float, what: str = "mean") -> pd.DataFrame:
         """A row per person of every run, a column per law: m²."""
-        errors = self.errors(desired)
-        table: Any = errors[errors["horizon"] == horizon].pivot(index="run", columns="law")
+        found = self.found[self.found["horizon"] == horizon]
+        chosen = found["desired"] == desired
+        if desired == DESIRED[0]:
+            chosen |= found["task"] == "baselines"
+        table: Any = errors_by_run(found[chosen], LABELS).pivot(index="run", columns="law")
         table = table.loc[table.index.repeat(table["people"].iloc[:, 0])][what]
         order = [label for label in LABELS.values() if label in table]
         return by_unit({law: table[law] for law in order}, table.index)
+
+    def means(self, desired: str, what: str = "mean") -> pd.DataFrame:
+        """Mean cost (m²) by law and horizon."""
+        horizons = self.options.horizons
+        found = {f"{h:g} s": self.costs(desired, h, what).mean() for h in horizons}
+        return pd.DataFrame(found).rename_axis(None)
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """By their names in the template."""
         found = {"walking_parameters": self._parameters()}
         for desired in DESIRED:
-            for name, what in (("", "mean"), ("_end", "end")):
-                found[f"walking_{desired}{name}"] = pd.DataFrame(
-                    {f"{h:g} s": self.costs(desired, h, what).mean() for h in self.options.horizons}
-                ).rename_axis(None)
+            found[f"walking_{desired}"] = self.means(desired)
+            found[f"walking_{desired}_end"] = self.means(desired, "end")
             found[f"walking_{desired}_differences"] = self.differences(desired)
         return found
 
@@ -144,7 +157,7 @@ class Walking:
     def figure(self, desired: str) -> Any:
         """Errors relative to those without interaction, by horizon."""
         horizons, laws = self.options.horizons, [LABELS[law] for law in LAWS]
-        mean = self.tables()[f"walking_{desired}"].loc[laws]
+        mean = self.means(desired).loc[laws]
         away = self.differences(desired).set_index("horizon (s)", append=True)
         low, high = (
             away[end].unstack().reindex(laws).set_axis(mean.columns, axis=1) + mean.iloc[0]
@@ -153,35 +166,36 @@ class Walking:
         return horizon_costs(horizons, mean, low, high)
 
     def _parameters(self) -> pd.DataFrame:
-        rows = [
-            [
-                LABELS[one["law"]],
-                *(one["desired"], one["horizon"], ", ".join(one["held"])),
-                *(name, value, one["train"]),
-            ]
-            for one in self.found[self.found["task"] == "fit"].to_dict("records")
-            for name, _, value in numbers(one["row"])
-        ]
-        names = ["model", "wish", "horizon (s)", "held out", "parameter", "value"]
-        return pd.DataFrame(rows, columns=[*names, "training error (m²)"]).set_index("model")
+        fits = self.found[self.found["task"] == "fit"]
+        table = pd.DataFrame(
+            {
+                "model": fits["law"].map(LABELS),
+                "wish": fits["desired"],
+                "horizon (s)": fits["horizon"],
+                "held out": fits["held"].map(", ".join),
+                "row": fits["row"],
+                "training error (m²)": fits["train"],
+            }
+        )
+        table = by_number(table, "row").drop(columns="index").set_index("model")
+        table["training error (m²)"] = table.pop("training error (m²)")  # the last column
+        return table
 
     def replay(self, folders: list[str]) -> ReplayBlock:
         """The runs of the first group at the longest horizon, beside laws that did not see them."""
         horizon, desired = self.options.horizons[-1], DESIRED[0]
         held = groups(self.options.folds)[0]
-        seen = [s for folder in folders for s in sequences(folder) if s.recording in held]
-        complete = [s for s in seen if s.preferred is not None and np.isfinite(s.preferred).all()]
+        seen = [s for folder in folders for s in measured_before(folder) if s.recording in held]
+        complete = [s for s in seen if np.isfinite(np.array(s.preferred)).all()]
         mean = self.costs(desired, horizon).mean()
         best = min(list(LAWS)[1:], key=lambda law: mean[LABELS[law]])
-        fits = self.found.set_index("key")
+        rows = self.found["row"]
         systems = {
-            LABELS[law]: filled(
-                new_system(law, desired), fits.loc[f"{law}-{desired}-{horizon:g}s-0", "row"]
-            )
+            LABELS[law]: filled(new_system(law, desired), rows[f"{law}-{desired}-{horizon:g}s-0"])
             for law in ("alone", best)
         }
         what = (
             f"Sequences of {horizon:g} s of held-out runs, as measured and as simulated by "
             f"{' and '.join(systems)}; desired velocity: *{desired}*."
         )
-        return player("replay", scenes(spread(complete, FEW), systems), what, len(seen))
+        return player(scenes(thinned(complete, FEW), systems), what, len(seen))

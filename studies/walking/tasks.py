@@ -13,7 +13,7 @@ from nnode.data.sequence import Batch
 from nnode.model.scene import Scene, with_destinations
 from nnode.model.system import System
 from nnode.simulation.fused import FusedSolver
-from studies.pooled import pooled_fit, start_of
+from studies.pooled import parameters_of, pooled_fit
 from studies.walking.data import chosen
 from studies.walking.laws import GRID, new_system
 
@@ -32,16 +32,10 @@ def fit(law: str, desired: str, folders: list[str], held: list[str]) -> Result:
     """
     system = new_system(law, desired)
     train = chosen(folders, held, test=False)
-    own = start_of(system, train[0])
+    own = parameters_of(system)
     grid = [dict(zip(GRID[law], each, strict=True)) for each in product(*GRID[law].values())]
-    found = pooled_fit(system, train, [{**own, **more} for more in [{}, *grid]])
-    return {
-        "row": found.row,
-        "train": found.error,
-        "starts": found.starts,
-        "evaluations": found.evaluations,
-        "errors": _of_runs(simulated(system), folders, held),
-    }
+    row, error = pooled_fit(system, train, [own, *({**own, **more} for more in grid)])
+    return {"row": row, "train": error, "errors": _of_runs(simulated(system), folders, held)}
 
 
 def baselines(folders: list[str], held: list[str]) -> Result:
@@ -95,4 +89,4 @@ def _errors(x: Predict, batches: list[Batch]) -> Result:
     if not batches:
         return {"people": 0, **dict.fromkeys(found, 0.0)}
     means = {name: float(torch.cat(parts).mean()) for name, parts in found.items()}
-    return {"people": sum(len(part) for part in found["mean"]), **means}
+    return {"people": sum(map(len, found["mean"])), **means}

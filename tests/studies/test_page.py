@@ -74,16 +74,16 @@ def test_bold_cells_are_the_least_among_some_rows_or_in_a_row() -> None:
 def test_one_row_per_task_and_one_per_number() -> None:
     tasks = [Task(f"k{x}", square, {"x": x}) for x in (1, 2)]
     found = frame.tidy(tasks, {"k1": {"y": 1}, "k2": {"y": 4}})
-    assert found.to_dict("list") == {
-        "key": ["k1", "k2"],
-        "task": ["square"] * 2,
-        "x": [1, 2],
-        "y": [1, 4],
+    assert found.to_dict("index") == {
+        "k1": {"task": "square", "x": 1, "y": 1},
+        "k2": {"task": "square", "x": 2, "y": 4},
     }
-    assert frame.numbers({"v": 3.0, "w": [[1.0, 2.0]]}) == [
-        ("v", "", 3.0),
-        ("w", "0 0", 1.0),
-        ("w", "0 1", 2.0),
+    fits = pd.DataFrame({"law": ["a", "b"], "row": [{"v": 3.0, "w": [[1.0, 2.0]]}, {"v": 4.0}]})
+    assert frame.by_number(fits, "row").to_numpy().tolist() == [
+        ["a", "v", "", 3.0],
+        ["a", "w", "0 0", 1.0],
+        ["a", "w", "0 1", 2.0],
+        ["b", "v", "", 4.0],
     ]
 
 

@@ -16,15 +16,6 @@ from tests.studies.traffic.invented import platoons
 V0, L = 25.0, 5.0
 
 
-def test_sequences_are_chosen_evenly() -> None:
-    items = platoons("a") + platoons("b") + platoons("c")
-    assert replay.spread(items, 3) == items[::3]
-    assert replay.spread(items, 9) == items
-    assert replay.spread(items, 100) == items
-    assert len(replay.spread(items, 4)) == 3
-    assert replay.spread([], 4) == []
-
-
 def test_models_drive_as_their_formula_says() -> None:
     sequences = platoons("a")[:2]
     system = system_of("lin", {"v0": V0, "L": L})
@@ -49,7 +40,7 @@ def test_after_a_blow_up_nobody_is_there(monkeypatch: pytest.MonkeyPatch) -> Non
     x = scene.simulated["lin"]
     np.testing.assert_array_equal(x[0], s.x[0])
     assert np.isnan(x[1:]).all()
-    block = replay.player("p", [scene], "One.", 7)
+    block = replay.player([scene], "One.", 7)
     text, said = block.data()
     assert said.startswith("The player contains 1 of 7 sequences.")
     rows = json.loads(text)["scenes"][0]["simulated"][0]["x"]

@@ -10,8 +10,9 @@ import numpy as np
 
 from nnode.data.sequence import Sequence
 from nnode.data.store import Store, write_store
-from studies.crowd.data import Place, parts, sequences
+from studies.crowd.data import parts
 from studies.crowd.fit import new_system, row_of, silence
+from studies.stores import sequences
 from tests.studies.crowd.corridor import DT, sequence
 
 #: A, k, kappa by horizon, s; those of 2 s are the printed ones times 1.1, 0.9 and 1.2.
@@ -29,13 +30,11 @@ ELSEWHERE = {
 WORSE = 0.1
 
 
-def store(
-    source: str | None, download: str | None, horizon: float, folder: Path, *, others: bool = False
-) -> Store:
+def store(options: Any, folder: Path, kind: str, horizon: float) -> Store:
     """A sequence of 12 people in every second of 24 s; or two other runs of one sequence each."""
     rng = np.random.default_rng(5)
     samples = round(horizon / DT) + 1
-    if others:
+    if kind == "others":
         made = []
         for name in ELSEWHERE:
             one = sequence(rng, 0, samples, 6)
@@ -43,7 +42,9 @@ def store(
     else:
         made = [_paced(sequence(rng, number, samples, 12)) for number in range(24)]
     files = {"a": {"name": "a.txt", "sha256": "34cd"}}
-    return write_store(folder, made, {"dt": DT, "files": files, "counts": {"dropped": 3}})
+    return write_store(
+        folder / f"{kind}-{horizon:g}s", made, {"dt": DT, "files": files, "counts": {"dropped": 3}}
+    )
 
 
 def _paced(one: Sequence) -> Sequence:
@@ -76,7 +77,7 @@ def fit(
     if start is not None and kind != "sf":
         assert row == start
     every = sequences(folder)
-    train, held = parts(Place(folder, scope, folds), (span[0], span[1]))
+    train, held = parts(folder, scope, folds, (span[0], span[1]))
     cost = COST[kind] * (1 + WORSE * seed)
     unseen = NN_THERE if (kind, scope) == ("nn", BAD_BLOCK) else cost
     return {

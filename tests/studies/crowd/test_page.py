@@ -22,7 +22,7 @@ from tests.studies.crowd.corridor import DT
 def blocks(tmp_path_factory: pytest.TempPathFactory) -> list[Block]:
     options = CrowdStudyOptions(workers=1, restarts=2, horizons=[2.0, 1.0], bootstrap=20)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(crowd, "prepare_horizon", invented.store)
+        patch.setattr(crowd, "prepared", invented.store)
         for name in ("fit", "resample", "baselines", "transfer"):
             patch.setattr(tasks, name, getattr(invented, name))
         return crowd.run(checked(options), tmp_path_factory.mktemp("study"))

@@ -63,7 +63,6 @@ def test_refits_to_resampled_data_without_noise_stay_where_they_are(folder: str)
 
 def test_baselines_calibrate_nothing(folder: str) -> None:
     found = tasks.baselines(folder)
-    assert found["people"] == [PEOPLE] * 4
     names = [f"made/{number}" for number in range(4)]
     assert all(list(by_name) == names for by_name in found["costs"].values())
     # no interaction is the social force without strength

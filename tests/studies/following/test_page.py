@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from nnode.pages.page import TableBlock, write_page
@@ -16,8 +17,10 @@ from studies.following.data import LEADERS, PAIRS, PLATOONS
 from studies.following.fit import OBJECTIVES, named
 from studies.following.results import Study
 from studies.following.study import after, training
+from studies.frame import tidy
 from studies.options import FollowingStudyOptions
 from studies.page import page
+from studies.runner import Task
 from tests.studies.following.test_fit import driven
 
 #: By candidate: held-out and test error of every pair, m.
@@ -126,13 +129,16 @@ def invented() -> dict[str, dict[str, Any]]:
 @pytest.fixture
 def study(monkeypatch: pytest.MonkeyPatch) -> Study:
     store = SimpleNamespace(folder="", manifest={"files": {}})
-    found = Study(
-        FollowingStudyOptions(),
-        cast(Any, dict.fromkeys((PAIRS, PLATOONS, LEADERS), store)),
-        invented(),
-    )
+    stores = cast(Any, dict.fromkeys((PAIRS, PLATOONS, LEADERS), store))
     monkeypatch.setattr(Study, "pairs", lambda self, test=False: tuple(driven()))
     monkeypatch.setattr(stability, "platoon", lambda *args, **more: np.full(11, 0.05))
+    options, results = FollowingStudyOptions(), invented()
+
+    def done(tasks: list[Task]) -> pd.DataFrame:
+        return tidy([task for task in tasks if task.key in results], results)
+
+    found = Study(options, stores, done(training(options, stores)))
+    found.found = pd.concat([found.found, done(after(found))])
     return found
 
 

@@ -17,6 +17,7 @@ from studies.prediction import printed, study, tasks
 from studies.prediction.data import AHEAD, SCENES, SEEN, events, scene
 from studies.walking import tasks as walking
 from studies.walking.data import chosen
+from studies.walking.study import errors_by_run
 from tests.builders import lane
 
 FREE = {"parameters": {"v0": "12 m/s"}, "rate": {"x": "v0"}}
@@ -91,7 +92,8 @@ def test_tables_of_errors() -> None:
     assert table.loc["idm", "low"] < table.loc["idm", "test"] < table.loc["idm", "high"]
     assert table.loc["idm", "parameters"] == "T = 1.5"
     assert list(table.index[1:]) == ["idm, published", "learned, published"]
-    ade = study._by_scene(study._distances(found), "ade")["eth_univ"]
+    distances = errors_by_run(found[found["task"] != "follow"], study.SIMPLE | study.PEOPLE)
+    ade = study._by_scene(distances, "ade")["eth_univ"]
     assert ade.to_dict() == {
         "constant velocity": 0.5,
         "mean speed with the stream": 0.5,

@@ -14,11 +14,13 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.data.options import Faults
 from nnode.data.prepare import prepare
 from nnode.data.readers.esimas import EsimasOptions
+from nnode.data.sequence import collate
 from nnode.model.build import build_model
 from nnode.model.system import System
 from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver
-from studies.crowd.data import chosen, prepare_horizon, sequences
+from studies.crowd.data import prepared
 from studies.crowd.fit import system_of
+from studies.options import CrowdStudyOptions
 from studies.traffic.printed import RECORDINGS
 from studies.traffic.problem import Problem, model_options, recording
 
@@ -98,8 +100,8 @@ def test_crowd_costs_follow_from_the_parameters(
     told = pd.read_csv(folder / "crowd_costs.csv", index_col=0)
     rows = pd.read_csv(folder / "parameters.csv")
     rows = rows[(rows.model == model) & (rows["trained on"] == "all") & (rows["horizon (s)"] == 1)]
-    prepare_horizon(str(real_data), None, 1.0, tmp_path)
-    batch = chosen(str(tmp_path), range(len(sequences(str(tmp_path)))))
+    options = CrowdStudyOptions(source=str(real_data))
+    batch = collate(prepared(options, tmp_path, "main", 1.0))
 
     def cost(system: System, solver: Solver) -> float:
         with torch.no_grad():

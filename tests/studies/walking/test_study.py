@@ -64,6 +64,7 @@ def test_errors_are_means_over_people() -> None:
     rows = [
         {
             "task": "baselines",
+            "desired": np.nan,
             "horizon": 1.0,
             "constant_velocity": {f"r{i}": one},
             "preferred": {f"r{i}": one},
