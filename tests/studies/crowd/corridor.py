@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,16 +30,23 @@ def sequence(rng: np.random.Generator, number: int, samples: int, people: int) -
     return replace(straight(x, v, samples, DT, **more), v=None)
 
 
-def corridor(
+def walkers(
     seed: int, *, system: System | None = None, samples: int = 16, people: int = 12, number: int = 3
-) -> Batch:
+) -> list[Sequence]:
     """Sequences of different numbers of people; with ``system`` they move as it says."""
     rng = np.random.default_rng(seed)
-    made = collate(sequence(rng, i, samples, people - i) for i in range(number))
-    if system is not None:
-        with torch.no_grad():
-            moved = TorchdiffeqSolver("euler", "discrete")(system, made)
-        assert moved.v is not None
-        made.x = torch.where(made.agent[..., None], moved.x, made.x)
-        made.v = torch.where(made.agent[..., None], moved.v, made.v)
-    return made
+    made = [sequence(rng, i, samples, people - i) for i in range(number)]
+    if system is None:
+        return made
+    with torch.no_grad():
+        moved = TorchdiffeqSolver("euler", "discrete")(system, collate(made))
+    assert moved.v is not None
+    return [
+        replace(s, x=moved.x[:, i, : s.n_agents].numpy(), v=moved.v[:, i, : s.n_agents].numpy())
+        for i, s in enumerate(made)
+    ]
+
+
+def corridor(seed: int, **how: Any) -> Batch:
+    """These sequences as a batch."""
+    return collate(walkers(seed, **how))

@@ -17,7 +17,7 @@ from studies.crowd import printed as printed_crowd
 from studies.crowd.data import ALL, fold_of, parts, time_groups, turned
 from studies.crowd.fit import calibrate, costs, new_system, row_of, system_of
 from studies.crowd.tasks import even_pace
-from tests.studies.crowd.corridor import corridor, sequence
+from tests.studies.crowd.corridor import corridor, sequence, walkers
 
 TRUE = np.array([0.05, 40.0, 12.0])
 
@@ -106,21 +106,9 @@ def test_growing_horizons_end_in_the_same_minimum_as_a_start_next_to_it():
 
 
 def test_weights_choose_the_sequences():
-    made = [
-        corridor(s, system=system_of("sf", row), samples=26, people=60, number=1)
-        for s, row in ((1, TRUE), (2, 2 * TRUE))
-    ]
     both = collate(
-        Sequence(
-            name=str(n),
-            recording="made",
-            time=0.04 * np.arange(26),
-            x=one.x[:, 0].numpy(),
-            v=one.v[:, 0].numpy(),
-            destination=one.destination[0].numpy(),
-            walls=one.walls[0].numpy(),
-        )
-        for n, one in enumerate(made)
+        walkers(seed, system=system_of("sf", row), samples=26, people=60, number=1)[0]
+        for seed, row in ((1, TRUE), (2, 2 * TRUE))
     )
     row, _ = calibrate("sf", both, TRUE, weights=np.array([0.0, 1.0]))
     assert row == pytest.approx(2 * TRUE, rel=1e-3)

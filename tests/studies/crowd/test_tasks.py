@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from nnode.data.sequence import Sequence
 from nnode.data.store import write_store
 from studies.crowd import tasks
 from studies.crowd.data import chosen
 from studies.crowd.fit import costs, system_of
-from tests.studies.crowd.corridor import DT, corridor
+from tests.studies.crowd.corridor import DT, walkers
 
 TRUE = np.array([0.05, 40.0, 12.0])
 #: Starts of the sequences, s: two in each half of the recording, in four stretches of 10 s.
@@ -22,22 +23,11 @@ PEOPLE = 30
 def folder(tmp_path_factory: pytest.TempPathFactory) -> str:
     made = []
     for number, start in enumerate(STARTS):
-        one = corridor(number, system=system_of("sf", TRUE), samples=26, people=PEOPLE, number=1)
-        assert one.v is not None
-        assert one.destination is not None
-        assert one.walls is not None
-        made.append(
-            Sequence(
-                name=f"made/{number}",
-                recording="made",
-                time=start + DT * np.arange(26),
-                x=one.x[:, 0].numpy(),
-                v=one.v[:, 0].numpy(),
-                walls=one.walls[0].numpy(),
-                destination=one.destination[0].numpy(),
-                agents=tuple(f"{number}-{i}" for i in range(PEOPLE)),
-            )
-        )
+        truth = system_of("sf", TRUE)
+        (one,) = walkers(number, system=truth, samples=26, people=PEOPLE, number=1)
+        agents = tuple(f"{number}-{i}" for i in range(PEOPLE))
+        time = start + DT * np.arange(26)
+        made.append(replace(one, name=f"made/{number}", recording="made", time=time, agents=agents))
     place = tmp_path_factory.mktemp("crowd")
     write_store(place, made, {"dt": DT})
     return str(place)

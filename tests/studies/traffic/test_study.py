@@ -19,34 +19,15 @@ from studies.options import TrafficStudyOptions
 from studies.traffic import printed, tasks
 from studies.traffic import study as traffic
 from studies.traffic.problem import Problem
+from tests.builders import linear
 
 V0, L = 24.0, 5.0
 
 
 def platoons(number: int) -> list[Sequence]:
-    """Cars that follow the linear law, integrated by Runge and Kutta's method in NumPy."""
+    """Cars that follow the linear law."""
     rng = np.random.default_rng(2)
-    found = []
-    for i in range(number):
-        x = np.cumsum(rng.uniform(7, 25, 4))
-        path = [x]
-
-        def rate(x: np.ndarray) -> np.ndarray:
-            return np.append(V0 * (1 - L / np.diff(x)), V0)
-
-        for _ in range(6):
-            for _ in range(20):
-                h = 0.01
-                a = rate(x)
-                b = rate(x + h / 2 * a)
-                c = rate(x + h / 2 * b)
-                x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c))
-            path.append(x)
-        time = 100.0 * i + 0.2 * np.arange(7)
-        found.append(
-            Sequence(name=f"r/{i:03}", recording="r", time=time, x=np.array(path)[:, :, None])
-        )
-    return found
+    return linear([np.cumsum(rng.uniform(7, 25, 4)) for _ in range(number)], V0, L, 7, 0.0005)
 
 
 @pytest.fixture(scope="module")
