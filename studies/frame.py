@@ -47,17 +47,17 @@ def computed(
 
 def labelled(rows: Mapping[tuple[Any, ...], Mapping[str, Any]], *names: str) -> pd.DataFrame:
     """A table of rows by labels of several levels."""
-    found = pd.DataFrame.from_dict(dict(rows), orient="index")
-    found.index = pd.MultiIndex.from_tuples(list(rows), names=names)
-    return found
+    return pd.DataFrame.from_dict(dict(rows), orient="index").rename_axis(list(names))
 
 
-def by_unit(
-    costs: Mapping[str, Iterable[float]], cluster: Iterable[Any], unit: Iterable[Any] | None = None
-) -> pd.DataFrame:
-    """A column of costs per law, indexed by cluster and unit."""
+def by_unit(costs: Any, cluster: Iterable[Any], unit: Iterable[Any] | None = None) -> pd.DataFrame:
+    """A column of costs per law, indexed by cluster and unit.
+
+    Args:
+        costs: law to a cost per unit.
+    """
     cluster = list(cluster)
-    names = list(unit) if unit is not None else range(len(cluster))
+    names = range(len(cluster)) if unit is None else unit
     index = pd.MultiIndex.from_arrays([cluster, list(names)], names=["cluster", "unit"])
     return pd.DataFrame({law: list(values) for law, values in costs.items()}, index=index)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from importlib.resources import files
-from typing import Any
+from types import SimpleNamespace
 
 import yaml
 
 
-def told(package: str) -> dict[str, Any]:
-    """The entries of the ``printed.yaml`` of a study's package."""
+def published(package: str) -> SimpleNamespace:
+    """The entries of the ``printed.yaml`` of a study's package, as attributes."""
     text = files(package).joinpath("printed.yaml").read_text(encoding="utf-8")
-    return dict(yaml.safe_load(text))
+    return SimpleNamespace(**yaml.safe_load(text))

@@ -13,8 +13,8 @@ import re
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Generator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,22 +118,23 @@ def run_tasks(
     failed: dict[str, str] = {}
     start, before = time.monotonic(), len(tasks) - len(missing)
     progress = TaskProgress(title, len(tasks), before, sum(costs.values()))
-
-    def outcomes(guard: InterruptGuard) -> Generator[tuple[str, Outcome], None, None]:
-        calls = [(task.key, task.call()) for task in missing]
-        if cluster is not None:
-            return calls_on_cluster(calls, cluster, guard, progress.tick)
-        if workers == 1:
-            return calls_here(calls, guard)
-        return calls_in_processes(calls, workers, guard, progress.tick)
-
-    with InterruptGuard() as guard, progress, closing(outcomes(guard)) as found:
-        for key, outcome in found:
-            with _kept_or_refused(key, places[key].parent):
+    calls = [(task.key, task.call()) for task in missing]
+    with (
+        InterruptGuard() as guard,
+        progress,
+        closing(_outcomes(calls, workers, cluster, guard, progress.tick)) as outcomes,
+    ):
+        for key, outcome in outcomes:
+            try:
                 if outcome.text is None:
                     failed[key] = _failure(outcome, places[key])
                 else:
                     results[key] = _keep(outcome, places[key], identities[key])
+            except OSError as error:
+                raise StudyError(
+                    f"the result of task {key} cannot be kept in {folder / KEPT}: "
+                    f"{error.strerror}; make room or choose another folder, and start again"
+                ) from error
             progress.advance(costs[key])
     done = sum(result is not None for result in results.values())
     if guard.requested is not None:
@@ -149,6 +150,21 @@ def run_tasks(
     return {key: result for key, result in results.items() if result is not None}
 
 
+def _outcomes(
+    calls: list[tuple[str, Call]],
+    workers: int,
+    cluster: str | None,
+    guard: InterruptGuard,
+    tick: Callable[[], None],
+) -> Generator[tuple[str, Outcome], None, None]:
+    """The calls' outcomes as they come, from a cluster, this process or others."""
+    if cluster is not None:
+        return calls_on_cluster(calls, cluster, guard, tick)
+    if workers == 1:
+        return calls_here(calls, guard)
+    return calls_in_processes(calls, workers, guard, tick)
+
+
 def kept_results(
     folder: Path, function: Callable[..., dict[str, Any]], fingerprint: str
 ) -> dict[str, dict[str, Any]]:
@@ -162,10 +178,11 @@ def kept_results(
     found = {}
     for path in sorted((folder / KEPT).glob("*.json")):
         with suppress(OSError, ValueError, KeyError, TypeError):
-            content = json.loads(path.read_text(encoding="utf-8"))
-            task = Task(path.stem, function, content["identity"]["arguments"])
-            if _canonical(content["identity"]) == _canonical(task.identity(fingerprint)):
-                found[task.key] = dict(content["result"])
+            arguments = json.loads(path.read_text(encoding="utf-8"))["identity"]["arguments"]
+            task = Task(path.stem, function, arguments)
+            result = _kept(path, task.identity(fingerprint))
+            if result is not None:
+                found[task.key] = result
     return found
 
 
@@ -173,30 +190,14 @@ def _kept(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
     """A kept result, if it is of the same task."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        same = _canonical(content["identity"]) == _canonical(identity)
-        return dict(content["result"]) if same else None
+        # as text, NaN equals itself
+        kept, asked = (json.dumps(each, sort_keys=True) for each in (content["identity"], identity))
+        return dict(content["result"]) if kept == asked else None
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
         log.warning("%s is damaged (%s) and is computed again", path, type(error).__name__)
         return None
-
-
-def _canonical(identity: dict[str, Any]) -> str:
-    # as text, NaN equals itself
-    return json.dumps(identity, sort_keys=True)
-
-
-@contextmanager
-def _kept_or_refused(key: str, folder: Path) -> Iterator[None]:
-    """Report a result that cannot be written as an error of the study."""
-    try:
-        yield
-    except OSError as error:
-        raise StudyError(
-            f"the result of task {key} cannot be kept in {folder}: {error.strerror}; make room or "
-            "choose another folder, and start again"
-        ) from error
 
 
 def _keep(outcome: Outcome, path: Path, identity: dict[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ Examples:
 
 Both minimise the mean root mean square error of the gap over the same pairs within the published
 bounds, in the same compiled simulator with one thread. Differential evolution is SciPy's with the
-settings of the replication package (:mod:`studies.following.printed`).
+settings of the replication package (``studies/following/printed.yaml``).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def timed(call: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
 def within_published(law: str, folder: str) -> ResidualProblem:
     """The cost on the training pairs with the published bounds; it starts in their middle."""
     cost = costs_of(EVERY[law], data.batch(folder))
-    bounds = printed.BOUNDS[law]
+    bounds = printed.bounds[law]
     for i, name in enumerate(cost.names):
         cost.low[i], cost.high[i] = bounds[name.split(".", 1)[1]]
     cost.start = (cost.low + cost.high) / 2
@@ -57,7 +57,7 @@ def compare(law: str, folder: str) -> dict[str, Any]:
         lambda: differential_evolution(
             lambda row: float(cost.costs(row).mean()),
             list(zip(cost.low, cost.high, strict=True)),
-            **printed.EVOLUTION,
+            **printed.evolution,
         )
     )
     return {
@@ -74,7 +74,7 @@ def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--source", default=os.environ.get("NNODE_DATA"), help="raw files")
-    parser.add_argument("--laws", nargs="+", default=["idm"], choices=list(printed.BOUNDS))
+    parser.add_argument("--laws", nargs="+", default=["idm"], choices=list(printed.bounds))
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark/following.json"))
     asked = parser.parse_args()
     torch.set_num_threads(1)

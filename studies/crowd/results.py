@@ -46,6 +46,35 @@ PARTS = {"sf": ("pair", "wall"), "nn": ("sum", "pair", "wall")}
 SHOWN, FEW = ("sf", "nn"), 8
 
 
+def beside_printed(model: str, table: pd.DataFrame) -> pd.DataFrame:
+    """The six settings, our forces and the printed ones; a row per setting and person.
+
+    Args:
+        model: ``sf`` or ``nn``.
+        table: of :func:`nnode.plots.settings.six_settings`.
+
+    Returns:
+        Indexed by setting and person: ``place (m)``, ``velocity (m/s)``, ``F_x``, ``F_y``,
+        ``F_x printed``, ``F_y printed`` (N).
+    """
+    rows = {}
+    for (_, row), told in zip(table.iterrows(), printed.forces[model], strict=True):
+        for person, theirs in zip(("blue", "red"), told, strict=True):
+            place, velocity = row[f"x_{person}"], row[f"v_{person}"]
+            force = row[f"force_{person}"]
+            rows[(row["setting"], person)] = {
+                "place (m)": f"({place[0]:g}; {place[1]:g})",
+                "velocity (m/s)": f"({velocity[0]:g}; {velocity[1]:g})",
+                "F_x": force[0],
+                "F_x printed": theirs[0],
+                "F_y": force[1],
+                "F_y printed": theirs[1],
+            }
+    found = pd.DataFrame(rows).T.rename_axis(["setting", "person"])
+    forces = [name for name in map(str, found) if name.startswith("F_")]
+    return found.astype(dict.fromkeys(forces, float))
+
+
 @dataclass
 class Crowd:
     """Options, prepared data by ``main`` or ``others`` and horizon (s), and a row per task."""
@@ -81,12 +110,12 @@ class Crowd:
 
     def take(self, task: str, horizon: float) -> Any:
         """The rows of one function at a horizon."""
-        return self.found[(self.found["task"] == task) & (self.found["horizon"] == horizon)]
+        return self.found.query("task == @task and horizon == @horizon")
 
     def fits(self, kind: str, scope: str, horizon: float) -> Any:
         """Calibrations from all starts, least training cost first."""
         found = self.take("fit", horizon)
-        return found[(found["kind"] == kind) & (found["scope"] == scope)].sort_values("J")
+        return found.query("kind == @kind and scope == @scope").sort_values("J")
 
     def best(self, model: str, scope: str, horizon: float) -> Any:
         """The calibration of least training cost.
@@ -109,21 +138,17 @@ class Crowd:
             heldout: of models that were calibrated without a sequence's block of time, in place of
                 all sequences training.
         """
-        columns: dict[str, Any] = {}
-        for model in MODELS:
-            if heldout:
-                each = (self.best(model, scope, horizon)["heldout"] for scope in self.scopes[1:])
-                columns[LABELS[model]] = pd.concat(map(pd.Series, each))
-            else:
-                columns[LABELS[model]] = pd.Series(self.best(model, ALL, horizon)["train"])
-        names = columns["SF"].index
-        simple = self.take("baselines", horizon)["costs"].iloc[0]
-        columns |= {LABELS[m]: pd.Series(each)[names] for m, each in simple.items()}
+        part, scopes = ("heldout", self.scopes[1:]) if heldout else ("train", [ALL])
+        costs = {
+            model: pd.concat(pd.Series(self.best(model, s, horizon)[part]) for s in scopes)
+            for model in MODELS
+        }
+        names = costs["sf"].index
+        costs |= self.take("baselines", horizon)["costs"].iloc[0]
+        table = pd.DataFrame({label: pd.Series(costs[name]) for name, label in LABELS.items()})
         every = sequences(self.folder("main", horizon))
         group = dict(zip((s.name for s in every), time_groups(every), strict=True))
-        columns = {label: values[names] for label, values in columns.items()}
-        order = {label: columns[label] for label in LABELS.values()}
-        return by_unit(order, [group[name] for name in names], names)
+        return by_unit(table.loc[names], [group[name] for name in names], names)
 
     # -- tables ------------------------------------------------------------------------------
 
@@ -140,7 +165,7 @@ class Crowd:
             "crowd_heldout_runs": self._other_runs(),
             "crowd_restarts": self._restarts(),
             "crowd_pull": self._pull(),
-            **{f"settings_{m}": printed.settings(m, self._settings(m)[1]) for m in PARTS},
+            **{f"settings_{m}": beside_printed(m, self._settings(m)[1]) for m in PARTS},
             "settings_nn_along": along[1],
             "parameters": self._every_parameter(),
         }
@@ -159,22 +184,20 @@ class Crowd:
 
     def _parameters(self) -> pd.DataFrame:
         """A, k, kappa by horizon with 95 % intervals, printed ones first."""
-        rows: dict[str, dict[str, float]] = {"printed, 1 s": dict(printed.PARAMETERS)}
+        rows: dict[str, dict[str, float]] = {"printed, 1 s": dict(printed.parameters)}
         for horizon in self.options.horizons:
             drawn = self.take("resample", horizon).sort_values("first")["rows"]
             low, high = np.quantile(np.concatenate(list(drawn)), [0.025, 0.975], axis=0)
-            best = self.best("sf", ALL, horizon)["row"]
-            rows[f"here, {horizon:g} s"] = {
-                label: value
-                for name, *ends in zip(NAMES, best, low, high, strict=True)
-                for label, value in zip((name, f"{name} from", f"{name} to"), ends, strict=True)
+            values = {"": self.best("sf", ALL, horizon)["row"], " from": low, " to": high}
+            row = {
+                f"{n}{end}": each[i] for i, n in enumerate(NAMES) for end, each in values.items()
             }
-        order = [f"{name}{end}" for name in NAMES for end in ("", " from", " to")]
-        return pd.DataFrame(rows).T.reindex(columns=order)
+            rows[f"here, {horizon:g} s"] = row
+        return pd.DataFrame(rows, index=list(row)).T
 
     def _costs(self) -> pd.DataFrame:
         found = means(self.costs(self.options.horizons[0], heldout=False), self.options.seed)
-        told = pd.Series({LABELS[m]: cost for m, cost in printed.COSTS.items()})
+        told = pd.Series({LABELS[m]: cost for m, cost in printed.costs.items()})
         return pd.DataFrame(
             {
                 "printed (m²)": told.reindex(found.index),
@@ -229,16 +252,13 @@ class Crowd:
                     "sequences": len(one["people"]),
                     "people": float(np.mean(one["people"])),
                     "speed": mean_speed(s for s in every if s.recording == run),
-                    **{
-                        LABELS[m]: float(np.mean(list(one["costs"][m].values())))
-                        for m in list(LABELS)[:-1]
-                    },
+                    **pd.DataFrame(one["costs"])[list(LABELS)[:-1]].mean().rename(LABELS),
                 }
         return labelled(rows, "horizon", "run")
 
     def _every_parameter(self) -> pd.DataFrame:
         """All calibrations, one row per number: what is needed to compute their costs again."""
-        fits = self.found[self.found["task"] == "fit"]
+        fits = self.found.query("task == 'fit'")
         values = [named(KINDS[k], row) for k, row in zip(fits["kind"], fits["row"], strict=True)]
         names = {
             "kind": "model",
@@ -362,8 +382,8 @@ class Crowd:
 
     def values(self) -> dict[str, Any]:
         """What else the template refers to."""
-        exact = printed.settings(
-            "sf", six_settings(system_of("sf", list(printed.PARAMETERS.values())))[1]
+        exact = beside_printed(
+            "sf", six_settings(system_of("sf", list(printed.parameters.values())))[1]
         )
         dv, dx = np.abs(self.measured.dv[:, 1]), np.abs(self.measured.dx[:, 1])
         folder = self.folder("main", self.options.horizons[0])

@@ -13,9 +13,9 @@ from nnode.calibrate.resampling import group_weights
 from nnode.data.sequence import Batch, collate
 from nnode.simulation.base import Trajectory
 from nnode.simulation.fused import FusedSolver
+from studies.crowd import printed
 from studies.crowd.data import chosen, parts, time_groups, turned
 from studies.crowd.fit import calibrate, costs, new_system, row_of
-from studies.crowd.printed import PARAMETERS
 from studies.stores import sequences
 
 Result = dict[str, Any]
@@ -136,7 +136,7 @@ def _simple(batch: Batch) -> dict[str, dict[str, float]]:
         found = {
             name: _by_name(batch, sequence_costs(s(batch), batch)) for name, s in simple.items()
         }
-    return {**found, "printed": _of("sf", list(PARAMETERS.values()), batch)}
+    return {**found, "printed": _of("sf", list(printed.parameters.values()), batch)}
 
 
 def _of(model: str, row: Any, batch: Batch) -> dict[str, float]:

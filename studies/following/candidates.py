@@ -14,6 +14,7 @@ from nnode.calibrate.problem import ResidualProblem
 from nnode.model.build import build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 from nnode.model.system import System
+from studies.following import printed
 
 #: Cost of a network's weight of 1, m: networks of so few pairs are kept flat.
 DECAY = 1e-3
@@ -80,6 +81,24 @@ class Candidate:
             },
             seed=seed,
         )
+
+
+def published_law(name: str, values: dict[str, float]) -> dict[str, Any]:
+    """A law of :data:`nnode.model.laws.CAR_FOLLOWING_LAWS` with published parameters, its
+    acceleration clipped, in the published steps, ballistic ones.
+
+    Args:
+        values: by parameter, SI units.
+    """
+    law, (low, high) = CAR_FOLLOWING_LAWS[name], printed.clipped[name]
+    ends = {"least_rate": f"{low} m/s²", "most_rate": f"{high} m/s²"}
+    return {
+        **law,
+        "parameters": {name: f"{value!r} {printed.units[name]}" for name, value in values.items()},
+        "constants": {**law.get("constants", {}), **ends},
+        "rate": {"v": f"clip({law['rate']['v']}, least_rate, most_rate)"},
+        "step": "ballistic",
+    }
 
 
 def key(name: str) -> str:

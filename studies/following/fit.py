@@ -15,7 +15,7 @@ from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import Batch
 from nnode.simulation.fused import FusedSolver
 from studies.following import data, printed
-from studies.following.candidates import EVERY, Candidate, decay, starts
+from studies.following.candidates import EVERY, Candidate, decay, published_law, starts
 
 Result = dict[str, Any]
 
@@ -133,9 +133,9 @@ def reproduced(folder: str) -> Result:
     seen = batch.valid[:, :, 0].sum(0).numpy()
     first = np.sqrt((seen - 1) / seen)
     found: Result = {}
-    for law, parameters in printed.PARAMETERS.items():
-        for k, objective in enumerate(printed.OBJECTIVES):
+    for law, parameters in printed.parameters.items():
+        for k, objective in enumerate(printed.objectives):
             values = {name: each[k] for name, each in parameters.items()}
-            cost = costs_of(Candidate(law, given=printed.published(law, values)), batch)
+            cost = costs_of(Candidate(law, given=published_law(law, values)), batch)
             found[f"{law} {objective}"] = (cost.costs(cost.start) * first).tolist()
     return found

@@ -12,7 +12,7 @@ from nnode.calibrate.pooling import best_alone
 from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Batch, Sequence, collate
 from studies.following import data, printed
-from studies.following.candidates import Candidate, decay, starts
+from studies.following.candidates import Candidate, decay, published_law, starts
 from studies.following.data import gap_of
 from studies.following.fit import STEPS, TOLERANCE, at_limits, costs_of, named
 from studies.stores import sequences
@@ -56,11 +56,11 @@ def reproduced(folder: str) -> Result:
     """By make, the error (m) of the published parameters on the last part: ``law`` as it is
     simulated here, ``stopped`` with the published rule for collisions."""
     found: Result = {"law": {}, "stopped": {}}
-    for pair in followers(folder, printed.PLATOON):
+    for pair in followers(folder, printed.platoon):
         make = pair.agents[0]
-        values = printed.PLATOON_PARAMETERS[make]
-        law = Candidate("ovm", given=printed.published("ovm", values))
-        last_part = pair.part(printed.FIRST, 1.0)
+        values = printed.platoon_parameters[make]
+        law = Candidate("ovm", given=published_law("ovm", values))
+        last_part = pair.part(printed.first, 1.0)
         cost = costs_of(law, collate([last_part]))
         found["law"][make] = float(cost.costs(cost.start)[0])
         found["stopped"][make] = collided(last_part, values)
@@ -74,7 +74,7 @@ def collided(pair: Sequence, values: dict[str, float]) -> float:
     Args:
         values: ``kappa``, ``v0``, ``s_c``, ``w`` in SI units.
     """
-    least, (low, high) = 0.1, printed.CLIPPED["ovm"]
+    least, (low, high) = 0.1, printed.clipped["ovm"]
     kappa, v0, s_c, w = (values[name] for name in ("kappa", "v0", "s_c", "w"))
     measured, (own, lead) = gap_of(pair), pair.velocity()[..., 0].T
     gap, v, found = float(measured[0]), float(own[0]), [float(measured[0])]
@@ -99,8 +99,8 @@ def compare(folder: str, name: str, restarts: int, seed: int) -> Result:
         stands before; ``train`` and ``heldout``: calibrated on the whole first part. m.
     """
     candidate = CANDIDATES[name]
-    pairs = followers(folder, printed.PLATOON)
-    first = printed.FIRST
+    pairs = followers(folder, printed.platoon)
+    first = printed.first
 
     def share(low: float, high: float) -> Batch:
         return collate([pair.part(low, high) for pair in pairs])

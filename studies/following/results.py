@@ -57,7 +57,7 @@ class Study:
 
     def of(self, task: str) -> Any:
         """The results of a function that many candidates are given to, a row per candidate."""
-        return self.found[self.found["task"] == task].set_index("name")
+        return self.found.query("task == @task").set_index("name")
 
     @property
     def names(self) -> list[str]:
@@ -130,8 +130,8 @@ class Study:
         here = self.found.loc["reproduced-pairs"]
         rows = {
             (law, objective): {"printed": told, "here": float(np.mean(here[f"{law} {objective}"]))}
-            for law, errors in printed.ERRORS.items()
-            for objective, told in zip(printed.OBJECTIVES, errors, strict=True)
+            for law, errors in printed.errors.items()
+            for objective, told in zip(printed.objectives, errors, strict=True)
         }
         table = labelled(rows, "law", "minimised")
         return table.assign(difference=table["here"] - table["printed"])
@@ -150,8 +150,8 @@ class Study:
         table.insert(0, "held out", self.heldout().mean())
         told = {
             f"{law}, printed ({objective})": {"test": value}
-            for law, errors in printed.ERRORS.items()
-            for objective, value in zip(printed.OBJECTIVES, errors, strict=True)
+            for law, errors in printed.errors.items()
+            for objective, value in zip(printed.objectives, errors, strict=True)
         }
         table = pd.concat([table, pd.DataFrame.from_dict(told, orient="index")])
         return table.rename_axis("candidate")
@@ -183,7 +183,7 @@ class Study:
                 "value": row,
                 "from": row - half,
                 "to": row + half,
-                "unit": printed.units(names),
+                "unit": _units(names),
                 "at a limit": [n in limits for n in names],
             },
         )
@@ -234,13 +234,13 @@ class Study:
                 "pooled": one["centre"],
                 "spread of single pairs": one["between"],
                 "spread that lasts": one["spread"],
-                "unit": printed.units(one["names"]),
+                "unit": _units(one["names"]),
             },
         )
 
     def _platoon_published(self) -> pd.DataFrame:
         again = self.found.loc["reproduced-platoon"]
-        table = pd.DataFrame({"printed": printed.PLATOON_ERRORS, "here": again["stopped"]})
+        table = pd.DataFrame({"printed": printed.platoon_errors, "here": again["stopped"]})
         table["difference"] = table["here"] - table["printed"]
         table["the law alone"] = pd.Series(again["law"])
         table.loc["mean"] = table.mean()
@@ -266,7 +266,7 @@ class Study:
             }
         )
         best = pd.Series({make: held.loc[law, make] for make, law in fold.idxmin().items()})
-        told = pd.Series(printed.PLATOON_ERRORS)
+        told = pd.Series(printed.platoon_errors)
         more = {
             "chosen by follower": {"fold": fold.min().mean(), "last 30 %": best.mean(), **best},
             "ovm, printed": {"last 30 %": told.mean(), **told},
@@ -299,7 +299,7 @@ class Study:
             {kind: np.array(one[part][kind]) for kind in leaders.KINDS}
             for part in ("rows", "without")
         )
-        columns: dict[str, Any] = {"unit": printed.units(one["names"])}
+        columns: dict[str, Any] = {"unit": _units(one["names"])}
         for kind, row in rows.items():
             columns |= {kind: row, f"± {kind}": leaders.jackknifed(without[kind])}
         away = rows["CAV"] - rows["HV"]
@@ -388,7 +388,7 @@ class Study:
         for name in self.profiled:
             one = self.of("precision").loc[name]
             best = dict(zip(one["names"], one["row"], strict=True))
-            found[f"profiles_{key(name)}"] = figures.profiles(one["profiles"], best, printed.UNITS)
+            found[f"profiles_{key(name)}"] = figures.profiles(one["profiles"], best, printed.units)
         return found
 
     @property
@@ -447,8 +447,13 @@ class Study:
             "length": self.length,
             "swing": SWING,
             "objectives": list(OBJECTIVES),
-            "run": printed.PLATOON,
+            "run": printed.platoon,
         }
+
+
+def _units(names: list[str]) -> list[str]:
+    """The units of parameters; 1 where there is none."""
+    return [printed.units.get(name, "1") for name in names]
 
 
 def _by_parameter(names: list[str], columns: dict[str, Any]) -> pd.DataFrame:

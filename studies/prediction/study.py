@@ -61,7 +61,7 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
             one = {"law": law, "desired": "direction", **where}
             every.append(Task(f"{law}-{name}", walking.fit, one, cost=10.0))
     found = computed(every, folder, options, prepared, "prediction study")
-    distances = errors_by_run(found[found["task"] != "follow"], SIMPLE | PEOPLE)
+    distances = errors_by_run(found.query("task != 'follow'"), SIMPLE | PEOPLE)
     tables = {"following": _following(found, options.seed)}
     tables |= {what: _by_scene(distances, what) for what in ("ade", "fde")}
     people = distances.groupby("run", sort=False)["people"].first().to_dict()
@@ -72,7 +72,7 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
 def _following(found: pd.DataFrame, seed: int) -> pd.DataFrame:
     """Errors of spacings by law, published ones last."""
     rows: dict[str, dict[str, Any]] = {}
-    for one in found[found["task"] == "follow"].to_dict("records"):
+    for one in found.query("task == 'follow'").to_dict("records"):
         test = one["test"]
         clusters = np.arange(len(test["error"]))
         weights = group_weights(clusters, DRAWS, np.random.default_rng(seed))
@@ -84,8 +84,8 @@ def _following(found: pd.DataFrame, seed: int) -> pd.DataFrame:
             "high": high,
             "parameters": ", ".join(f"{name} = {value:.3g}" for name, value in one["row"].items()),
         }
-    rows["idm, published"] = dict(zip(("training", "test"), printed.IDM, strict=True))
-    rows["learned, published"] = {"test": printed.LEARNED}
+    rows["idm, published"] = dict(zip(("training", "test"), printed.idm, strict=True))
+    rows["learned, published"] = {"test": printed.learned}
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("law")
 
 
@@ -94,6 +94,6 @@ def _by_scene(distances: pd.DataFrame, what: str) -> pd.DataFrame:
     order = distances["law"].unique(), distances["run"].unique()
     table = distances.pivot(index="law", columns="run", values=what).loc[*order]
     place = ("ade", "fde").index(what)
-    told = {scene: printed.CONSTANT_VELOCITY[scene][place] for scene in map(str, table)}
+    told = {scene: printed.constant_velocity[scene][place] for scene in map(str, table)}
     table.loc["constant velocity, published"] = pd.Series(told)
     return table.rename_axis(index=None, columns=None)

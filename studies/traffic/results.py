@@ -52,7 +52,7 @@ def side_by_side(ours: Any, theirs: Any) -> Any:
 
 def as_printed(table: dict[str, Any], averages: dict[str, float]) -> Any:
     """A table of the paper: a row per model, a column per recording, the averages as printed."""
-    found = pd.DataFrame(table, index=list(printed.RECORDINGS)).T
+    found = pd.DataFrame(table, index=list(printed.recordings)).T
     return found.assign(**{AVERAGE: pd.Series(averages)})
 
 
@@ -70,16 +70,16 @@ class Study:
         self.found = self.found.assign(
             faults=self.found["folder"].map(policy),
             recording=self.found["recording_name"],
+            boxed=boxed,
             law=self.found["model"] + np.where(boxed, "-box", ""),
         )
 
     def take(self, value: str, task: str = "fit", faults: str = "keep", box: bool = False) -> Any:
         """One result of every task of a kind: a row per model, a column per recording."""
-        chosen = self.found[(self.found["task"] == task) & (self.found["faults"] == faults)]
-        chosen = chosen[chosen["box"].notna() == box]
+        chosen = self.found.query("task == @task and faults == @faults and boxed == @box")
         found = chosen.pivot(index="model", columns="recording", values=value)
         rows = [m for m in MODELS if m in found.index]
-        return found.loc[rows, [r for r in printed.RECORDINGS if r in found.columns]]
+        return found.loc[rows, [r for r in printed.recordings if r in found.columns]]
 
     def costs(self, task: str = "fit", faults: str = "keep", box: bool = False) -> Any:
         """Calibrated cost (m² s), and the average over recordings."""
@@ -94,7 +94,7 @@ class Study:
     @cached_property
     def heldout(self) -> dict[str, pd.DataFrame]:
         """By treatment of faults, a column of held-out costs (m² s) per model and baseline."""
-        every = self.found[self.found["task"] == "cross_validate"].dropna(subset="groups")
+        every = self.found.query("task == 'cross_validate'").dropna(subset="groups")
         every = every.explode(["costs", "groups", *tasks.BASELINES])
         found = {}
         for faults, part in every.groupby("faults"):
@@ -108,11 +108,11 @@ class Study:
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """By their names in the template."""
-        ours, theirs = self.costs(), as_printed(printed.COSTS, printed.AVERAGE_COSTS)
+        ours, theirs = self.costs(), as_printed(printed.costs, printed.average_costs)
         box, dropped = self.costs(box=True), self.costs(faults="drop")
         speeds = self.parameter("v0", MODELS)[0] * KMH
         lengths, low, high = self.parameter("L", LAWS)
-        printed_lengths = as_printed(printed.LENGTHS, printed.AVERAGE_LENGTHS)
+        printed_lengths = as_printed(printed.lengths, printed.average_lengths)
         table_1 = side_by_side(averaged(lengths), printed_lengths)
         ends = pd.concat({"95 % low": low, "95 % high": high}, names=["", "model"]).swaplevel()
         both = pd.concat({"box": box, "free": ours.loc[list(NETWORKS)]}, names=["", "model"])
@@ -145,7 +145,7 @@ class Study:
         ends = pd.DataFrame(rows, index=["95 % low", "95 % high"]).T
         return pd.DataFrame(
             {
-                "printed": printed.AVERAGE_COSTS,
+                "printed": printed.average_costs,
                 "here": self.costs()[AVERAGE],
                 **ends,
                 "paper's optimiser": self.costs("descend")[AVERAGE],
@@ -179,7 +179,7 @@ class Study:
         again = "before" in self.found
         table["first search"] = self.take("before").stack() if again else np.nan
         table["best tenth of starts"] = self.take("starts").stack().map(itemgetter(1))
-        scans = self.found[self.found["task"] == "scan"].set_index(["model", "recording"])
+        scans = self.found.query("task == 'scan'").set_index(["model", "recording"])
         table["grid"] = scans["cost"]
         table["grid, printed L"] = pd.Series(
             {

@@ -71,7 +71,7 @@ def wider(every: list[Task], costs: Any) -> dict[str, Task]:
         how = task.arguments
         if not task.key.startswith("fit-keep-") or how["box"] or how["model"] in LAWS:
             continue
-        theirs = printed.COSTS[how["model"]][printed.RECORDINGS.index(how["recording_name"])]
+        theirs = printed.costs[how["model"]][printed.recordings.index(how["recording_name"])]
         if theirs < costs[task.key]:
             more = {key: 2 * how[key] for key in ("restarts", "iterations")}
             more = {**how, **more, "seed": how["seed"] + 1}

@@ -118,11 +118,11 @@ class Walking:
 
     def costs(self, desired: str, horizon: float, what: str = "mean") -> pd.DataFrame:
         """A row per person of every run, a column per law: m²."""
-        found = self.found[self.found["horizon"] == horizon]
-        chosen = found["desired"] == desired
+        found = self.found.query("horizon == @horizon")
+        chosen = found.query("desired == @desired")
         if desired == DESIRED[0]:
-            chosen |= found["task"] == "baselines"
-        table: Any = errors_by_run(found[chosen], LABELS).pivot(index="run", columns="law")
+            chosen = pd.concat([chosen, found.query("task == 'baselines'")])
+        table: Any = errors_by_run(chosen, LABELS).pivot(index="run", columns="law")
         table = table.loc[table.index.repeat(table["people"].iloc[:, 0])][what]
         order = [label for label in LABELS.values() if label in table]
         return by_unit({law: table[law] for law in order}, table.index)
@@ -166,7 +166,7 @@ class Walking:
         return horizon_costs(horizons, mean, low, high)
 
     def _parameters(self) -> pd.DataFrame:
-        fits = self.found[self.found["task"] == "fit"]
+        fits = self.found.query("task == 'fit'")
         table = pd.DataFrame(
             {
                 "model": fits["law"].map(LABELS),

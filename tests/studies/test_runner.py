@@ -129,7 +129,7 @@ def test_a_damaged_result_is_computed_again(text: str, tmp_path: Path, caplog) -
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_failing_tasks_let_the_others_finish(workers: int, tmp_path: Path) -> None:
-    kinds = ["data", "python", "list"] + ["exit", "killed"] * (workers > 1)
+    kinds = ["data", "python", "list", "object"] + ["exit", "killed"] * (workers > 1)
     bad = [Task(kind, work.fail, {"kind": kind}, cost=2.0) for kind in kinds]
     good = squares(tmp_path, 1.0, 2.0)
     with pytest.raises(StudyError) as caught:
@@ -137,12 +137,13 @@ def test_failing_tasks_let_the_others_finish(workers: int, tmp_path: Path) -> No
     text = str(caught.value)
     assert f"{len(kinds)} of {len(kinds) + 2} tasks failed" in text
     assert "data: recording 7: no rows" in text
+    assert "object: TypeError: Object of type object is not JSON" in text
     if workers > 1:
         assert "exit: its process ended by itself with status 3" in text
         assert "killed: its process was ended by signal 9 (SIGKILL)" in text
     assert f"2 results are kept in {tmp_path / 'tasks'}" in text
     kept = {path.name for path in (tmp_path / "tasks").iterdir()}
-    traces = {f"{kind}.error.txt" for kind in ("python", "list")}
+    traces = {f"{kind}.error.txt" for kind in ("python", "list", "object")}
     assert kept == {"square-1.json", "square-2.json", *traces}
     assert "ZeroDivisionError: by nought" in (tmp_path / "tasks/python.error.txt").read_text()
     with pytest.raises(StudyError, match="1 of 3 tasks failed: python: ZeroDivisionError"):
@@ -225,12 +226,6 @@ def test_results_that_cannot_be_written_are_an_error_in_words(tmp_path: Path) ->
     (tmp_path / "study").write_text("a file where a folder should be")
     with pytest.raises(StudyError, match=r"task square-2 cannot be kept in .*study/tasks"):
         run_tasks(squares(tmp_path, 2.0), tmp_path / "study", workers=1, fingerprint="f")
-
-
-def test_a_result_that_is_not_json_is_named(tmp_path: Path) -> None:
-    todo = [Task("object", work.fail, {"kind": "object"})]
-    with pytest.raises(StudyError, match="object: TypeError: Object of type object is not JSON"):
-        run_tasks(todo, tmp_path, workers=1, fingerprint="f")
 
 
 def test_tasks_that_cannot_work_are_refused(tmp_path: Path) -> None:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.pages.page import Block, FigureBlock, TableBlock, write_page
+from nnode.pages.page import Block, TableBlock
 from nnode.pages.replay import ReplayBlock
+from studies.crowd import printed, tasks
 from studies.crowd import study as crowd
-from studies.crowd import tasks
-from studies.crowd.printed import COSTS, PARAMETERS
 from studies.options import CrowdStudyOptions, checked
 from tests.studies.crowd import invented
 from tests.studies.crowd.corridor import DT
@@ -30,12 +27,12 @@ def blocks(tmp_path_factory: pytest.TempPathFactory) -> list[Block]:
 
 @pytest.fixture(scope="module")
 def tables(blocks: list[Block]) -> dict[str, pd.DataFrame]:
-    return {b.name: b.frame for b in blocks if isinstance(b, TableBlock)}
+    return {b.name: b.full for b in blocks if isinstance(b, TableBlock) and b.full is not None}
 
 
 def test_costs_are_in_both_units(tables: dict[str, pd.DataFrame]) -> None:
     table = tables["crowd_costs"]
-    assert table.loc["SF", "printed (m²)"] == COSTS["sf"]
+    assert table.loc["SF", "printed (m²)"] == printed.costs["sf"]
     for label, cost in (("SF", 2.0), ("NN", 1.0), ("NN, walls alone", 1.9)):
         assert table.loc[label, "here (m² s)"] == pytest.approx(cost)
         assert table.loc[label, "here (m²)"] == pytest.approx(cost / DT)
@@ -65,7 +62,7 @@ def test_parameters_with_their_intervals(tables: dict[str, pd.DataFrame]) -> Non
         assert row[f"{name} from"] == pytest.approx(0.525 * value)
         assert row[f"{name} to"] == pytest.approx(1.475 * value)
     assert list(tables["crowd_parameters"].loc["printed, 1 s", ["A", "k", "kappa"]]) == list(
-        PARAMETERS.values()
+        printed.parameters.values()
     )
 
 
@@ -103,9 +100,6 @@ def test_starts_are_set_side_by_side(tables: dict[str, pd.DataFrame]) -> None:
     assert table.loc[("NN, walls alone", 0), "size, pair"] == 0.0
 
 
-def test_the_page_can_be_written(blocks: list[Block], tmp_path: Path) -> None:
-    few = [b for b in blocks if not isinstance(b, FigureBlock)]
-    write_page(few, tmp_path, title=crowd.TITLE, subtitle=crowd.SUBTITLE)
-    rows = pd.read_csv(tmp_path / "parameters.csv")
-    one = rows[(rows["model"] == "sf") & (rows["trained on"] == "all") & (rows["start"] == 0)]
-    assert list(one["value"]) == pytest.approx(invented.FORCE[1] + invented.FORCE[2])
+def test_all_parameters_are_named(tables: dict[str, pd.DataFrame]) -> None:
+    assert list(tables["parameters"].loc[("sf", "all", 1.0, 0), "value"]) == invented.FORCE[1]
+    assert list(tables["parameters"].loc[("sf", "all", 2.0, 0), "value"]) == invented.FORCE[2]

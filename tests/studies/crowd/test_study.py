@@ -13,9 +13,10 @@ from nnode.data.sequence import Sequence, collate
 from nnode.data.store import write_store
 from nnode.plots.interaction import evaluate_force, interaction
 from studies.crowd import forces as crowd_forces
-from studies.crowd import printed as printed_crowd
+from studies.crowd import printed
 from studies.crowd.data import ALL, fold_of, parts, time_groups, turned
 from studies.crowd.fit import calibrate, costs, new_system, row_of, system_of
+from studies.crowd.results import beside_printed
 from studies.crowd.tasks import even_pace
 from tests.studies.crowd.corridor import corridor, sequence, walkers
 
@@ -98,13 +99,6 @@ def test_known_parameters_are_found_from_the_papers_starts(seed):
     assert row == pytest.approx(TRUE, rel=1e-3)
 
 
-def test_growing_horizons_end_in_the_same_minimum_as_a_start_next_to_it():
-    batch = corridor(3, system=system_of("sf", TRUE), samples=26, people=40)
-    near, _ = calibrate("sf", batch, 1.1 * TRUE, grow=False)
-    far, _ = calibrate("sf", batch, np.array([30.0, 10.0, 40.0]))
-    assert far == pytest.approx(near, rel=1e-3)
-
-
 def test_weights_choose_the_sequences():
     both = collate(
         walkers(seed, system=system_of("sf", row), samples=26, people=60, number=1)[0]
@@ -172,8 +166,8 @@ def test_likeness_is_the_sign_and_share_of_agreement():
 def test_settings_stand_beside_the_printed_forces():
     from nnode.plots.settings import six_settings
 
-    system = system_of("sf", list(printed_crowd.PARAMETERS.values()))
-    table = printed_crowd.settings("sf", six_settings(system)[1])
+    system = system_of("sf", list(printed.parameters.values()))
+    table = beside_printed("sf", six_settings(system)[1])
     assert len(table) == 12
     for part in ("F_x", "F_y"):
         away = (table[part] - table[f"{part} printed"]).abs().max()

@@ -13,7 +13,7 @@ from nnode.data.sequence import Sequence, collate
 from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
 from nnode.simulation.fused import FusedSolver
 from studies.following import data, fit, inference, leaders, printed
-from studies.following.candidates import EVERY, decay, key, starts
+from studies.following.candidates import EVERY, decay, key, published_law, starts
 
 HELLY = {"c_s": 0.15, "c_v": 0.7, "T": 1.4, "s0": 3.0}
 
@@ -62,9 +62,9 @@ def test_candidates_are_stepped_as_in_the_published_comparisons() -> None:
     maps = {name for name in steps if name.split(" ")[0] in ("krauss", "newell")}
     assert {steps[name] for name in maps} == {"semi_implicit"}
     assert {steps[name] for name in steps.keys() - maps} == {"ballistic"}
-    for law in printed.CLIPPED:
+    for law in printed.clipped:
         values = dict.fromkeys(CAR_FOLLOWING_LAWS[law]["parameters"], 1.0)
-        assert law_from(law, printed.published(law, values)).step == "ballistic"
+        assert law_from(law, published_law(law, values)).step == "ballistic"
 
 
 def test_clusters_stay_in_one_fold() -> None:

@@ -25,17 +25,17 @@ from tests.studies.following.test_fit import driven
 
 #: By candidate: held-out and test error of every pair, m.
 ERRORS = {"idm": (5.0, 3.0), "helly": (4.5, 3.2), "idm + memory": (4.0, 2.8)}
-MAKES = list(printed.PLATOON_ERRORS)
+MAKES = list(printed.platoon_errors)
 
 
 def invented() -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {
         "floor": {"costs": [1.0] * 6, "limits": [[]] * 5 + [["v0"]]},
-        "reproduced-platoon": {"law": printed.PLATOON_ERRORS, "stopped": printed.PLATOON_ERRORS},
+        "reproduced-platoon": {"law": printed.platoon_errors, "stopped": printed.platoon_errors},
         "reproduced-pairs": {
             f"{law} {o}": [value] * 20
-            for law, row in printed.ERRORS.items()
-            for o, value in zip(printed.OBJECTIVES, row, strict=True)
+            for law, row in printed.errors.items()
+            for o, value in zip(printed.objectives, row, strict=True)
         },
     }
     for name, (held, test) in ERRORS.items():

@@ -26,8 +26,8 @@ def folders(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 def test_nine_errors_of_test_pairs(folders: dict[str, str]) -> None:
     found = fit.reproduced(folders[PAIRS])
-    for law, theirs in printed.ERRORS.items():
-        for objective, value in zip(printed.OBJECTIVES, theirs, strict=True):
+    for law, theirs in printed.errors.items():
+        for objective, value in zip(printed.objectives, theirs, strict=True):
             errors = found[f"{law} {objective}"]
             assert len(errors) == 20
             assert np.mean(errors) == pytest.approx(value, abs=0.01), (law, objective)
@@ -35,4 +35,4 @@ def test_nine_errors_of_test_pairs(folders: dict[str, str]) -> None:
 
 def test_four_errors_on_the_track(folders: dict[str, str]) -> None:
     found = platoons.reproduced(folders[PLATOONS])
-    assert found["stopped"] == pytest.approx(printed.PLATOON_ERRORS, abs=0.03)
+    assert found["stopped"] == pytest.approx(printed.platoon_errors, abs=0.03)

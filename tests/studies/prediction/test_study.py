@@ -57,7 +57,7 @@ def test_constant_velocity_has_nearly_the_published_errors(real_data: Path, tmp_
     for name in SCENES[1:]:
         store = prepare(scene(name, str(real_data)), tmp_path / name)
         found = walking.baselines([str(store.folder)], [name])["constant_velocity"][name]
-        ade, fde = printed.CONSTANT_VELOCITY[name]
+        ade, fde = printed.constant_velocity[name]
         assert found["ade"] == pytest.approx(ade, rel=0.08)
         assert found["fde"] == pytest.approx(fde, rel=0.08)
         (batch,) = chosen([str(store.folder)], [name], test=True)
@@ -92,11 +92,11 @@ def test_tables_of_errors() -> None:
     assert table.loc["idm", "low"] < table.loc["idm", "test"] < table.loc["idm", "high"]
     assert table.loc["idm", "parameters"] == "T = 1.5"
     assert list(table.index[1:]) == ["idm, published", "learned, published"]
-    distances = errors_by_run(found[found["task"] != "follow"], study.SIMPLE | study.PEOPLE)
+    distances = errors_by_run(found.query("task != 'follow'"), study.SIMPLE | study.PEOPLE)
     ade = study._by_scene(distances, "ade")["eth_univ"]
     assert ade.to_dict() == {
         "constant velocity": 0.5,
         "mean speed with the stream": 0.5,
         "no interaction": 0.25,
-        "constant velocity, published": printed.CONSTANT_VELOCITY["eth_univ"][0],
+        "constant velocity, published": printed.constant_velocity["eth_univ"][0],
     }

@@ -8,7 +8,7 @@ import numpy as np
 
 from nnode.data.sequence import Sequence
 from nnode.model import build_model
-from studies.traffic.printed import COSTS, RECORDINGS
+from studies.traffic import printed
 from studies.traffic.problem import GAPS, model_options
 from tests.builders import lane
 
@@ -33,9 +33,9 @@ def platoons(name: str) -> list[Sequence]:
     return [lane(x, start=100.0 * i, name=f"{name}/{i:03}") for i in range(3)]
 
 
-def printed(model: str, name: str) -> float:
+def printed_cost(model: str, name: str) -> float:
     """The printed cost, m² s."""
-    return COSTS[model][RECORDINGS.index(name)]
+    return printed.costs[model][printed.recordings.index(name)]
 
 
 def _parameters(model: str, name: str) -> dict[str, Any]:
@@ -62,15 +62,11 @@ def fit(
     seed: int,
 ) -> dict[str, Any]:
     """In place of :func:`studies.traffic.tasks.fit`."""
-    cost = printed(model, recording_name)
+    cost = printed_cost(model, recording_name)
     cost += 5.0 if box else ABOVE.get((model, recording_name), (-1.0, -1.0))[seed]
     cost /= 2 if folder.endswith("drop") else 1
     parameters = _parameters(model, recording_name)
     found: dict[str, Any] = {
-        "model": model,
-        "recording": recording_name,
-        "box": box,
-        "restarts": restarts,
         "cost": cost,
         "costs": [share * cost for share in SHARES],
         "groups": [0, 1, 2],
@@ -97,45 +93,24 @@ def cross_validate(
 ) -> dict[str, Any]:
     """In place of :func:`studies.traffic.tasks.cross_validate`."""
     cost = UNSEEN.get(model, BOX if box else FREE)
-    return {
-        "model": model,
-        "recording": recording_name,
-        "box": box,
-        "costs": [cost] * 3,
-        "groups": [0, 1, 2],
-        "names": ["a", "b", "c"],
-        **{name: [UNSEEN[name]] * 3 for name in ("no_interaction", "constant_velocity")},
-    }
-
-
-def _run(model: str, name: str, above: float, history: list[list[float]]) -> dict[str, Any]:
-    return {
-        "model": model,
-        "recording": name,
-        "cost": printed(model, name) + above,
-        "parameters": _parameters(model, name),
-        "residual": 0.1,
-        "history": history,
-    }
+    simple = {name: [UNSEEN[name]] * 3 for name in ("no_interaction", "constant_velocity")}
+    return {"costs": [cost] * 3, "groups": [0, 1, 2], **simple}
 
 
 def descend(recording_name: str, model: str, **how: Any) -> dict[str, Any]:
     """In place of :func:`studies.traffic.tasks.descend`."""
-    begin = printed(model, recording_name)
-    history = [[0, begin + 10, begin + 10], [5, begin + 2, begin + 2]]
-    return _run(model, recording_name, 2.0, history)
+    cost = printed_cost(model, recording_name)
+    return {
+        "cost": cost + 2.0,
+        "parameters": _parameters(model, recording_name),
+        "residual": 0.1,
+        "history": [[0, cost + 10, cost + 10], [5, cost + 2, cost + 2]],
+    }
 
 
 def scan(recording_name: str, model: str, points: int, **how: Any) -> dict[str, Any]:
     """In place of :func:`studies.traffic.tasks.scan`: the cost grows with the length."""
     lengths = np.linspace(2, 12, points)
-    cost = printed(model, recording_name) + 1
-    return {
-        "model": model,
-        "recording": recording_name,
-        "cost": cost,
-        "v0": V0,
-        "L": 2.0,
-        "lengths": lengths.tolist(),
-        "by_length": (cost + lengths - 2).tolist(),
-    }
+    cost = printed_cost(model, recording_name) + 1
+    by_length = (cost + lengths - 2).tolist()
+    return {"cost": cost, "lengths": lengths.tolist(), "by_length": by_length}

@@ -10,12 +10,11 @@ import pandas as pd
 import pytest
 
 from nnode.data.store import Store, write_store
-from nnode.pages.page import Block, FigureBlock, Provenance, TableBlock, write_page
+from nnode.pages.page import Block, Provenance, TableBlock
 from nnode.pages.replay import ReplayBlock
 from studies.options import TrafficStudyOptions
+from studies.traffic import printed, tasks
 from studies.traffic import study as traffic
-from studies.traffic import tasks
-from studies.traffic.printed import AVERAGE_COSTS, COSTS, LENGTHS, RECORDINGS
 from tests.studies.traffic import invented
 
 FAULT = {"kind": "jump", "sequence": "1-1_1/002", "agents": [1], "time": 200.4}
@@ -25,11 +24,11 @@ OPTIONS = TrafficStudyOptions(workers=1, restarts=8, bootstrap=2, descent_steps=
 def store(options: Any, policy: str, folder: Path) -> Store:
     """Three platoons in each recording, one of them faulty."""
     manifest = {
-        "recordings": {name: {"kept": 3 if policy == "keep" else 2} for name in RECORDINGS},
+        "recordings": {name: {"kept": 3 if policy == "keep" else 2} for name in printed.recordings},
         "faults": [FAULT],
         "files": {"a": {"name": "a.mat", "sha256": "12ab"}},
     }
-    every = [s for name in RECORDINGS for s in invented.platoons(name)]
+    every = [s for name in printed.recordings for s in invented.platoons(name)]
     return write_store(folder / "data" / policy, every, manifest)
 
 
@@ -44,18 +43,16 @@ def blocks(tmp_path_factory: pytest.TempPathFactory) -> list[Block]:
 
 @pytest.fixture(scope="module")
 def tables(blocks: list[Block]) -> dict[str, pd.DataFrame]:
-    return {
-        b.name: b.frame if b.full is None else b.full for b in blocks if isinstance(b, TableBlock)
-    }
+    return {b.name: b.full for b in blocks if isinstance(b, TableBlock) and b.full is not None}
 
 
 def test_averages_stand_beside_the_printed_ones(tables: dict[str, pd.DataFrame]) -> None:
     table = tables["averages"]
-    assert list(table["printed"]) == [AVERAGE_COSTS[model] for model in table.index]
+    assert list(table["printed"]) == [printed.average_costs[model] for model in table.index]
     # nine recordings of ten lie 1 below the printed cost, the tenth where it was put
     away = {"lin": -1.0, "n10": -1.0, "log": -0.7, "n2": -0.96, "n4": -0.6}
     for model, difference in away.items():
-        mean = np.mean(COSTS[model])
+        mean = np.mean(printed.costs[model])
         assert table.loc[model, "here"] == pytest.approx(mean + difference)
         # half of it, and nothing was searched again
         dropped = (mean + {**away, "n2": -0.8}[model]) / 2
@@ -63,14 +60,14 @@ def test_averages_stand_beside_the_printed_ones(tables: dict[str, pd.DataFrame])
         assert table.loc[model, "paper's optimiser"] == pytest.approx(mean + 2)
         assert table.loc[model, "95 % low"] < table.loc[model, "here"]
         assert table.loc[model, "here"] < table.loc[model, "95 % high"]
-    assert table.loc["n4", "weights in box"] == pytest.approx(np.mean(COSTS["n4"]) + 5)
+    assert table.loc["n4", "weights in box"] == pytest.approx(np.mean(printed.costs["n4"]) + 5)
     assert np.isnan(table.loc["lin", "weights in box"])
 
 
 def test_the_player_shows_every_recording(blocks: list[Block]) -> None:
     (block,) = (b for b in blocks if isinstance(b, ReplayBlock))
     recordings = [scene.sequence.recording for scene in block.scenes]
-    assert list(dict.fromkeys(recordings)) == list(RECORDINGS)
+    assert list(dict.fromkeys(recordings)) == list(printed.recordings)
     scene = next(s for s in block.scenes if s.sequence.recording != invented.LEAST_IN)
     time = scene.sequence.time - scene.sequence.time[0]
     for model, speed in (("lin", invented.V0_LIN), ("n2", invented.V0)):
@@ -95,12 +92,12 @@ def test_printed_costs_that_are_lower(tables: dict[str, pd.DataFrame]) -> None:
 def test_lengths_have_intervals_and_bounds_are_named(tables: dict[str, pd.DataFrame]) -> None:
     table = tables["table_1"]
     for model in ("lin", "log"):
-        for number, name in enumerate(RECORDINGS):
+        for number, name in enumerate(printed.recordings):
             at_bound = (model, name) == ("lin", invented.LEAST_IN)
             length = invented.L_LEAST if at_bound else invented.L
             column = table[name][model]
             assert column["here"] == length
-            assert column["difference"] == pytest.approx(length - LENGTHS[model][number])
+            assert column["difference"] == pytest.approx(length - printed.lengths[model][number])
             # of 101 values over 4 m
             assert column["95 % low"] == pytest.approx(length - 1.9)
             assert column["95 % high"] == pytest.approx(length + 1.9)
@@ -126,7 +123,7 @@ def test_unseen_sequences_tell_who_does_not_generalise(tables: dict[str, pd.Data
 
 def test_optimisers_and_steps(tables: dict[str, pd.DataFrame]) -> None:
     table = tables["optimizers"]
-    assert table.loc["lin", "at the start"] == pytest.approx(np.mean(COSTS["lin"]) + 10)
+    assert table.loc["lin", "at the start"] == pytest.approx(np.mean(printed.costs["lin"]) + 10)
     assert (table["residual, ADADELTA"] == 0.1).all()
     steps = tables["steps"]
     assert list(steps.columns)[:2] == ["0.2 s", "0.1 s"]
@@ -151,13 +148,11 @@ def test_faulty_sequences_are_weighed(tables: dict[str, pd.DataFrame]) -> None:
     assert recordings["longest (s)"].to_numpy(float) == pytest.approx(1.0)
 
 
-def test_the_page_can_be_written_and_names_its_sources(blocks: list[Block], tmp_path: Path) -> None:
-    few = [b for b in blocks if not isinstance(b, FigureBlock)]
-    write_page(few, tmp_path, title=traffic.TITLE, subtitle=traffic.SUBTITLE)
-    page = (tmp_path / "study.md").read_text(encoding="utf-8")
-    assert "SHA-256 of a.mat: 12ab" in page
-    assert [b for b in blocks if isinstance(b, Provenance)]
-    rows = pd.read_csv(tmp_path / "parameters.csv", keep_default_na=False)
+def test_sources_and_all_parameters_are_named(
+    blocks: list[Block], tables: dict[str, pd.DataFrame]
+) -> None:
+    assert Provenance({"SHA-256 of a.mat": "12ab"}) in blocks
+    rows = tables["parameters"]
     lin = rows[(rows["model"] == "lin") & (rows["parameter"] == "L") & (rows["faults"] == "drop")]
-    assert set(lin["recording"]) == set(RECORDINGS)
+    assert set(lin["recording"]) == set(printed.recordings)
     assert set(rows["optimizer"]) == {"bfgs", "adadelta"}

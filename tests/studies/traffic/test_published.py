@@ -11,9 +11,6 @@ import pytest
 import torch
 
 from nnode.calibrate.cost import sequence_costs
-from nnode.data.options import Faults
-from nnode.data.prepare import prepare
-from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.sequence import collate
 from nnode.model.build import build_model
 from nnode.model.system import System
@@ -21,7 +18,7 @@ from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver
 from studies.crowd.data import prepared
 from studies.crowd.fit import system_of
 from studies.options import CrowdStudyOptions
-from studies.traffic.printed import RECORDINGS
+from studies.traffic import printed
 from studies.traffic.problem import Problem, model_options, recording
 
 PUBLISHED = Path(__file__).parents[3] / "docs" / "studies" / "traffic"
@@ -36,13 +33,6 @@ def parameters() -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def table() -> pd.DataFrame:
     return pd.read_csv(PUBLISHED / "table_2.csv", index_col=0)
-
-
-@pytest.fixture(scope="module")
-def esimas(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = tmp_path_factory.mktemp("esimas")
-    prepare(EsimasOptions(name="esimas", source=str(real_data), faults=Faults.keep), folder)
-    return str(folder)
 
 
 def calibrated(parameters: pd.DataFrame, model: str, name: str) -> System:
@@ -76,7 +66,7 @@ def test_costs_follow_from_the_parameters(
     model: str, parameters: pd.DataFrame, table: pd.DataFrame, esimas: str
 ) -> None:
     renamed = parameters.rename(columns={"index": "index_"})
-    for name in RECORDINGS:
+    for name in printed.recordings:
         system = calibrated(renamed, model, name)
         cost = mean_cost(system, esimas, name, model, FusedSolver(DT))
         assert cost == pytest.approx(table.loc[model, name], rel=1e-6), name
@@ -88,7 +78,7 @@ def test_costs_follow_from_the_parameters(
 
 def test_the_average_is_one(table: pd.DataFrame) -> None:
     pd.testing.assert_series_equal(
-        table[list(RECORDINGS)].mean(axis=1), table["average"], check_names=False
+        table[list(printed.recordings)].mean(axis=1), table["average"], check_names=False
     )
 
 

@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.data.options import Faults
-from nnode.data.prepare import prepare
-from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.sequence import Sequence
 from nnode.data.store import write_store
 from nnode.errors import ConfigError
@@ -125,10 +122,10 @@ def test_starts_begin_with_the_papers(store: str) -> None:
 
 
 def test_printed_averages_follow_from_the_printed_rows() -> None:
-    for model, row in printed.COSTS.items():
-        assert np.mean(row) == pytest.approx(printed.AVERAGE_COSTS[model], abs=0.06), model
-    for model, row in printed.LENGTHS.items():
-        assert np.mean(row) == pytest.approx(printed.AVERAGE_LENGTHS[model], abs=0.02), model
+    for model, row in printed.costs.items():
+        assert np.mean(row) == pytest.approx(printed.average_costs[model], abs=0.06), model
+    for model, row in printed.lengths.items():
+        assert np.mean(row) == pytest.approx(printed.average_lengths[model], abs=0.02), model
 
 
 #: Least costs (m² s) of a direct search over (v0, L >= 2 m) with Euler steps of 0.02 s, made
@@ -139,16 +136,9 @@ SEARCHED = {
 }
 
 
-@pytest.fixture(scope="module")
-def esimas(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = tmp_path_factory.mktemp("esimas")
-    prepare(EsimasOptions(name="esimas", source=str(real_data), faults=Faults.keep), folder)
-    return str(folder)
-
-
 @pytest.mark.parametrize("model", SEARCHED)
 def test_laws_cost_what_a_direct_search_found(model: str, esimas: str) -> None:
-    for name, expected in zip(printed.RECORDINGS, SEARCHED[model], strict=True):
+    for name, expected in zip(printed.recordings, SEARCHED[model], strict=True):
         if expected is not None:
             one = tasks.fit(esimas, name, model, None, 8, 0.02, 100, 0, [], 0)
             # to the digits given, or lower: a direct search may stop short of the minimum
