@@ -70,9 +70,7 @@ def beside_printed(model: str, table: pd.DataFrame) -> pd.DataFrame:
                 "F_y": force[1],
                 "F_y printed": theirs[1],
             }
-    found = pd.DataFrame(rows).T.rename_axis(["setting", "person"])
-    forces = [name for name in map(str, found) if name.startswith("F_")]
-    return found.astype(dict.fromkeys(forces, float))
+    return labelled(rows, "setting", "person")
 
 
 @dataclass
