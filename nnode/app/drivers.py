@@ -267,14 +267,14 @@ def _intervals(
     """Intervals, correlations and the number of clusters, in the form of
     :func:`nnode.calibrate.intervals.intervals`."""
     from nnode.calibrate.intervals import VAGUE
-    from nnode.population.intervals import at_bounds, influence
+    from nnode.population.intervals import bounds_reached, influence
 
     model, theta, paths = population.model, population.estimate.theta, population.model.paths
     agent_cluster = np.zeros(len(paths.names), dtype=int)
     agent_cluster[paths.agent] = cluster[paths.sequence]
     number = len(np.unique(agent_cluster))
     cluster_influence, free = influence(population, agent_cluster)
-    low, high = at_bounds(population)
+    bound = bounds_reached(population)
     half = np.full(len(theta), np.inf)
     error, degrees = half.copy(), half.copy()
     half[free], error[free] = cluster_influence.half_widths(), cluster_influence.standard_errors()
@@ -298,7 +298,7 @@ def _intervals(
         parameters[name] = {
             **(interval if has_interval else dict.fromkeys(interval)),
             "scale": "log" if model.logs[i] else "linear",
-            "at_bound": "low" if low[i] else "high" if high[i] else None,
+            "at_bound": str(bound[i]) or None,
             "identified": identified if number > 1 else None,
         }
     table = np.full((len(theta), len(theta)), np.nan)

@@ -140,10 +140,15 @@ def influence(
     return ClusterInfluence(grams[:, free][:, :, free], scores[:, free])
 
 
-def at_bounds(problem: ResidualProblem, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``(P,)`` True for parameters at the lower bound, and the same for the upper bound."""
-    near = 1e-6 * (1 + np.abs(row))
-    return row <= problem.low + near, row >= problem.high - near
+def at_bounds(row: Any, low: Any, high: Any, near: Any = None) -> np.ndarray:
+    """``(P,)`` ``low`` or ``high`` for parameters at a bound, and an empty text for others.
+
+    Args:
+        row, low, high: ``(P,)`` parameters, and the bounds of the admissible set.
+        near: largest distance from the bound; None is a rounding error of the parameters.
+    """
+    near = 1e-6 * (1 + np.abs(row)) if near is None else near
+    return np.where(row <= low + near, "low", np.where(row >= high - near, "high", ""))
 
 
 def intervals(problem: ResidualProblem, row: np.ndarray, cluster: np.ndarray) -> dict[str, Any]:
@@ -163,8 +168,8 @@ def intervals(problem: ResidualProblem, row: np.ndarray, cluster: np.ndarray) ->
         ``correlation``: address to address to correlation;
         ``clusters``: their number.
     """
-    low, high = at_bounds(problem, row)
-    free = ~(low | high)
+    bound = at_bounds(row, problem.low, problem.high)
+    free = bound == ""
     clusters, number = influence(problem, row, cluster, free), len(np.unique(cluster))
     half, undetermined = np.zeros(len(row)), ~free
     error, degrees = half.copy(), half.copy()
@@ -183,7 +188,7 @@ def intervals(problem: ResidualProblem, row: np.ndarray, cluster: np.ndarray) ->
             "high": float(min(row[i] + half[i], problem.high[i])) if has_interval else None,
             "std_error": float(error[i]) if has_interval else None,
             "df": float(degrees[i]) if has_interval else None,
-            "at_bound": "low" if low[i] else "high" if high[i] else None,
+            "at_bound": str(bound[i]) or None,
             "identified": bool(has_interval and 2 * half[i] < scale)
             if number > 1 or undetermined[i]
             else None,

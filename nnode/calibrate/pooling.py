@@ -220,8 +220,8 @@ def sequence_parameters(
             "cost": costs,
             **dict(zip(names, rows.T, strict=True)),
             "at_bound": [
-                " ".join(np.array(names)[low | high])
-                for low, high in (at_bounds(whole, values) for values in rows)
+                " ".join(np.array(names)[at_bounds(values, whole.low, whole.high) != ""])
+                for values in rows
             ],
         }
     )

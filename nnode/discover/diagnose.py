@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
+from nnode.calibrate.intervals import at_bounds
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover import thresholds
@@ -61,6 +62,7 @@ from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.system import System
+from nnode.model.term import physical_bounds
 from nnode.population.drivers import EXPLAINED
 from nnode.population.followers import drivers_differ, without_errors
 from nnode.population.intervals import variations
@@ -552,12 +554,14 @@ def _reached_bounds(base: System, extended: System) -> list[str]:
 
 def _at_bounds(system: System) -> set[str]:
     """Addresses of the law's parameters at a bound of their admissible values."""
-    law = system.term_list[0]
+    limits, prefix = physical_bounds(system), f"{system.term_list[0].name}."
+    values = {
+        name: float(x) for name, (x, _) in system.physical().items() if name.startswith(prefix)
+    }
     return {
-        f"{law.name}.{name}"
-        for name, interval in law.bounds.items()
-        if "." not in name  # no weights of networks
-        and np.isclose(getattr(law, name).item(), [interval.low, interval.high], 1e-3, 1e-6).any()
+        name
+        for name, x in values.items()
+        if at_bounds(x, limits[name].low, limits[name].high, 1e-6 + 1e-3 * abs(x)) != ""
     }
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from nnode.calibrate.intervals import LEVEL, ClusterInfluence
+from nnode.calibrate.intervals import LEVEL, ClusterInfluence, at_bounds
 from nnode.model.term import short_names
 from nnode.population.drivers import Population
 from nnode.population.likelihood import NOISE, Products, PushNoise, marginal
@@ -23,10 +23,11 @@ NEAR = 1e-3
 DIFFERENCE = 1e-2
 
 
-def at_bounds(population: Population) -> tuple[np.ndarray, np.ndarray]:
-    """``(P,)`` twice: which parameters are at their lower and at their upper bound."""
-    theta, model = population.estimate.theta, population.model
-    return theta <= model.low + NEAR, theta >= model.high - NEAR
+def bounds_reached(population: Population) -> np.ndarray:
+    """``(P,)`` the bounds at which parameters are, see
+    :func:`nnode.calibrate.intervals.at_bounds`."""
+    model = population.model
+    return at_bounds(population.estimate.theta, model.low, model.high, NEAR)
 
 
 def influence(population: Population, cluster: np.ndarray) -> tuple[ClusterInfluence, np.ndarray]:
@@ -35,8 +36,7 @@ def influence(population: Population, cluster: np.ndarray) -> tuple[ClusterInflu
     Args:
         cluster: ``(D,)`` the driver's cluster.
     """
-    low, high = at_bounds(population)
-    free = ~(low | high)
+    free = bounds_reached(population) == ""
     member = (np.unique(cluster)[:, None] == cluster).astype(float)
     products = np.tensordot(member, population.marginal.agents, 1)[:, 1:]
     grams = products[:, :, 1:]
@@ -50,7 +50,7 @@ def deviation_intervals(population: Population) -> np.ndarray:
     concave."""
     variances, data = population.estimate.variances, population.estimate.data
     logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
-    free = np.flatnonzero((logs > low + NEAR) & (logs < high - NEAR))
+    free = np.flatnonzero(at_bounds(logs, low, high, NEAR) == "")
     theta, model = population.estimate.theta, population.model
     products: dict[tuple[float, ...], Products] = {}
 
@@ -108,15 +108,13 @@ def variations(population: Population) -> dict[str, dict[str, Any]]:
     for k, name in enumerate([*noise, *drivers]):
         value, lowest, highest = variances.row[k], variances.low[k], variances.high[k]
         factor = 1.0 if k < len(noise) else 100.0
-        bound = "low" if value <= lowest * (1 + NEAR) else ""
-        bound = "high" if value >= highest / (1 + NEAR) else bound
-        bound = bound if lowest < highest else ""
+        bound = at_bounds(*np.log((value, lowest, highest)), NEAR) if lowest < highest else ""
         table[name] = {
             "estimate": float(factor * value),
             "lower": float(factor * ends[k, 0]),
             "upper": float(factor * ends[k, 1]),
             "unit": units[k] if k < len(noise) else "%",
-            "at_bound": bound,
+            "at_bound": str(bound),
             "shrinkage": float(shrinkage[k]),
         }
     return table
