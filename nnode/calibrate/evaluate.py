@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -68,10 +69,10 @@ def evaluate(
             and time.
     """
     costs: dict[str, float] = {}
-    total: dict[int, float] = {}
-    number: dict[int, int] = {}
+    total: defaultdict[int, float] = defaultdict(float)
+    number: defaultdict[int, int] = defaultdict(int)
     final, agents, overlaps, followers = 0.0, 0, 0, 0
-    objectives: dict[str, float] = {}
+    objectives: defaultdict[str, float] = defaultdict(float)
     dt = 0.0
     for batch in batches:
         dt = batch.dt
@@ -82,8 +83,8 @@ def evaluate(
         _check_finite(error, batch)
         free = batch.agent if trajectory.given is None else batch.agent & ~trajectory.given
         for k in range(1, batch.n_samples):
-            total[k] = total.get(k, 0.0) + float((error[k] * free).sum())
-            number[k] = number.get(k, 0) + int((batch.valid[k] & free).sum())
+            total[k] += float((error[k] * free).sum())
+            number[k] += int((batch.valid[k] & free).sum())
         last = batch.valid.sum(0) - 1
         distance = error.gather(0, last.clamp(min=0)[None])[0].sqrt()
         final += float((distance * free).sum())
@@ -91,8 +92,7 @@ def evaluate(
         if batch.x.shape[-1] == 1:
             for kind in FOLLOWING:
                 if kind is not Convention.speed or trajectory.v is not None:
-                    total_of = float(sequence_costs(trajectory, batch, kind).sum())
-                    objectives[kind.value] = objectives.get(kind.value, 0.0) + total_of
+                    objectives[kind.value] += float(sequence_costs(trajectory, batch, kind).sum())
             gap = trajectory.x[1:, :, 1:, 0] - trajectory.x[1:, :, :-1, 0]
             real = batch.valid[1:, :, 1:]
             overlaps += int(((gap <= 0) & real).sum())

@@ -138,10 +138,7 @@ class Trainer:
         self.seconds += now - self._clock
         self._clock = now
         return Checkpoint(
-            config=self.provenance.config,
-            manifest=self.provenance.manifest,
-            split=self.provenance.split,
-            free_speed=self.provenance.free_speed,
+            **vars(self.provenance),
             model=copied(dict(self.model.state_dict())),
             optimizer=copied(self.optimizer.state_dict()),
             progress={name: getattr(self, name) for name in self._COUNTERS},

@@ -11,7 +11,7 @@ import numpy as np
 
 from nnode.errors import ConfigError, SimulationError
 from nnode.model import System, Traffic
-from nnode.model.arrays import numpy_function
+from nnode.model.arrays import Formulas
 from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.lane import VehicleClass
 from nnode.model.expression import symbol, symbols, topological
@@ -232,7 +232,7 @@ class Drivers:
         new = self._fresh
         self._begun = given["start"]
         starts = self.lane.starts
-        values = numpy_function(tuple(starts.values()), _GAPS)(given, given["gaps"])
+        values = Formulas(starts.values(), _GAPS)(given, given["gaps"])
         for state, start in zip(starts, values, strict=True):
             self._states[state] = np.where(new, start, self._states[state])
             given[state] = self._states[state]

@@ -6,8 +6,8 @@ suits searches over many models, each of which is simulated only a few times.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,19 +17,16 @@ from torch import Tensor
 from nnode.model.expression import Expr, topological
 from nnode.model.operations import LIBRARIES, OPERATIONS
 
-#: Maps the symbols' values and the values of precomputed nodes to the outputs' values. An output
-#: that depends on no symbol is a number.
-NumpyFunction = Callable[[Mapping[str, Any], tuple[Any, ...]], list[Any]]
 #: A function that a formula calls by its name.
 Code = Callable[..., Tensor]
 
 
 @lru_cache(maxsize=1024)
 def _straight_line(
-    outputs: tuple[Expr, ...], precomputed: tuple[Expr, ...], library: str
+    outputs: tuple[Expr, ...], given: tuple[Expr, ...], library: str
 ) -> tuple[Callable[..., list[Any]], list[float]]:
-    """A function of constants, symbol values, precomputed values and code; and the constants."""
-    label = {node: f"k[{i}]" for i, node in enumerate(precomputed)}
+    """A function of constants, symbol values, given values and code; and the constants."""
+    label = {node: f"k[{i}]" for i, node in enumerate(given)}
     numbers: dict[str, float] = {}
     lines: list[str] = []
     for node in topological(outputs, label):
@@ -52,33 +49,42 @@ def _straight_line(
     return names["run"], list(numbers.values())
 
 
-def numpy_function(outputs: tuple[Expr, ...], precomputed: tuple[Expr, ...] = ()) -> NumpyFunction:
-    """A NumPy function of the symbols and the precomputed nodes.
+class Formulas:
+    """Formulas as a function of their symbols' values, which are tensors or NumPy arrays.
+
+    An output that depends on no symbol is a number. Values of tensors are differentiable by
+    PyTorch's automatic differentiation.
 
     Args:
-        outputs: formulas without calls of code.
-        precomputed: nodes whose values are arguments of the function.
+        outputs: the formulas.
+        given: nodes of the formulas whose values are arguments.
     """
-    run, numbers = _straight_line(outputs, precomputed, "array")
-    # Python floats would raise an error in a division by zero
-    return partial(run, tuple(map(np.float64, numbers)))
 
+    def __init__(self, outputs: Iterable[Expr], given: Sequence[Expr] = ()) -> None:
+        self.outputs, self.given = tuple(outputs), tuple(given)
 
-def computed(
-    outputs: Sequence[Expr],
-    values: Mapping[str, Tensor],
-    precomputed: Mapping[Expr, Tensor] | None = None,
-    code: Mapping[str, Code] | None = None,
-) -> list[Tensor]:
-    """The values of formulas by PyTorch, differentiable by its automatic differentiation.
+    @cached_property
+    def _numpy(self) -> Callable[..., list[Any]]:
+        run, numbers = _straight_line(self.outputs, self.given, "array")
+        # Python floats would raise an error in a division by zero
+        return partial(run, tuple(map(np.float64, numbers)))
 
-    Args:
-        values: symbol to value.
-        precomputed: node to value.
-        code: name to the function that calls of this name evaluate.
-    """
-    precomputed = precomputed or {}
-    run, numbers = _straight_line(tuple(outputs), tuple(precomputed), "tensor")
-    like = next(iter(values.values()))
-    constants = [torch.tensor(c, dtype=like.dtype, device=like.device) for c in numbers]
-    return run(constants, values, tuple(precomputed.values()), code)
+    def __call__(
+        self,
+        values: Mapping[str, Any],
+        given: Sequence[Any] = (),
+        code: Mapping[str, Code] | None = None,
+    ) -> list[Any]:
+        """The formulas' values.
+
+        Args:
+            values: symbol to value.
+            given: values of the given nodes.
+            code: name to the function that calls of this name evaluate; only for tensors.
+        """
+        like = next(iter(values.values()))
+        if not isinstance(like, Tensor):
+            return self._numpy(values, given)
+        run, numbers = _straight_line(self.outputs, self.given, "tensor")
+        constants = [torch.tensor(c, dtype=like.dtype, device=like.device) for c in numbers]
+        return run(constants, values, given, code)

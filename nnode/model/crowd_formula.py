@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.model.arrays import Code, computed, numpy_function
-from nnode.model.expression import Expr
+from nnode.model.arrays import Code, Formulas
 from nnode.model.scene import Scene
 from nnode.model.term import State, Term
 from nnode.model.terms import (
@@ -103,16 +102,11 @@ class CrowdRates:
             for name, value in places.items():
                 relative |= {f"d{name}": person[name] - value} if name in person else {name: value}
             context = person | sums if over == SMALLEST else person
-            terms = self._computed(summands.values(), context | relative)
+            terms = Formulas(summands.values())(context | relative, code=self._code)
             real = self._real[over][:, part]
             for name, value in zip(summands, terms, strict=True):
                 sums[name] = _smallest(value, real) if over == SMALLEST else (value * real).sum(0)
-        return self._computed(self.law.rate, person | sums)
-
-    def _computed(self, formulas: Iterable[Expr], values: Mapping[str, Any]) -> list[Any]:
-        if self._numpy:
-            return numpy_function(tuple(formulas))(values, ())
-        return computed(list(formulas), values, code=self._code)
+        return Formulas(self.law.rate)(person | sums, code=self._code)
 
     def _arrays(self, values: Mapping[str, Tensor]) -> dict[str, Any]:
         if not self._numpy:

@@ -7,14 +7,14 @@ ahead is the next row. ``Array`` stands for a tensor or a NumPy array.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache, cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.model.arrays import Code, NumpyFunction, computed, numpy_function
+from nnode.model.arrays import Code, Formulas
 from nnode.model.expression import Expr, topological
 from nnode.model.terms import LaneDynamics
 
@@ -23,39 +23,6 @@ Array = Any
 Values = dict[str, Any]
 #: Gap of vehicles without a vehicle ahead, m. It keeps their unused rates finite.
 SAFE = 20.0
-
-
-class Formulas:
-    """Formulas as a function of their symbols' values, which are tensors or arrays.
-
-    Args:
-        outputs: the formulas.
-        given: nodes of the formulas whose values are arguments.
-    """
-
-    def __init__(self, outputs: Sequence[Expr], given: Sequence[Expr] = ()) -> None:
-        self.outputs, self.given = tuple(outputs), tuple(given)
-
-    @cached_property
-    def _numpy(self) -> NumpyFunction:
-        return numpy_function(self.outputs, self.given)
-
-    def __call__(
-        self,
-        values: Mapping[str, Array],
-        given: Sequence[Array] = (),
-        code: Mapping[str, Code] | None = None,
-    ) -> list[Array]:
-        """The formulas' values.
-
-        Args:
-            values: symbol to value.
-            given: values of the given nodes.
-            code: name to the function that calls of this name evaluate; only for tensors.
-        """
-        if isinstance(next(iter(values.values())), Tensor):
-            return computed(self.outputs, values, dict(zip(self.given, given, strict=True)), code)
-        return self._numpy(values, tuple(given))
 
 
 class Rates:

@@ -239,14 +239,9 @@ class Traffic(System):
         return [torch.stack(list(start_values.values()), -1)]
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
-        place = scene.measured_at(t) if self.leader_measured else None
-        return self.rates_behind(t, y, scene, place)
-
-    def rates_behind(self, t: Tensor, y: Tensor, scene: Scene, place: Tensor | None) -> Tensor:
-        """The right-hand side where the leader's ``place`` (m) is given, if it is measured."""
         lead = scene.leader[..., None]
-        if place is not None:
-            measured = [place, scene.measured_rate_at(t)][: self.order]
+        if self.leader_measured:
+            measured = [scene.measured_at(t), scene.measured_rate_at(t)][: self.order]
             moved = torch.where(lead, torch.cat(measured, -1), y[..., : self.order])
             y = _joined(moved, y[..., self.order :])
         law = self.terms[0]
@@ -254,10 +249,10 @@ class Traffic(System):
         alone = len(self.terms) == 1 and isinstance(law, Law) and law.of_gap
         lane = None if alone else self.formula
         if lane is not None:
-            rate = rates_of(self.term_list, lane, y, t, scene, place is not None)
-            return rate if place is None else rate.masked_fill(lead, 0.0)
+            rate = rates_of(self.term_list, lane, y, t, scene, self.leader_measured)
+            return rate.masked_fill(lead, 0.0) if self.leader_measured else rate
         rates = self._rates(State(t, y[..., :1], None, scene), y[..., 1:])
-        if place is None:
+        if not self.leader_measured:
             return rates
         # the leader's state is never read: its place is known at every time
         return _joined(rates[..., :1].masked_fill(lead, 0.0), rates[..., 1:])
@@ -362,10 +357,3 @@ def with_parameters(module: N, parameters: Mapping[str, Tensor]) -> N:
         assert part is not None
         copied._modules[name] = with_parameters(part, inner_parameters)
     return copied
-
-
-def initial_with(
-    system: System, parameters: Mapping[str, Tensor], batch: Batch, step: float | None = None
-) -> Tensor:
-    """``(B, N, W)`` states at the start, with other parameters in place of the model's."""
-    return with_parameters(system, parameters).initial(batch, step)

@@ -339,9 +339,7 @@ class LaneDynamics(Dynamics):
             if start_slopes[s].is_number(1)
             for j in ("", "_1", "_2")
         }
-        rate_slopes = shift_slopes(
-            [*self.rates.values(), self.leader, *self.leader_rates.values()], positions
-        )
+        rate_slopes = shift_slopes(self.outputs, positions)
         starts_known = all(
             slope.is_number(0) or slope.is_number(1) for slope in start_slopes.values()
         )
@@ -354,10 +352,6 @@ class LaneDynamics(Dynamics):
         second = [s for s in self.rates if f"{s}_2" in self.symbols]
         first = [s for s in self.rates if f"{s}_1" in self.symbols or s in second]
         return [*((s, 1) for s in first), *((s, 2) for s in second)]
-
-    @cached_property
-    def is_formula(self) -> bool:
-        return all(node.op != "call" for node in topological(self.rates.values()))
 
     def flat(self) -> LaneDynamics:
         """The formulas with derived quantities and constants substituted."""
@@ -672,31 +666,6 @@ _PLACE: dict[str | None, str] = {
 }
 
 
-def values_of(model: Dynamics, parameters: Mapping[str, Tensor]) -> list[Tensor]:
-    """The values of the parameters' symbols, in their order.
-
-    Args:
-        parameters: name in the model to value; additional leading axes are kept.
-    """
-    values = []
-    for name, place, size in model.owned.values():
-        value = parameters[name]
-        values.append(value if size is None else value.flatten(value.ndim - size)[..., place])
-    return values
-
-
-def own_values(terms: Sequence[Any], model: Dynamics) -> dict[str, Tensor]:
-    """Name in the model to value of the terms' parameters in a model's formula."""
-    values = {}
-    for name, _, _ in model.owned.values():
-        _, place, path = name.split(".", 2)
-        value: Any = terms[int(place)]
-        for part in path.split("."):
-            value = getattr(value, part)  # may be a tensor in place of a parameter
-        values[name] = value
-    return values
-
-
 def parameter_values(
     terms: Sequence[Any], model: Dynamics, parameters: Mapping[str, Tensor] | None = None
 ) -> dict[str, Tensor]:
@@ -706,5 +675,15 @@ def parameter_values(
         terms: the terms of the model, which have the default values.
         parameters: name in the model to value; additional leading axes are kept.
     """
-    values = values_of(model, {**own_values(terms, model), **(parameters or {})})
-    return dict(zip(model.owned, values, strict=True))
+    parameters, values = parameters or {}, {}
+    for symbol_name, (name, place, size) in model.owned.items():
+        value: Any = parameters.get(name)
+        if value is None:
+            _, number, path = name.split(".", 2)
+            value = terms[int(number)]
+            for part in path.split("."):
+                value = getattr(value, part)  # may be a tensor in place of a parameter
+        values[symbol_name] = (
+            value if size is None else value.flatten(value.ndim - size)[..., place]
+        )
+    return values

@@ -22,12 +22,13 @@ from nnode.data.paths import smooth
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import measured_noise
 from nnode.errors import ConfigError, SimulationError
+from nnode.model.arrays import Formulas
 from nnode.model.differentiate import derivatives
 from nnode.model.formula import inputs_of
-from nnode.model.lane_rates import SAFE, Formulas
+from nnode.model.lane_rates import SAFE
 from nnode.model.system import System
 from nnode.model.term import Term
-from nnode.model.terms import LaneDynamics, own_values, values_of
+from nnode.model.terms import LaneDynamics, parameter_values
 from nnode.population.estimate import Estimate, fit_deviations
 from nnode.population.likelihood import Linearised, Noise
 from nnode.simulation.linear import trapezoidal
@@ -319,11 +320,7 @@ class Followers:
             "dt": 2 * paths.half,
             "second": paths.second,
         }
-        constants = {
-            name: value.detach().double() for name, value in own_values(terms, lane).items()
-        }
-        values = values_of(lane, constants)
-        self._fixed |= {s: float(v) for s, v in zip(lane.owned, values, strict=True)}
+        self._fixed |= {s: float(v.detach()) for s, v in parameter_values(terms, lane).items()}
         self._rates = Formulas(list(lane.rates.values()))
         self._starts = Formulas(list(lane.starts.values())) if lane.starts else None
 

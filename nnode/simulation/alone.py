@@ -23,7 +23,7 @@ from nnode.model.laws import InteractionForce, Law
 from nnode.model.scene import Scene
 from nnode.model.system import System, with_parameters
 from nnode.model.term import State, Term
-from nnode.model.terms import CrowdDynamics, own_values, values_of
+from nnode.model.terms import CrowdDynamics, parameter_values
 from nnode.simulation.kernels.alone import FIELDS, WalkSource
 from nnode.simulation.kernels.runs import compiled
 from nnode.simulation.linear import RungeKuttaSolver
@@ -122,11 +122,11 @@ class PersonAlone:
         effects: list[Term] = []
         if law is not None and self.compiled:
             self._kernel = compiled(WalkSource(law))
-            law_values = {name: value.detach() for name, value in own_values(laws, law).items()}
-            self.of_law = frozenset(law_values)
-            rows = [*values_of(law, law_values | parameters), *settings_of(laws, law).values()]
+            self.of_law = frozenset(name for name, _, _ in law.owned.values())
+            values = parameter_values(laws, law, parameters) | settings_of(laws, law)
             columns = [
-                torch.as_tensor(row, dtype=torch.float64).expand(self.number) for row in rows
+                torch.as_tensor(value, dtype=torch.float64).detach().expand(self.number)
+                for value in values.values()
             ]
             self._law = torch.stack(columns, 1).numpy() if columns else np.zeros((self.number, 1))
             effects = list(takewhile(_is_formula, terms[len(laws) :]))
@@ -134,10 +134,8 @@ class PersonAlone:
             {name: value[r] for name, value in parameters.items()} for r in range(self.number)
         ]
         self._effects = [
-            CrowdRates(
-                [*laws, *effects], added_to(laws, effects), around.scene, law_values, numpy=True
-            )
-            for law_values in (self._runs if effects else ())
+            CrowdRates([*laws, *effects], added_to(laws, effects), around.scene, run, numpy=True)
+            for run in (self._runs if effects else ())
         ]
         first = len(laws) + len(effects) if self.compiled else 0
         self._code = range(first, len(terms))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +17,10 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from nnode.data.sequence import Batch
+from nnode.model.arrays import Formulas
 from nnode.model.differentiate import derivatives
-from nnode.model.lane_rates import Formulas
 from nnode.model.scene import Scene
-from nnode.model.system import System, initial_with
+from nnode.model.system import System, with_parameters
 from nnode.model.term import State
 from nnode.model.terms import LaneDynamics
 from nnode.simulation.numpy import runge_kutta
@@ -30,20 +30,6 @@ from nnode.simulation.rhs import RightHandSide, arranged, rates_along, samples
 #: of rates ``(N - 1, K, B)``. The index after the last state stands for ``dx_1``, the speed of the
 #: vehicle ahead.
 Blocks = dict[tuple[int, int, int], np.ndarray]
-
-
-class Solver(Protocol):
-    """Linearised equations along a path."""
-
-    def response(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-        """``(K, N, C, B)`` changes of the first state by C changes of rates and starts.
-
-        Args:
-            source: ``(K, W, N, C, B)`` changes of the rates of the first W states; the other
-                rates do not change.
-            start: ``(M, N, C, B)`` changes of the states at the start; None for 0.
-        """
-        ...
 
 
 class DenseSolver:
@@ -59,6 +45,13 @@ class DenseSolver:
         self._step, self._after = trapezoidal(matrix, dt)
 
     def response(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+        """``(K, N, C, B)`` changes of the first state by C changes of rates and starts.
+
+        Args:
+            source: ``(K, W, N, C, B)`` changes of the rates of the first W states; the other
+                rates do not change.
+            start: ``(M, N, C, B)`` changes of the states at the start; None for 0.
+        """
         k, w, n, c, b = source.shape
         all_sources = np.zeros((k, self._width, n, c, b))
         all_sources[:, :w] = source
@@ -141,6 +134,7 @@ class FrontToBackSolver:
                     self._inverse[p, q] = np.ascontiguousarray(inverse[..., p, q])
 
     def response(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+        """See :meth:`DenseSolver.response`."""
         times, width, n, c, b = source.shape
         # the row after the states is the change of the speed, (A d)_0
         d = np.zeros((self._width + 1, n, c, b))
@@ -263,7 +257,7 @@ class LinearResponse:
         self._of_lead = dict[str, Any]()
         #: derivatives of the added term's rates by the speeds of the formula
         self._by_speed = np.zeros((n, n, *axes))
-        self._solver: Solver
+        self._solver: DenseSolver | FrontToBackSolver
         with np.errstate(all="ignore"):
             if self.rhs.lane is not None:
                 self._differentiate(self.rhs.lane)
@@ -374,7 +368,10 @@ class LinearResponse:
         """``(C, B, N, M)`` derivatives of the states at the start; None if these are measured."""
         if self.states.shape[-1] == self.system.order:
             return None
-        start = partial(initial_with, self.system, batch=self._batch)
+
+        def start(parameters: dict[str, Tensor]) -> Tensor:
+            return with_parameters(self.system, parameters).initial(self._batch)
+
         return torch.stack([self._along(name, place, start) for name, place in entries])
 
     def _along(

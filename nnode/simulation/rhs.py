@@ -21,7 +21,7 @@ from nnode.model.formula import lane_of, symbols_of
 from nnode.model.lane_rates import LaneRates, Values
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
-from nnode.model.system import System, Traffic, initial_with, with_parameters
+from nnode.model.system import System, Traffic, with_parameters
 from nnode.model.term import State, Term
 from nnode.model.terms import LaneDynamics, parameter_values
 
@@ -108,7 +108,7 @@ class RightHandSide:
         starts = [self.system.initial(batch)] * runs
         if self.system.memory:
             rows = [{name: p[r] for name, p in self.parameters.items()} for r in range(runs)]
-            starts = [initial_with(self.system, row, batch) for row in rows]
+            starts = [with_parameters(self.system, row).initial(batch) for row in rows]
         return arranged(torch.stack(starts).detach())
 
     def __call__(self, t: Any, y: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnode.model.arrays import computed
+from nnode.model.arrays import Formulas
 from nnode.model.expression import Expr, const, symbol, topological
 from nnode.model.parse import FormulaError, parse
 from nnode.model.text import latex, plain
@@ -120,7 +120,7 @@ formulas = st.recursive(
 
 def _value(node: Expr, values: dict[str, float]) -> float:
     tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
-    return float(computed([node], tensors)[0])
+    return float(Formulas([node])(tensors)[0])
 
 
 @given(formulas)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from numba import njit
 
-from nnode.model.arrays import computed, numpy_function
+from nnode.model.arrays import Formulas
 from nnode.model.differentiate import derivatives, slopes
 from nnode.model.expression import apply, const, symbol
 from nnode.model.operations import OPERATIONS, compiled
@@ -34,7 +34,7 @@ def test_values_and_derivatives(text: str) -> None:
     rng = np.random.default_rng(3)
     node = parse(text)
     values = {n: torch.tensor(rng.uniform(0.3, 2.0, 50), requires_grad=True) for n in "abc"}
-    found = computed([node], values)[0]
+    found = Formulas([node])(values)[0]
     names = {
         **vars(math),
         "max": max,
@@ -54,7 +54,7 @@ def test_values_and_derivatives(text: str) -> None:
         if wanted is None:
             assert name not in own_slopes
             continue
-        slope = computed([own_slopes[name]], values)[0].expand(50)
+        slope = Formulas([own_slopes[name]])(values)[0].expand(50)
         torch.testing.assert_close(slope, wanted, rtol=1e-12, atol=1e-13)
 
 
@@ -68,9 +68,9 @@ def test_an_operation_is_the_same_in_every_library(name: str) -> None:
     points = list(zip(*values.values(), strict=True))
     node = apply(name, *map(symbol, names))
     wanted = [apply(name, *map(const, point)).value for point in points]
-    np.testing.assert_allclose(numpy_function((node,))(values, ())[0], wanted, rtol=1e-14)
+    np.testing.assert_allclose(Formulas([node])(values)[0], wanted, rtol=1e-14)
     tensors = {n: torch.tensor(v, requires_grad=True) for n, v in values.items()}
-    found = computed([node], tensors)[0]
+    found = Formulas([node])(tensors)[0]
     np.testing.assert_allclose(found.detach(), wanted, rtol=1e-14)
     code = compiled(row.code.format(*names), ", ".join(names), vars(functions) | SCALARS)
     machine = njit(error_model="numpy")(code)
@@ -78,7 +78,7 @@ def test_an_operation_is_the_same_in_every_library(name: str) -> None:
     exact = torch.autograd.grad(found.sum(), list(tensors.values()), allow_unused=True)
     for own, slope in zip(slopes(node), exact, strict=True):
         if slope is not None:
-            other = computed([own], tensors)[0].expand_as(slope)
+            other = Formulas([own])(tensors)[0].expand_as(slope)
             torch.testing.assert_close(other, slope, rtol=1e-13, atol=1e-15)
         else:
             assert own.is_number(0)
@@ -91,8 +91,8 @@ def test_the_larger_of_a_number_and_none_is_none(op: str) -> None:
     node = parse(f"{op}(a, b)")
     wanted = [nan, nan, nan, 2.0 if op == "max" else 1.0]
     tensors = {name: torch.from_numpy(value) for name, value in values.items()}
-    np.testing.assert_array_equal(computed([node], tensors)[0].numpy(), wanted)
-    np.testing.assert_array_equal(numpy_function((node,))(values, ())[0], wanted)
+    np.testing.assert_array_equal(Formulas([node])(tensors)[0].numpy(), wanted)
+    np.testing.assert_array_equal(Formulas([node])(values)[0], wanted)
     text = OPERATIONS[op].code.format("a", "b")
     code = njit(error_model="numpy")(compiled(text, "a, b", vars(functions)))
     pairs = list(zip(*values.values(), strict=True))
@@ -107,11 +107,11 @@ def test_the_larger_of_a_number_and_none_is_none(op: str) -> None:
 def test_ties_go_to_the_first(text: str, slope: tuple[float, float]) -> None:
     found = derivatives(parse(text), ["a", "b"])
     one = {"a": torch.ones(1), "b": torch.ones(1)}
-    assert [float(computed([found[n]], one)[0]) for n in "ab"] == list(slope)
+    assert [float(Formulas([found[n]])(one)[0]) for n in "ab"] == list(slope)
 
 
 def test_a_slope_of_zero_wins_over_what_is_not_finite() -> None:
     # where the other side is chosen, its own slope counts for nothing
     found = derivatives(parse("choose(a, log(a), 2*b)"), ["a", "b"])
     at = {"a": torch.zeros(1), "b": torch.ones(1)}
-    assert float(computed([found["b"]], at)[0]) == 2.0
+    assert float(Formulas([found["b"]])(at)[0]) == 2.0

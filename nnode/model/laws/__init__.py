@@ -17,7 +17,7 @@ import yaml
 from torch import Tensor
 
 from nnode.errors import ConfigError
-from nnode.model.arrays import Code, computed
+from nnode.model.arrays import Code, Formulas
 from nnode.model.crowd import velocity
 from nnode.model.crowd_formula import rates_of, settings_of
 from nnode.model.expression import Expr, call, const, substitute, symbol, symbols
@@ -380,7 +380,7 @@ class Law(Term):
         law_values = parameter_values([self], law)
         like = next(iter(values.values()))
         law_values |= {k: like.new_tensor(value) for k, value in settings_of([self], law).items()}
-        return computed(formulas, {**law_values, **values}, code=self.code())
+        return Formulas(formulas)({**law_values, **values}, code=self.code())
 
     def evaluated(self, values: Mapping[str, Tensor]) -> Tensor:
         """The rate of a vehicle from the values of the quantities in it."""
@@ -575,20 +575,15 @@ class InteractionForce(Law):
         wall's unit normal."""
         return self._force(POINTS, {"d{}": dx, "v{}": v, "normal_{}": normal})
 
-    def pairs(self, state: State) -> Tensor:
-        """``(B, N, N, 2)`` m/s²: the acceleration of person i (second axis) by person j (third
-        axis), 0 for i = j."""
+    def components(self, state: State) -> dict[str, Tensor]:
+        """``pair`` and ``wall`` accelerations, ``(B, N, 2)`` m/s² each."""
         x, v, scene = state.x, velocity(state), state.scene
         other, speed = state.others
         dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
         apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
         acts = (scene.agent[:, None, :] & apart)[..., None]
-        return self.pair_force(dx, dv) * (acts / (self.mass * scene.count[..., None]))
-
-    def components(self, state: State) -> dict[str, Tensor]:
-        """``pair`` and ``wall`` accelerations, ``(B, N, 2)`` m/s² each."""
-        x, v, scene = state.x, velocity(state), state.scene
-        parts = {"pair": self.pairs(state).sum(2)}
+        pair = self.pair_force(dx, dv) * (acts / (self.mass * scene.count[..., None]))
+        parts = {"pair": pair.sum(2)}
         if self.walls and scene.wall.shape[1]:
             wall, normal, real = scene.walls_of_each()
             dx = x[:, :, None] - wall
@@ -651,7 +646,6 @@ def law_from(
             "model.law needs parameters and rate, as in {parameters: {v0: 30 m/s, L: 5 m}, "
             "rate: {x: v0*(1 - L/gap)}}"
         )
-    check_names("model.name", [name])
     people = _of_people(description["rate"])
     keys = _CROWD_KEYS if people else _KEYS
     unknown = sorted(set(map(str, description)) - set(keys))

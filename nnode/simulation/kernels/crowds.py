@@ -22,7 +22,7 @@ from torch import Tensor
 
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
-from nnode.model.arrays import computed
+from nnode.model.arrays import Formulas
 from nnode.model.crowd_formula import people_of, settings_of, walls_of
 from nnode.model.differentiate import derivatives
 from nnode.model.expression import (
@@ -502,7 +502,7 @@ def _opposite(pair: list[Expr], swapped: list[Expr]) -> bool:
         return False
     return all(
         torch.allclose(a, -b, rtol=1e-9, atol=1e-12)
-        for a, b in zip(computed(pair, values), computed(swapped, values), strict=True)
+        for a, b in zip(Formulas(pair)(values), Formulas(swapped)(values), strict=True)
     )
 
 

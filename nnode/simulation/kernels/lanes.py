@@ -31,7 +31,7 @@ from nnode.model.formula import inputs_of, starts_of
 from nnode.model.lane_rates import SAFE
 from nnode.model.names import check_symbols
 from nnode.model.steps import STAGES, stepped
-from nnode.model.system import System, Traffic, initial_with
+from nnode.model.system import System, Traffic, with_parameters
 from nnode.model.tangent import with_tangents
 from nnode.model.terms import LaneDynamics
 from nnode.model.text import plain
@@ -385,9 +385,7 @@ def simulate(
     else:
         every = [{name: value[r] for name, value in parameters.items()} for r in range(runs)]
         step = batch.dt / substeps
-        y0 = torch.stack(
-            [initial_with(system, per_simulation, batch, step) for per_simulation in every]
-        )
+        y0 = torch.stack([with_parameters(system, values).initial(batch, step) for values in every])
     y0 = y0.to(batch.x.dtype).permute(3, 0, 1, 2)
     simulations, agents = y0.shape[2:]
     if system.leader_measured:  # the start of a measured leader has no gradient

@@ -17,7 +17,7 @@ from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.residuals.variables import Curve
 from nnode.model import System
-from nnode.model.arrays import computed, numpy_function
+from nnode.model.arrays import Formulas
 from nnode.model.build import add_effects, build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.lane import DriverHeterogeneity
@@ -108,9 +108,9 @@ def rows_of(system: System) -> Tensor:
 def test_a_straight_line_function(text: str) -> None:
     rng, node = np.random.default_rng(3), parse(text)
     values = {name: rng.uniform(0.3, 2.0, 50) for name in "abc"}
-    (found,) = numpy_function((node,))(values, ())
+    (found,) = Formulas([node])(values)
     tensors = {name: torch.from_numpy(value) for name, value in values.items()}
-    same(torch.from_numpy(found), computed([node], tensors)[0], close=1e-14)
+    same(torch.from_numpy(found), Formulas([node])(tensors)[0], close=1e-14)
 
 
 @pytest.mark.parametrize(("law", "leader", "effects"), CASES)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nnode.data.sequence import Batch, collate
 from nnode.model import Traffic, build_model
-from nnode.model.arrays import computed
+from nnode.model.arrays import Formulas
 from nnode.model.effects.lane import ReactionDelay
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.tangent import with_tangents
@@ -158,7 +158,7 @@ def test_their_formulas_are_the_slopes_of_the_rate() -> None:
         "x__d1_1": 0.0,
     }
     values = {k: torch.tensor(v, dtype=torch.float64) for k, v in given.items()}
-    by_v0, by_L = computed([twice.rates["x__d0"], twice.rates["x__d1"]], values)
+    by_v0, by_L = Formulas([twice.rates["x__d0"], twice.rates["x__d1"]])(values)
     steep = 25 * 6 / 20**2
     assert float(by_v0) == pytest.approx(1 - 6 / 20 + steep * 1.5, rel=1e-14)
     assert float(by_L) == pytest.approx(-25 / 20 + steep * 1.0, rel=1e-14)
