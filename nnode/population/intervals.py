@@ -108,7 +108,8 @@ def variations(population: Population) -> dict[str, dict[str, Any]]:
     for k, name in enumerate([*noise, *drivers]):
         value, lowest, highest = variances.row[k], variances.low[k], variances.high[k]
         factor = 1.0 if k < len(noise) else 100.0
-        bound = at_bounds(*np.log((value, lowest, highest)), NEAR) if lowest < highest else ""
+        logs = (np.log(number) for number in (value, lowest, highest))
+        bound = at_bounds(*logs, near=NEAR) if lowest < highest else ""
         table[name] = {
             "estimate": float(factor * value),
             "lower": float(factor * ends[k, 0]),

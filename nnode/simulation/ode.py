@@ -63,7 +63,10 @@ class Rates(nn.Module):
 
     def forward(self, step: Tensor, y: Tensor) -> Tensor:
         """``(B, N, order * D + M)``: change of ``y`` from ``step`` to the next step."""
-        rate: Tensor = self.dt * self.system(step * self.dt, y, self.scene)
+        return self.until_the_end(step, self.dt * self.system(step * self.dt, y, self.scene))
+
+    def until_the_end(self, step: Tensor, rate: Tensor) -> Tensor:
+        """The change of the state, which is 0 for sequences that have ended."""
         # the last step is included, because the backward integration starts there
         return rate.where(step <= self.end, 0.0) if self.ragged else rate
 
