@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from nnode.data.sequence import Sequence
+from nnode.model import Law, make_law
 
 
 def lane(
@@ -65,3 +66,9 @@ def linear(
             path.append(path[-1] + step * np.append(v0 * (1 - length / np.diff(path[-1])), v0))
         found.append(lane(path[::every], start=100.0 * i, name=f"r/{i:03d}"))
     return found
+
+
+def social_forces(**options: Any) -> list[Law]:
+    """Terms of a crowd: relaxation, and a social force with some strengths or with others."""
+    strengths = {"A": 2.0, "k": 30.0, "kappa": 9.0, **options}
+    return [make_law("relaxation"), make_law("social_force", **strengths)]

@@ -14,6 +14,7 @@ from nnode.data.sequence import collate
 from nnode.errors import SimulationError
 from nnode.model import Crowd, Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver
+from tests.builders import social_forces
 
 V0, LENGTH, GAP = 20.0, 5.0, 8.0
 
@@ -103,7 +104,7 @@ def test_single_precision_stays_close(platoon, crowd) -> None:  # type: ignore[n
             [platoon([12.0, 30.0], samples=13, start=900.0)],
         ),
         (
-            Crowd([make_law("relaxation"), make_law("social_force", A=1.0, k=30.0, kappa=9.0)]),
+            Crowd(social_forces(A=1.0)),
             [crowd(4)],
         ),
     ):

@@ -23,7 +23,7 @@ from nnode.model.effects import CATALOGUE
 from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, Law, law_from
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.base import simulated_batch
-from tests.builders import lane, straight
+from tests.builders import lane, social_forces, straight
 
 #: Metres: a city's own coordinates, a country's, and northings of UTM.
 AWAY = (1e5, 7e6)
@@ -48,9 +48,7 @@ def cars(shift: float = 0.0, number: int = 5) -> Sequence:
 
 
 def crowd(dtype: torch.dtype) -> System:
-    return Crowd([make_law("relaxation"), make_law("social_force", A=2.0, k=100.0, kappa=10.0)]).to(
-        dtype
-    )
+    return Crowd(social_forces(k=100.0, kappa=10.0)).to(dtype)
 
 
 def lin(dtype: torch.dtype) -> System:
@@ -137,26 +135,11 @@ def test_a_leader_that_follows_its_measured_path_has_no_error_at_all() -> None:
         assert torch.equal(x[:, b, last], batch.x[:, b, last])
 
 
-@pytest.mark.parametrize("law", [make_law("lin"), make_law("log"), make_law("network_speed")])
-def test_the_paper_s_lanes_name_no_places(law: object) -> None:
-    assert not Traffic([law]).depends_on_position  # type: ignore[list-item]
-
-
-@pytest.mark.parametrize("name", CAR_FOLLOWING_LAWS)
-def test_laws_of_the_field_name_no_places(name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["lin", "log", "n4", "sf", "nn", *CAR_FOLLOWING_LAWS, *PEDESTRIAN_LAWS]
+)
+def test_laws_name_no_places(name: str) -> None:
     assert not build_model(model_options(name)).depends_on_position
-
-
-@pytest.mark.parametrize("name", PEDESTRIAN_LAWS)
-def test_laws_of_people_name_no_places(name: str) -> None:
-    assert not Crowd([law_from(name, PEDESTRIAN_LAWS[name])]).depends_on_position
-
-
-def test_the_paper_s_crowds_name_no_places() -> None:
-    assert not Crowd(
-        [make_law("relaxation"), make_law("social_force", A=1.0, k=30.0, kappa=9.0)]
-    ).depends_on_position
-    assert not Crowd([make_law("relaxation"), make_law("network_force")]).depends_on_position
 
 
 PLACES = {"speed_zone", "slope", "obstacle", "attraction"}

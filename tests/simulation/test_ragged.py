@@ -10,6 +10,7 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Sequence, collate
 from nnode.model import Crowd, System, Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver
+from tests.builders import social_forces
 
 
 def seeded() -> torch.Generator:
@@ -23,9 +24,7 @@ TRAFFIC = {
     "lin_measured": lambda: Traffic([make_law("lin", v0=18.0, L=4.0)], leader="measured"),
 }
 CROWD = {
-    "sf": lambda: Crowd(
-        [make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1)]
-    ),
+    "sf": lambda: Crowd(social_forces(B=0.1)),
     "nn": lambda: Crowd(
         [make_law("relaxation"), make_law("network_force", hidden=4, generator=seeded())]
     ),

@@ -19,6 +19,7 @@ from nnode.model.network import FeedForward
 from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, fused
 from nnode.simulation.kernels import crowds as compiled
 from nnode.simulation.kernels.crowds import SIZE, CrowdSource
+from tests.builders import social_forces
 from tests.simulation.fused.compare import difference, single
 from tests.simulation.fused.test_fallback import Sway
 
@@ -32,10 +33,7 @@ def network(hidden: int = 4, **options: object) -> Law:
 
 
 MODELS = {
-    "sf": lambda: [
-        make_law("relaxation"),
-        make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1),
-    ],
+    "sf": lambda: social_forces(B=0.1),
     "nn": lambda: [make_law("relaxation"), network()],
     "nn_self": lambda: [make_law("relaxation"), network(self_interaction=True)],
 }
@@ -158,27 +156,6 @@ def test_saturated_neurons(people: list[Sequence]) -> None:
     check(model, single(people), FusedSolver(DT))
 
 
-def test_directional_derivative(people: list[Sequence]) -> None:
-    # independent of every adjoint: a difference quotient of states
-    batch, model = single(people), Crowd(MODELS["nn"]())
-    _, found = gradient(model, FusedSolver(DT), batch)
-    draw = torch.Generator().manual_seed(1)
-    direction = [torch.randn(p.shape, generator=draw, dtype=p.dtype) for p in model.parameters()]
-    values = []
-    for side in (1e-6, -2e-6):
-        with torch.no_grad():
-            for p, d in zip(model.parameters(), direction, strict=True):
-                p += side * d
-            run = FusedSolver(DT)(model, batch)
-            assert run.v is not None
-            speeds = run.v.masked_fill(~batch.valid[..., None], 0.0)
-            total = sequence_costs(run, batch).sum() + 0.02 * speeds.square().sum()
-            values.append(float(total))
-    flat = torch.cat([d.flatten() for d in direction])
-    quotient = (values[0] - values[1]) / 2e-6
-    assert float(found[: len(flat)] @ flat) == pytest.approx(quotient, rel=1e-6)
-
-
 @pytest.mark.parametrize(
     ("name", "options"), [("nn", {}), ("sf", {"cutoff": 30.0})], ids=["dense", "lists"]
 )
@@ -209,21 +186,9 @@ def test_without_gradient_nothing_changes(people: list[Sequence]) -> None:
         torch.testing.assert_close(found, same, rtol=1e-14, atol=1e-14)
 
 
-def test_backward_twice(people: list[Sequence]) -> None:
-    batch, model = collate(people), Crowd(MODELS["sf"]())
-    cost = FusedSolver(DT)(model, batch).x[:, :, :2].square().sum()
-    weights = list(model.parameters())
-    once = torch.autograd.grad(cost, weights, retain_graph=True)
-    again = torch.autograd.grad(cost, weights)
-    for a, b in zip(once, again, strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
-
-
 def test_a_blow_up_is_reported(crowd) -> None:  # type: ignore[no-untyped-def]
     items = [crowd(1, name="alone"), crowd(3, name="crushed", apart=0.1)]
-    model = Crowd(
-        [make_law("relaxation"), make_law("social_force", A=1e300, k=0.0, kappa=0.0, B=1e-4)]
-    )
+    model = Crowd(social_forces(A=1e300, k=0.0, kappa=0.0, B=1e-4))
     with pytest.raises(SimulationError, match="crushed blew up"):
         FusedSolver(DT)(model, collate(items))
 

@@ -10,6 +10,7 @@ from nnode.errors import ConfigError
 from nnode.model import Crowd, Traffic, make_law
 from nnode.simulation import FusedSolver
 from nnode.simulation.kernels import lanes
+from tests.builders import social_forces
 from tests.simulation.fused.compare import difference, single
 from tests.simulation.fused.test_fallback import Sway
 
@@ -22,9 +23,7 @@ MODELS = {
         [make_law("network_speed", hidden=4, v0=18.0, generator=torch.Generator().manual_seed(3))]
     ),
     "fallback": lambda: Traffic([make_law("lin", v0=18.0, L=4.0), Sway()]),
-    "crowd": lambda: Crowd(
-        [make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1)]
-    ),
+    "crowd": lambda: Crowd(social_forces(B=0.1)),
 }
 
 

@@ -11,7 +11,8 @@ from torch import Tensor
 from nnode.model import Crowd, Law, System, Traffic, make_law
 from nnode.model.term import State, Term
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
-from tests.simulation.fused.compare import difference, gradient, single
+from tests.builders import social_forces
+from tests.simulation.fused.compare import single
 
 DT = 0.02
 
@@ -48,40 +49,6 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_states_and_gradient(name, ragged, crowd) -> None:  # type: ignore[no-untyped-def]
-    people = [crowd(3, samples=4, name="a"), crowd(2, samples=3, name="b")]
-    batch = single(people if name == "crowd" else ragged)
-    model = MODELS[name]()
-    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
-    assert wanted.abs().max() > 0
-    found, own = gradient(model, FusedSolver(DT), batch)
-    torch.testing.assert_close(found.x, exact.x, rtol=1e-13, atol=1e-12)
-    if exact.v is not None:
-        torch.testing.assert_close(found.v, exact.v, rtol=1e-13, atol=1e-12)
-    assert difference(own, wanted) < 1e-10
-    found, own = gradient(model.to(torch.float32), FusedSolver(DT), batch.to(dtype=torch.float32))
-    wide, same = TorchdiffeqSolver("euler", "discrete", DT), batch.to(dtype=torch.float32)
-    assert difference(own, gradient(model, wide, same)[1]) < 1e-4
-
-
-def test_frozen_parameters(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model = single(ragged), Traffic([make_law("lin", v0=18.0, L=4.0), Sway()])
-    model.terms[0].requires_grad_(False)
-    _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
-    _, own = gradient(model, FusedSolver(DT), batch)
-    assert difference(own, wanted) < 1e-10
-
-
-def test_changed_parameters_are_refused(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model = single(ragged), Traffic([make_law("lin", v0=18.0, L=4.0), Sway()])
-    cost = FusedSolver(DT)(model, batch).x.sum()
-    with torch.no_grad():
-        model.terms[1].c += 1.0
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        cost.backward()
-
-
 def test_models_are_not_touched(ragged) -> None:  # type: ignore[no-untyped-def]
     model: System = Traffic([make_law("lin", v0=18.0, L=4.0), Sway()])
     stacked = {"terms.1.c": torch.tensor([0.1, 0.2], dtype=torch.float64)}
@@ -108,7 +75,9 @@ def test_it_is_said_once_in_a_run_and_why(name, ragged, crowd, caplog) -> None: 
     batch = single([crowd(3, samples=4)] if system.domain == "crowd" else ragged)
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
-            solver(system, batch)
+            found = solver(system, batch).x
+    assert torch.equal(found, TorchdiffeqSolver(gradient="discrete")(system, batch).x)
+    assert found.requires_grad
     (record,) = caplog.records
     assert record.levelname == "WARNING"
     for words in ("in PyTorch", SAID[name], "docs/performance.md"):
@@ -121,9 +90,7 @@ def test_compiled_models_and_the_baseline_without_forces_say_nothing(ragged, cro
     with caplog.at_level(logging.INFO):
         solver(Traffic([make_law("lin", v0=18.0, L=4.0)]), single(ragged))
         solver(
-            Crowd(
-                [make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0, B=0.1)]
-            ),
+            Crowd(social_forces(B=0.1)),
             single([crowd(3, samples=4)]),
         )
         solver(Crowd([make_law("relaxation")]), single([crowd(3, samples=4)]))

@@ -19,7 +19,7 @@ from nnode.model import Crowd, InteractionForce, Traffic, make_law
 from nnode.model.formula import crowd_of
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.kernels import crowds
-from tests.builders import straight
+from tests.builders import social_forces, straight
 from tests.simulation.fused.compare import difference
 from tests.simulation.fused.test_crowd import gradient
 
@@ -124,9 +124,7 @@ def hall(n: int, samples: int = 3, dt: float = 0.04, walls: int = 2) -> Batch:
 @pytest.mark.parametrize("cutoff_error", [1e-3, 1e-6, 1e-10])
 def test_the_bound_holds(cutoff_error: float) -> None:
     A, mass, n = 3.0, 2.0, 300
-    model = Crowd(
-        [make_law("relaxation"), make_law("social_force", A=A, k=40.0, kappa=5.0, mass=mass)]
-    )
+    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0, mass=mass))
     # wall points would be averaged over their own number: one bound at a time
     for walls in (False, True):
         batch = hall(n, walls=2 * walls)
@@ -146,12 +144,7 @@ def test_the_bound_holds(cutoff_error: float) -> None:
 def test_the_bound_of_a_given_distance(cutoff: float) -> None:
     A, decay, mass = 3.0, 0.1, 2.0
     batch = hall(40, walls=0)  # small crowds have a cutoff where one is given
-    model = Crowd(
-        [
-            make_law("relaxation"),
-            make_law("social_force", A=A, k=40.0, kappa=5.0, B=decay, mass=mass),
-        ]
-    )
+    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0, B=decay, mass=mass))
     with torch.no_grad():
         v = FusedSolver(batch.dt, cutoff=cutoff, cutoff_error=0)(model, batch).v
         exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
@@ -164,7 +157,7 @@ def test_the_bound_of_a_given_distance(cutoff: float) -> None:
 @pytest.mark.thorough  # compiled for
 def test_no_error_is_everybody() -> None:
     batch = hall(crowds.LISTS_FROM + 20)
-    model = Crowd([make_law("relaxation"), make_law("social_force", A=3.0, k=40.0, kappa=5.0)])
+    model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0))
     with torch.no_grad():
         exact = TorchdiffeqSolver("euler", "discrete")(model, batch).x
         for error, same in ((0.0, True), (1e-3, False)):
@@ -215,7 +208,7 @@ def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
     # the force on one person, not divided by the number of people
     A, n = 3.0, 2000
     batch = hall(n, walls=0)
-    model = Crowd([make_law("relaxation"), make_law("social_force", A=A, k=40.0, kappa=5.0)])
+    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0))
     with torch.no_grad():
         law = crowds.supports(model, batch)
         assert law is not None
@@ -238,9 +231,7 @@ def test_the_formula_of_the_bound() -> None:
 @pytest.mark.parametrize("walls", [True, pytest.param(False, marks=pytest.mark.thorough)])
 def test_lists_give_the_gradient(walls: bool) -> None:
     batch = hall(crowds.LISTS_FROM + 20)
-    model = Crowd(
-        [make_law("relaxation"), make_law("social_force", A=3.0, k=40.0, kappa=5.0, walls=walls)]
-    )
+    model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0, walls=walls))
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
     for threads in (1, 2):
         found, own = gradient(model, FusedSolver(0.02, threads), batch)
@@ -257,9 +248,7 @@ def test_lists_give_the_gradient(walls: bool) -> None:
 @pytest.mark.parametrize("walls", [False, True])
 def test_lists_in_single_precision(walls: bool) -> None:
     batch = hall(crowds.LISTS_FROM + 20)
-    model = Crowd(
-        [make_law("relaxation"), make_law("social_force", A=3.0, k=40.0, kappa=5.0, walls=walls)]
-    )
+    model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0, walls=walls))
     _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
     single = gradient(model.to(torch.float32), FusedSolver(0.02), batch.to(dtype=torch.float32))
     assert difference(single[1], wanted) < 1e-4
@@ -299,10 +288,11 @@ SCALE = """
 import resource
 import torch
 from tests.simulation.fused.test_neighbours import hall
-from nnode.model import Crowd, make_law
+from tests.builders import social_forces
+from nnode.model import Crowd
 from nnode.simulation.kernels import crowds
 torch.set_num_threads(1)
-model = Crowd([make_law("relaxation"), make_law("social_force", A=2.0, k=30.0, kappa=9.0)])
+model = Crowd(social_forces())
 law = crowds.supports(model)
 crowds.simulate(model, law, hall(10_000, samples=26), 1)[..., :2].square().sum().backward()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)

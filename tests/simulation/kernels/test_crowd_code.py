@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
-
-from nnode.errors import ConfigError
 from nnode.model import Crowd, make_law
 from nnode.model.formula import crowd_of
-from nnode.simulation.kernels import crowds, source
+from nnode.simulation.kernels import source
 from nnode.simulation.kernels.crowds import CrowdSource
+from tests.builders import social_forces
 
 
 def test_one_law_of_other_bodies_is_one_module() -> None:
@@ -27,17 +23,6 @@ def test_one_law_of_other_bodies_is_one_module() -> None:
 
 
 def test_its_source_is_shown() -> None:
-    text = source(
-        Crowd([make_law("relaxation"), make_law("social_force", A=1.0, k=2.0, kappa=3.0)])
-    )
+    text = source(Crowd(social_forces(A=1.0, k=2.0, kappa=3.0)))
     assert "social_force.pair_x = sum over others of" in text
     assert "def backward(" in text
-
-
-def test_a_folder_that_cannot_be_written(tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("NNODE_CACHE", str(tmp_path / "file"))
-    law = crowd_of([make_law("social_force", A=1.0, k=2.0, kappa=3.0)])
-    assert law is not None
-    with pytest.raises(ConfigError, match="NNODE_CACHE"):
-        crowds.compiled.__wrapped__(CrowdSource(law))

@@ -7,29 +7,12 @@ import pytest
 import torch
 
 from nnode.app.python.inputs import model_options
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import System, build_model
 from nnode.model.laws import PEDESTRIAN_LAWS
 from nnode.simulation import FusedSolver
-from tests.builders import straight
-from tests.simulation.test_engines import OWN_FORCES
-
-DT = 0.02
-#: Two sides of the room, and a wall in it; x1, y1, x2, y2 in m.
-WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 2.5, 0.0, 2.5], [1.0, 0.5, 2.5, 2.0]])
-
-
-def people(n: int, seed: int, samples: int = 6) -> Sequence:
-    draw = np.random.default_rng(seed)
-    x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
-    wish = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
-    more = {"preferred": wish, "walls": WALLS[: seed % 4]}
-    return straight(x, v, samples, 0.04, name=f"{n}-{seed}", **more)
-
-
-def batch() -> Batch:
-    return collate([people(6, 1), people(9, 2, 4), people(1, 3), people(2, 4)])
+from tests.simulation.test_engines import OWN_FORCES, room
 
 
 def many() -> System:
@@ -39,11 +22,10 @@ def many() -> System:
 
 
 def test_a_smallest_value_by_loops() -> None:
-    item = people(6, 7)
-    model, one = many(), collate([item])
+    model, one = many(), room().select([0])
     found = model(torch.zeros(()), model.initial(one), model.scene(one))[0, :, 2].detach().numpy()
-    x, v = item.x[0], item.v[0]  # type: ignore[index]
-    goal = item.x[-1]
+    x, v = one.x[0, 0].numpy(), one.v[0, 0].numpy()
+    goal = one.destination[0].numpy()
     for i in range(6):
         d = np.array([np.hypot(*(x[i] - x[j])) for j in range(6) if j != i])
         dx = np.array([x[i, 0] - x[j, 0] for j in range(6) if j != i])
@@ -79,7 +61,7 @@ def test_derivatives_of_a_law_with_a_smallest_value() -> None:
     options = model_options(
         {"term": "formula", "name": "c", "law": PEDESTRIAN_LAWS["cfsm"]}, "measured"
     )
-    model, one = build_model({**options, "desired": "direction"}), collate([people(4, 9)])
+    model, one = build_model({**options, "desired": "direction"}), room().select([1])
     scene, zero = model.scene(one), torch.zeros((), dtype=torch.float64)
     y = model.initial(one).requires_grad_()
     assert torch.autograd.gradcheck(lambda y: model(zero, y, scene), (y,), eps=1e-7, atol=1e-5)
@@ -87,4 +69,4 @@ def test_derivatives_of_a_law_with_a_smallest_value() -> None:
 
 def test_a_cutoff_is_refused() -> None:
     with pytest.raises(ConfigError, match="smallest values"):
-        FusedSolver(DT, cutoff=3.0)(many(), batch())
+        FusedSolver(cutoff=3.0)(many(), room())

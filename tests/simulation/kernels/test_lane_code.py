@@ -19,6 +19,7 @@ from nnode.simulation.kernels import functions, lanes, source
 from nnode.simulation.kernels.cache import digest
 from nnode.simulation.kernels.lanes import LaneSource
 from nnode.simulation.kernels.runs import COMPILED_IN
+from tests.builders import social_forces
 from tests.simulation.fused.compare import gradient, single
 
 #: Divisions of several numbers at once, by processor.
@@ -122,7 +123,7 @@ def test_everything_that_is_compiled_in_counts() -> None:
     # whatever compiled text imports from the package must be part of the digest
     counted = {module.__name__ for module in COMPILED_IN}
     texts = [Path(str(module.__file__)).read_text("utf-8") for module in COMPILED_IN]
-    crowd = Crowd([make_law("relaxation"), make_law("social_force")])
+    crowd = Crowd(social_forces())
     texts += [source(model) for model in (Traffic([make_law("lin")]), crowd)]
     for text in texts:
         for line in text.splitlines():
