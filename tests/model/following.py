@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.model import Traffic, build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
+from tests.builders import lane
 
 DT = 0.1
 
@@ -50,25 +51,6 @@ def numbers(system: Traffic) -> SimpleNamespace:
     return SimpleNamespace(**{name: float(getattr(law, name).detach()) for name in law.scalars})
 
 
-def driven(
-    time: np.ndarray,
-    x: np.ndarray,
-    v: np.ndarray | None = None,
-    length: Any = None,
-    name: str = "a",
-) -> Sequence:
-    """A platoon from places ``(K, N)``, speeds, and one length, m, of all vehicles."""
-    lengths = None if length is None else np.broadcast_to(np.asarray(length, float), x.shape[1:])
-    return Sequence(
-        name=name,
-        recording=name,
-        time=time,
-        x=x[..., None],
-        v=None if v is None else v[..., None],
-        length=lengths,
-    )
-
-
 def behind(
     lead: Any, gaps: Many[float], seconds: float, length: float = 4.0, dt: float = DT
 ) -> Batch:
@@ -78,7 +60,7 @@ def behind(
     speed = (lead(time + hair) - lead(time - hair)) / (2 * hair)
     apart = np.cumsum([0.0, *gaps])[::-1]
     x = place[:, None] - apart
-    return collate([driven(time, x, np.repeat(speed[:, None], len(apart), 1), length)])
+    return collate([lane(x, dt, v=speed[:, None], length=length)])
 
 
 def states(seed: int = 3, platoons: int = 40) -> Batch:
@@ -94,7 +76,7 @@ def states(seed: int = 3, platoons: int = 40) -> Batch:
             v[:] = v[0]  # ties of speeds
         x = 100 + np.cumsum([0.0, *gap])
         x = x + v * np.array([[0.0], [DT]])
-        found.append(driven(DT * np.arange(2), x, np.stack([v, v]), 4.0, f"s{number}"))
+        found.append(lane(x, DT, v=v, length=4.0, name=f"s{number}"))
     return collate(found)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 import nnode.model.laws as laws
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError
-from nnode.model import Crowd, FollowTheLeader, InteractionForce, Law, State, Traffic, make_law
+from nnode.model import Crowd, FollowTheLeader, InteractionForce, State, Traffic, make_law
 from nnode.model.build import add_effects, build_model
 from nnode.model.terms import REDUCED
 from tests.model.test_forces import people
@@ -140,8 +140,3 @@ def test_a_formula_of_more_than_the_gap_does_not_go_with_code() -> None:
     x = torch.zeros(1, 2, 1, dtype=torch.float64)
     with pytest.raises(ConfigError, match="cannot be mixed with terms that are code"):
         law(State(torch.zeros(()), x, None, None))  # type: ignore[arg-type]
-
-
-def test_a_network_of_people_has_one_number_of_inputs() -> None:
-    with pytest.raises(ConfigError, match=r"NN is called with \[1, 2\] inputs"):
-        Law({"parameters": {}, "rate": {"x": "NN(gap) + NN(gap, gap)"}}, "mine", hidden=2)

@@ -11,20 +11,19 @@ import pytest
 import torch
 
 from nnode.data.sequence import collate
-from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
-from nnode.simulation import FusedSolver, TorchdiffeqSolver
+from nnode.model.laws import NEURONS
+from nnode.simulation import TorchdiffeqSolver
+from tests.builders import lane
 from tests.model.following import (
     DT,
     accelerations,
     behind,
-    driven,
     each_follower,
     model,
     numbers,
     set_,
     states,
 )
-from tests.simulation.fused.compare import RungeKutta, difference, gradient
 
 #: Length of every vehicle here, m.
 LONG = 4.0
@@ -143,39 +142,6 @@ def test_a_network_beside_a_law_starts_as_nothing(law: str) -> None:
     np.testing.assert_allclose((found - alone)[free], 0.25, rtol=1e-9)
     assert free.sum() > 40
     assert standing[np.isfinite(alone)].all()
-
-
-COMPILED = [
-    pytest.param(name, marks=() if name in ("idm", "krauss") else pytest.mark.thorough)
-    for name in CAR_FOLLOWING_LAWS
-]
-
-
-@pytest.mark.parametrize("name", COMPILED)
-def test_the_compiled_gradient_is_that_of_the_discrete_scheme(name: str) -> None:
-    sizes = ((4, 16), (2, 9), (1, 4))
-    batch = collate([driven(DT * np.arange(k), *_slalom(n, k), LONG, f"p{n}") for n, k in sizes])
-    system = model(name)
-    if name in NEURONS:
-        with torch.no_grad():
-            for p in system.parameters():
-                p.mul_(0.1)
-    exact, wanted = gradient(
-        system,
-        RungeKutta(2) if system.step == "rk4" else TorchdiffeqSolver(None, "discrete", DT / 2),
-        batch,
-    )
-    found, own = gradient(system, FusedSolver(DT / 2), batch)
-    torch.testing.assert_close(found.x[batch.valid], exact.x[batch.valid], rtol=1e-12, atol=1e-10)
-    assert difference(own, wanted) < 1e-10
-    assert wanted.abs().max() > 0
-
-
-def _slalom(vehicles: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places and speeds of vehicles that all drive like a wave."""
-    t = DT * np.arange(samples)[:, None] - 0.3 * np.arange(vehicles)[::-1]
-    x = 12 * t + 2 * np.sin(t) + 22.3 * np.arange(vehicles)
-    return x, 12 + 2 * np.cos(t)
 
 
 #: Speed in equilibrium at a net gap s, solved for on paper.
@@ -312,9 +278,8 @@ def test_newell_drives_the_leader_s_path_later_and_farther_back(T: float) -> Non
         return 14 * t + np.where(t > 0, 5 * (1 - np.cos(0.7 * t)), 0.0)
 
     x = np.stack([lead(time - i * T) - i * (7 + LONG) for i in (3, 2, 1, 0)], 1)
-    v = np.full_like(x, 14.0)  # all that is read of it is the first one
     with torch.no_grad():
-        batch = collate([driven(time, x, v, LONG)])
+        batch = collate([lane(x, DT, v=14.0, length=LONG)])  # of v the first one is read
         found = TorchdiffeqSolver(None, "discrete", DT)(system, batch)
     assert np.ptp(x[:, -1] - 14 * time) > 8
     np.testing.assert_allclose(found.x[:, 0, :, 0], x, rtol=0, atol=1e-9)

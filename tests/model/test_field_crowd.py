@@ -23,9 +23,7 @@ R = 0.25
 
 def model(name: str, desired: str = "direction", **parameters: Any) -> Crowd:
     """A law of the field, with other values of some parameters."""
-    options = model_options(
-        {"term": "formula", "name": name, "law": PEDESTRIAN_LAWS[name]}, "measured"
-    )
+    options = model_options(name)
     found = build_model({**options, "desired": desired})
     assert isinstance(found, Crowd)
     with torch.no_grad():
@@ -99,9 +97,7 @@ def test_who_meets_nobody_walks_as_he_wants() -> None:
 
 
 def test_nothing_is_added_to_a_law_of_first_order() -> None:
-    options = model_options(
-        {"term": "formula", "name": "cfsm", "law": PEDESTRIAN_LAWS["cfsm"]}, "measured"
-    )
+    options = model_options("cfsm")
     with pytest.raises(ConfigError, match="first order"):
         build_model({**options, "effects": [{"name": "anticipation"}]})
     law = {**PEDESTRIAN_LAWS["cfsm"], "rate": {"x": "V*e_x", "y": "0*V"}}
@@ -222,8 +218,7 @@ def nearest(x: np.ndarray, wall: np.ndarray) -> tuple[np.ndarray, bool]:
 
 def by_walls(name: str, item: Sequence, **parameters: Any) -> np.ndarray:
     """(N, 2): what walls add to the rates."""
-    entry = {"term": "formula", "name": name, "law": PEDESTRIAN_LAWS[name]}
-    law = {**model_options(entry, "measured"), "desired": "direction"}
+    law = {**model_options(name), "desired": "direction"}
     found = rates(build_model(law), replace(item, walls=WALLS))
     bare = build_model({**law, "law": without_walls(PEDESTRIAN_LAWS[name])})
     np.testing.assert_array_equal(

@@ -227,15 +227,6 @@ def test_parameters_are_kept_non_negative() -> None:
     assert [term.A.item(), term.k.item(), term.kappa.item()] == [0.0, 2.0, 0.0]
 
 
-def test_box_bounds_both_networks() -> None:
-    term = make_law("network_force", hidden=4, box=0.5, generator=torch.Generator().manual_seed(0))
-    before = [p.detach().clone() for p in term.parameters()]
-    term.project_()
-    for p, old in zip(term.parameters(), before, strict=True):
-        assert torch.equal(p, old.clip(-0.5, 0.5))
-    assert max(p.abs().max() for p in term.parameters()) == 0.5
-
-
 @pytest.mark.parametrize(
     ("make", "name"),
     [

@@ -112,14 +112,6 @@ def test_box_bounds_the_weights_and_nothing_else() -> None:
     assert max(p.abs().max() for n, p in term.named_parameters() if n != "v0") == 0.25
 
 
-def test_without_a_box_weights_stay() -> None:
-    term = make_law("network_speed", hidden=4)
-    with torch.no_grad():
-        term.network.layers[0].weight.fill_(1e3)
-    term.project_()
-    assert torch.all(term.network.layers[0].weight == 1e3)
-
-
 def test_unknown_leader_is_refused() -> None:
     with pytest.raises(ValueError, match="leader=first"):
         Traffic([make_law("lin")], leader="first")

@@ -88,4 +88,3 @@ def test_without_interaction_it_is_its_drive() -> None:
             rtol=1e-12,
             atol=1e-12,
         )
-    torch.testing.assert_close(rates(model, batch), rates(same(), batch), rtol=1e-12, atol=1e-12)

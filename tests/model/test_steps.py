@@ -17,8 +17,8 @@ from nnode.model import Traffic, build_model, make_law
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.steps import METHODS, STAGES, stepped
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
-from tests.model.following import DT, behind, driven, model, numbers
-from tests.simulation.fused.compare import RungeKutta, difference, gradient
+from tests.builders import lane
+from tests.model.following import DT, behind, model, numbers
 
 #: A car that brakes with b m/s², whatever is ahead, and one that accelerates.
 BRAKE = {"parameters": {"b": "3 m/s²"}, "rate": {"v": "0*dv*b/gap - b"}}
@@ -27,16 +27,12 @@ SPEEDS = np.array([7.03, 0.2, 0.3, 0.0, 12.0, 1e-9])
 
 def alone(system: Traffic, speeds: Any, seconds: float, method: str | None) -> tuple[Any, Any]:
     """Places and speeds ``(K, B)`` of one car a platoon, each far behind its leader."""
-    time = DT * np.arange(round(seconds / DT) + 1)
+    time = DT * np.arange(round(seconds / DT) + 1)[:, None]
+    places = [np.array([0.0, 500.0]) + time * [v, 0.0] for v in speeds]
     batch = collate(
         [
-            driven(
-                time,
-                np.stack([v * time, 500 + 0 * time], 1),
-                np.stack([v + 0 * time, 0 * time], 1),
-                name=f"p{i}",
-            )
-            for i, v in enumerate(speeds)
+            lane(x, DT, v=[v, 0.0], name=f"p{i}")
+            for i, (x, v) in enumerate(zip(places, speeds, strict=True))
         ]
     )
     with torch.no_grad():
@@ -87,8 +83,7 @@ def test_an_acceleration_that_is_no_number_shows(method: str) -> None:
     time = DT * np.arange(8)
     near = np.stack([8 * time, 4 + 8 * time], 1)
     far = np.stack([8 * time, 4 + 16 * time], 1)
-    speeds = np.stack([0 * time + 8, 0 * time + 8], 1)
-    fine, bad = (collate([driven(time, x, speeds)]) for x in (near, far))
+    fine, bad = (collate([lane(x, DT, v=8.0)]) for x in (near, far))
     for solver in (TorchdiffeqSolver(method, "discrete", DT), FusedSolver(DT, method=method)):
         assert solver(broken, fine).x.isfinite().all()
         with pytest.raises(SimulationError, match="is not a finite number"):
@@ -127,7 +122,7 @@ def test_orders_of_accuracy_against_dop853() -> None:
     steps = [0.1, 0.05, 0.025]
     for step, method in itertools.product(steps, METHODS):
         time = step * np.arange(round(seconds / step) + 1)
-        batch = collate([driven(time, start + speed * time[:, None], speed + 0 * time[:, None])])
+        batch = collate([lane(start + speed * time[:, None], step, v=speed)])
         with torch.no_grad():
             found = TorchdiffeqSolver(method, "discrete", step)(system, batch).x[-1, 0, :2, 0]
         errors[method].append(float(np.abs(found.numpy() - exact.y[:2, -1]).max()))
@@ -136,23 +131,10 @@ def test_orders_of_accuracy_against_dop853() -> None:
         assert slopes[method] == pytest.approx(order, abs=0.3), (slopes, errors)
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("method", METHODS)
-def test_compiled_steps_and_their_gradient_are_those_of_a_loop(method: str) -> None:
-    system = model("idm")
-    batch = behind(lambda t: 6 * np.minimum(t, 1.2), [7.0, 9.0, 6.5], 2.5)
-    loop = RungeKutta() if method == "rk4" else TorchdiffeqSolver(method, "discrete", DT)
-    exact, wanted = gradient(system, loop, batch)
-    found, own = gradient(system, FusedSolver(DT, method=method), batch)
-    torch.testing.assert_close(found.x, exact.x, rtol=1e-12, atol=1e-11)
-    assert difference(own, wanted) < 1e-10
-    assert wanted.abs().max() > 0
-
-
 def test_speeds_are_stepped_as_they_are() -> None:
-    lane = Traffic([make_law("lin")]).formula
-    assert lane is not None
-    assert all(stepped(lane, method) is lane for method in METHODS)
+    formula = Traffic([make_law("lin")]).formula
+    assert formula is not None
+    assert all(stepped(formula, method) is formula for method in METHODS)
     assert set(STAGES) == set(METHODS)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize_scalar
-from torch.func import functional_call, vmap
+from torch.func import functional_call
 
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
@@ -232,23 +232,6 @@ def test_derivatives_are_those_of_differences(name: str) -> None:
         return found[BATCH.agent]
 
     assert torch.autograd.gradcheck(run, (x, v, *values), eps=1e-6, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", VALUES)
-def test_many_parameters_at_once(name: str) -> None:
-    effect, model = effect_of(name)
-    now = state(model)
-    factor = torch.tensor([0.5, 1.0, 1.3], dtype=torch.float64)
-    rows = {key: p.detach() * factor for key, p in effect.named_parameters()}
-
-    def run(row: dict[str, torch.Tensor]) -> torch.Tensor:
-        found: torch.Tensor = functional_call(effect, row, (now,))
-        return found
-
-    together = vmap(run)(rows)
-    for r in range(3):
-        alone = run({key: value[r] for key, value in rows.items()})
-        torch.testing.assert_close(together[r], alone, rtol=1e-12, atol=1e-12)
 
 
 def moved(angle: float, shift: tuple[float, float]) -> Callable[[np.ndarray], np.ndarray]:

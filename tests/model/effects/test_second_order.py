@@ -14,7 +14,6 @@ from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import build_model
 from nnode.model.effects import CATALOGUE
-from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulation import TorchdiffeqSolver
 from tests.builders import lane
 from tests.model.following import DT, accelerations, behind, model, numbers
@@ -285,8 +284,6 @@ PUSH = {"parameters": {"c": "1 m/s²", "T": "1 s"}, "rate": {"v": "c*late/v"}}
         ({"delayed": {"late": ["v_1", "m/s", "c"]}}, r"the delay of late .*m/s².*expected s"),
         ({"delayed": {"late": ["v_1", "m/s"]}}, r"must be \[formula, unit, delay\]"),
         ({"delayed": {"late": "v_1"}}, r"model\.law\.delayed\.late=v_1 must be"),
-        ({"delayed": {"late": ["open('x')", "m/s", "T"]}}, "there is no function open"),
-        ({"delayed": {"late": ["v_1.real", "m/s", "T"]}}, "not allowed"),
         ({"delayed": {"late": ["v_1", "m/s", "__import__('os')"]}}, "no function __import__"),
         ({"delayed": {"late": ["v_1", "os.system('x')", "T"]}}, "no unit"),
         ({"states": {"late": ["m/s", "v_1/T", "gap"]}}, "late of mine at the start"),
@@ -314,8 +311,3 @@ def test_networks_in_formulas_need_their_size() -> None:
     twice = {**law, "rate": {"v": "c*NN(gap/20) - c*NN(v/10, dv/2)"}}
     with pytest.raises(ConfigError, match=r"NN is called with \[1, 2\] inputs"):
         model(twice, network=3)
-
-
-def test_a_law_with_an_unknown_entry_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"unknown entries delay; there are .*delayed"):
-        model({**CAR_FOLLOWING_LAWS["idm"], "delay": {}})

@@ -10,7 +10,6 @@ from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import System, build_model
-from nnode.model.laws import PEDESTRIAN_LAWS
 from nnode.simulation import FusedSolver
 from tests.simulation.test_engines import OWN_FORCES, room
 
@@ -58,9 +57,7 @@ def test_the_first_of_several_has_the_slope() -> None:
 
 
 def test_derivatives_of_a_law_with_a_smallest_value() -> None:
-    options = model_options(
-        {"term": "formula", "name": "c", "law": PEDESTRIAN_LAWS["cfsm"]}, "measured"
-    )
+    options = model_options("cfsm")
     model, one = build_model({**options, "desired": "direction"}), room().select([1])
     scene, zero = model.scene(one), torch.zeros((), dtype=torch.float64)
     y = model.initial(one).requires_grad_()

@@ -8,21 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from nnode.data.sequence import collate
 from nnode.errors import ConfigError
 from nnode.model import Traffic, build_model, make_law
-from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.kernels import lanes
+from tests.builders import lane
+from tests.model.following import model
 from tests.simulation.fused.compare import difference, gradient, single
 
 DT = 0.02
-IDM = {
-    "term": "formula",
-    "name": "idm",
-    "leader": "measured",
-    "effects": [],
-    "law": CAR_FOLLOWING_LAWS["idm"],
-}
 OWN = {
     "term": "formula",
     "name": "mine",
@@ -63,12 +58,12 @@ def loop(batch: Any, b: int, row: list[float], per: int, ballistic: bool) -> np.
 
 @pytest.mark.parametrize("method", ["euler", "ballistic"])
 def test_the_intelligent_driver_is_what_its_formula_says(method: str, ragged: Any) -> None:
-    batch, system = single(ragged), build_model(IDM)
+    batch, system = single(ragged), model("idm")
     row = [float(p.detach()) for _, p in system.named_parameters()]
     assert list(system.physical()) == [f"idm.{name}" for name in ("v0", "T", "s0", "a", "b")]
-    lane = lanes.supports(system, batch)
-    assert lane is not None
-    y = lanes.simulate(system, lane, batch, 10, method=method)[:, 0]
+    formula = lanes.supports(system, batch)
+    assert formula is not None
+    y = lanes.simulate(system, formula, batch, 10, method=method)[:, 0]
     x, v = system.observe(y, batch)
     assert v is not None
     for b in range(len(batch.names)):
@@ -79,15 +74,12 @@ def test_the_intelligent_driver_is_what_its_formula_says(method: str, ragged: An
 
 def test_a_platoon_keeps_the_gap_of_equilibrium() -> None:
     """At speed v the gap is (s0 + v T) / sqrt(1 - (v / v0)^4)."""
-    system = build_model(IDM)
+    system = model("idm")
     v, (v0, T, s0) = 15.0, (30.0, 1.2, 2.0)
     gap = (s0 + v * T) / np.sqrt(1 - (v / v0) ** 4)
     assert idm(v, gap, 0.0, [v0, T, s0, 1.3, 1.7]) == pytest.approx(0, abs=1e-14)
-    from nnode.data.sequence import Sequence, collate
-
-    time = 0.1 * np.arange(50)
-    x = (np.array([0.0, gap, 2 * gap])[None] + v * time[:, None])[..., None]
-    batch = collate([Sequence(name="a", recording="a", time=time, x=x)])
+    x = np.array([0.0, gap, 2 * gap]) + v * 0.1 * np.arange(50)[:, None]
+    batch = collate([lane(x, 0.1)])
     with torch.no_grad():
         found = FusedSolver(0.01)(system, batch).x
     np.testing.assert_allclose(found.numpy(), batch.x.numpy(), rtol=0, atol=1e-9)

@@ -17,7 +17,8 @@ from nnode.model.arrays import Formulas
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.tangent import with_tangents
 from nnode.simulation.kernels import lanes
-from tests.model.following import DT, driven, model, set_
+from tests.builders import lane
+from tests.model.following import DT, model, set_
 from tests.simulation.kernels.interpreted import interpreted
 
 
@@ -27,7 +28,7 @@ def platoons(numbers: tuple[int, ...] = (4, 2, 3)) -> Batch:
     for i, n in enumerate(numbers):
         t = DT * np.arange(9 - 2 * i)[:, None] - 0.3 * np.arange(n)[::-1]
         x = 12 * t + 2 * np.sin(t + i) + (22.3 + i) * np.arange(n)
-        found.append(driven(DT * np.arange(len(t)), x, 12 + 2 * np.cos(t + i), 4.0, f"p{i}"))
+        found.append(lane(x, DT, v=12 + 2 * np.cos(t + i), length=4.0, name=f"p{i}"))
     return collate(found)
 
 
@@ -40,9 +41,9 @@ def tangents(
     system: Traffic, batch: Batch, names: list[str], each: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Places ``(K, B, N)`` and their derivatives ``(P, K, B, N)``."""
-    lane = lanes.supports(system, batch)
-    assert lane is not None
-    states, slopes = lanes.tangents(system, lane, batch, 2, names, each=each)
+    formula = lanes.supports(system, batch)
+    assert formula is not None
+    states, slopes = lanes.tangents(system, formula, batch, 2, names, each=each)
     return states[..., 0], slopes[..., 0]
 
 
@@ -93,11 +94,11 @@ def test_every_sequence_with_parameters_of_its_own() -> None:
 
 def test_their_formulas_are_the_slopes_of_the_rate() -> None:
     """Of v0 (1 - L/gap): by v0 the rate 1 - L/gap and v0 L/gap² times the gap's own tangent."""
-    lane = linear().formula
-    assert lane is not None
-    twice = with_tangents(lane, ("lin__v0", "lin__L"))
+    once = linear().formula
+    assert once is not None
+    twice = with_tangents(once, ("lin__v0", "lin__L"))
     assert list(twice.rates) == ["x", "x__d0", "x__d1"]
-    assert twice.rates["x"] is lane.rates["x"]
+    assert twice.rates["x"] is once.rates["x"]
     given = {
         "x": 3.0,
         "x_1": 23.0,
