@@ -21,20 +21,16 @@ from tests.builders import linear
 LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0, "L_min": 2.0}
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    """See :func:`write_platoons`."""
-    return write_platoons(tmp_path / "store")
-
-
-def write_platoons(folder: Path) -> Store:
+@pytest.fixture(scope="session")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     """Seven platoons of two to four cars over 1 s, v0 = 22 m/s and L = 4 m."""
     rng = np.random.default_rng(1)
     starts = [np.cumsum(rng.uniform(8, 30, rng.integers(2, 5))) for _ in range(7)]
+    folder = tmp_path_factory.mktemp("platoons") / "store"
     return write_store(folder, linear(starts, 22, 4, 6, 0.002), {"dt": 0.2, "files": {}})
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_trainer(store: Store) -> Callable[..., Trainer]:
     """Build a trainer in a folder; all randomness from its seed."""
 

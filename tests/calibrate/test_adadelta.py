@@ -69,17 +69,6 @@ def test_with_a_vanishing_eps_it_is_torch_s_adadelta() -> None:
     torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=0)
 
 
-def test_eps_stands_outside_the_root() -> None:
-    eps, rho, g = 1e-2, 0.95, 0.3
-    p, q = parameter(0.0), parameter(0.0)
-    ours = descend(NoisyAdadelta([p], rho=rho, eps=eps, eta1=0.0), p, np.array([[g]]))
-    theirs = descend(torch.optim.Adadelta([q], rho=rho, eps=eps), q, np.array([[g]]))
-    square = (1 - rho) * g**2
-    ratio = math.sqrt(square + eps) / (math.sqrt(square) + eps)
-    assert (ours / theirs).item() == pytest.approx(ratio, rel=1e-13)
-    assert abs(ratio - 1) > 0.1
-
-
 def noise_of_step(n: int, k: int, **options: Any) -> np.ndarray:
     """The n noise values added to a zero gradient in step k."""
     p = nn.Parameter(torch.zeros(n, dtype=torch.float64))

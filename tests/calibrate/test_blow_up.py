@@ -12,11 +12,11 @@ import torch
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import SimulationError
-from nnode.model import build_model
+from nnode.model import Crowd, build_model
 from nnode.simulation import Solver, TorchdiffeqSolver
 from nnode.simulation.base import Trajectory
 from nnode.simulation.fused import FusedSolver
-from tests.builders import lane
+from tests.builders import lane, social_forces
 
 SOLVERS = [
     pytest.param(lambda dt: TorchdiffeqSolver(gradient="discrete", dt=dt), id="torchdiffeq"),
@@ -56,22 +56,7 @@ def test_people_who_stand_in_one_place_give_numbers(solver: Any) -> None:
     x = np.zeros((5, 3, 2))
     x[:, 2, 0] = 1.0 + time
     batch = collate([Sequence(name="hall/1", recording="hall", time=time, x=x)])
-    model = build_model(
-        {
-            "term": "social_force",
-            "name": "sf",
-            "A": 5.0,
-            "k": 5.0,
-            "kappa": 5.0,
-            "B": 0.3,
-            "r": 0.25,
-            "tau": 0.5,
-            "mass": 1.0,
-            "walls": False,
-            "opposing_wall_friction": False,
-            "wall_spacing": 0.5,
-        }
-    )
+    model = Crowd(social_forces(A=5.0, k=5.0, kappa=5.0, B=0.3, walls=False))
     solve: Solver = solver(0.05)
     found = evaluate(lambda b: solve(model, b), [batch])
     assert math.isfinite(found.J)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 import zipfile
 from collections.abc import Callable
 from dataclasses import fields
@@ -19,11 +20,18 @@ from nnode.errors import CheckpointError, WriteError
 Make = Callable[..., Trainer]
 
 
-@pytest.fixture
-def saved(make_trainer: Make, tmp_path: Path) -> Path:
-    trainer = make_trainer(tmp_path, max_epochs=2)
+@pytest.fixture(scope="module")
+def trained(make_trainer: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The last checkpoint of a training, which no test changes."""
+    trainer = make_trainer(tmp_path_factory.mktemp("trained"), max_epochs=2)
     trainer.fit()
     return trainer.last_path
+
+
+@pytest.fixture
+def saved(trained: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return shutil.copytree(trained.parent, tmp_path / "checkpoints") / trained.name
 
 
 def test_load_rebuilds_the_model_alone(saved: Path) -> None:

@@ -22,21 +22,13 @@ from tests.calibrate.together import CASES, make_trainer, numbers
 
 
 @pytest.fixture(scope="module")
-def platoons(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    """Seven platoons of two to four cars."""
-    from tests.calibrate.conftest import write_platoons
-
-    return write_platoons(tmp_path_factory.mktemp("platoons") / "store")
-
-
-@pytest.fixture(scope="module")
-def together(platoons: Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def together(store: Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of two processes that have calibrated all cases together."""
     folder = tmp_path_factory.mktemp("together")
     worker = Path(__file__).with_name("together.py")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     done = subprocess.run(
-        [*command, str(worker), str(platoons.folder), str(folder)],
+        [*command, str(worker), str(store.folder), str(folder)],
         env={**environment(), "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
@@ -56,14 +48,14 @@ def processes(folder: Path) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("case", CASES)
 def test_two_processes_end_where_one_ends(
-    together: Path, platoons: Store, tmp_path: Path, case: str
+    together: Path, store: Store, tmp_path: Path, case: str
 ) -> None:
-    alone = make_trainer(case, platoons, tmp_path)
+    alone = make_trainer(case, store, tmp_path)
     alone.fit()
     expected = numbers(alone)
     assert alone.step >= 8
     start = torch.cat(
-        [p.detach().flatten() for p in make_trainer(case, platoons, tmp_path).model.parameters()]
+        [p.detach().flatten() for p in make_trainer(case, store, tmp_path).model.parameters()]
     )
     moved = (torch.tensor(expected["parameters"]) - start).abs().max()
     assert moved > 1e-2  # otherwise agreement would mean nothing
@@ -93,12 +85,12 @@ def test_an_error_in_one_process_is_raised_in_both(together: Path) -> None:
 
 
 def test_a_signal_to_one_process_stops_both_at_the_same_step(
-    together: Path, platoons: Store, tmp_path: Path
+    together: Path, store: Store, tmp_path: Path
 ) -> None:
     for found in processes(together):
         assert found["interrupted"] == [4, signal.SIGTERM]
     # and one process goes on to the same end
-    again = make_trainer("adadelta", platoons, tmp_path)
+    again = make_trainer("adadelta", store, tmp_path)
     again.restore(together / "interrupted" / "checkpoints" / "last.pt")
     assert again.step == 4
     again.fit()

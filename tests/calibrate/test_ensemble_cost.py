@@ -127,13 +127,3 @@ def test_a_sequence_without_weight_cannot_spoil_a_gradient(
     alone, slope = EnsembleCost(system, single.select([0]), FusedSolver(DT))(row)
     torch.testing.assert_close(value, alone)
     torch.testing.assert_close(gradient, slope, rtol=1e-5, atol=1e-5)
-
-
-def test_selected_sequences_cost_the_same(batch: Batch) -> None:
-    row = ParameterVector(build_model(LIN)).row[None]
-    each = EnsembleCost(build_model(LIN), batch, FusedSolver(DT)).costs(row)
-    for i in (0, 1):
-        part = batch.select([i])
-        assert part.names == (batch.names[i],)
-        one = EnsembleCost(build_model(LIN), part, FusedSolver(DT)).costs(row)
-        torch.testing.assert_close(one[:, 0], each[:, i])

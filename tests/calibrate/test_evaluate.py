@@ -20,7 +20,7 @@ from nnode.calibrate.evaluate import (
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver, Trajectory
-from tests.builders import lane, straight
+from tests.builders import lane, social_forces, straight
 
 
 def traffic(name: str, x: list[list[float]], dt: float = 0.5) -> Sequence:
@@ -177,9 +177,7 @@ def walkers() -> Sequence:
 
 
 def touchy() -> Crowd:
-    return Crowd(
-        [make_law("relaxation", tau=0.5), make_law("social_force", A=1.0, k=40.0, kappa=9.0)]
-    )
+    return Crowd(social_forces(A=1.0, k=40.0))
 
 
 def test_both_baselines_are_exact_on_people_walking_straight() -> None:

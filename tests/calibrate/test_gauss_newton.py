@@ -13,22 +13,17 @@ from nnode.calibrate.problem import ResidualProblem, alone, pooled
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.errors import ConfigError
 from nnode.model import System, Traffic, build_model
-from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.term import State, Term
 from nnode.simulation import FusedSolver, TorchdiffeqSolver, Trajectory
+from tests.model import following
+from tests.model.following import set_
 from tests.simulation.fused.compare import RungeKutta
 
 TRUE = {"v0": 25.0, "T": 1.4, "s0": 3.0, "a": 1.1, "b": 2.0}
 
 
 def model(**values: float) -> System:
-    system = build_model(
-        {"term": "formula", "name": "idm", "leader": "measured", "law": CAR_FOLLOWING_LAWS["idm"]}
-    )
-    with torch.no_grad():
-        for name, value in values.items():
-            getattr(system.terms[0], name).fill_(value)
-    return system
+    return set_(following.model("idm"), **values)
 
 
 @pytest.fixture(scope="module")

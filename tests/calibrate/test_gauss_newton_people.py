@@ -22,6 +22,7 @@ from nnode.model import System
 from nnode.model.build import build_model
 from nnode.simulation import FusedSolver
 from nnode.simulation.ode import Rates
+from tests.builders import straight
 
 TRUTH = (0.5, 40.0, 12.0)
 
@@ -33,18 +34,14 @@ def social(A: float, k: float, kappa: float) -> System:
 def crowd(seed: int) -> Sequence:
     """People who meet, bump into each other and walk on, by the model of :data:`TRUTH`."""
     rng = np.random.default_rng(seed)
-    time = 0.05 * np.arange(25)
     start = rng.uniform([0.0, -0.5], [3.0, 0.5], (6, 2))
     speed = np.where(np.arange(6)[:, None] < 3, [1.2, 0.0], [-1.2, 0.0]) * rng.uniform(0.8, 1.2)
-    plain = Sequence(
-        name=f"s{seed}",
-        recording=f"r{seed}",
-        time=time,
-        x=start + time[:, None, None] * speed,
-        v=np.broadcast_to(speed, (25, 6, 2)).copy(),
-        agents=tuple(f"{seed}-{n}" for n in range(6)),
-        destination=start + 10 * speed,
-    )
+    names = {
+        "name": f"s{seed}",
+        "recording": f"r{seed}",
+        "agents": tuple(f"{seed}-{n}" for n in range(6)),
+    }
+    plain = straight(start, speed, 25, 0.05, destination=start + 10 * speed, **names)
     batch = collate([plain])
     with torch.no_grad():
         found = FusedSolver()(social(*TRUTH), batch)

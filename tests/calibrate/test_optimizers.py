@@ -14,7 +14,6 @@ from nnode.calibrate.optimizers import (
     LbfgsOptions,
     OptimizerOptions,
     build_optimizer,
-    needs_full_batch,
 )
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.data.sequence import Batch, collate
@@ -96,11 +95,6 @@ def test_the_seed_reaches_the_optimiser() -> None:
     ]
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], states[2])
-
-
-@pytest.mark.parametrize(("name", "full"), [("adadelta", False), ("adam", False), ("lbfgs", True)])
-def test_who_compares_costs_of_different_steps(name: str, full: bool) -> None:
-    assert needs_full_batch(name) is full
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 import nnode
 from nnode.calibrate.cost import Convention
@@ -17,20 +16,16 @@ from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.simulation import FusedSolver
-from studies.following.candidates import EVERY
 from tests.app.following import pairs
-from tests.studies.following.test_fit import HELLY, driven
+from tests.calibrate.test_start_speeds import known
+from tests.studies.following.test_fit import driven
 
 TIME_GAPS = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
 
 
 def own(kind: Pooling, sequences: list[Sequence]) -> SequenceParameters:
-    system = EVERY["helly"].system()
-    with torch.no_grad():
-        for name, value in HELLY.items():
-            getattr(system.terms[0], name).fill_(value)
     cost = partial(ResidualProblem, solver=FusedSolver(), convention=Convention.spacing)
-    return sequence_parameters(kind, system, sequences, cost, seed=0)
+    return sequence_parameters(kind, known(), sequences, cost, seed=0)
 
 
 def test_drivers_who_differ_are_told_apart() -> None:
