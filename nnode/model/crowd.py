@@ -5,19 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nnode.model.term import State
 from nnode.model.terms import SMOOTHING
-
-
-def velocity(state: State) -> Tensor:
-    """``(B, N, 2)`` m/s.
-
-    Raises:
-        ValueError: the model is of first order.
-    """
-    if state.v is None:
-        raise ValueError("a term of a second-order model needs velocities")
-    return state.v
 
 
 def norm(vector: Tensor) -> Tensor:

@@ -27,34 +27,31 @@ _FORMULAS: dict[tuple[Any, ...], Any] = {}
 
 def lane_of(terms: Sequence[Term]) -> LaneDynamics | None:
     """The formula of a lane with these terms; None where one is code without a formula."""
-    if not terms or not isinstance(terms[0], Law) or terms[0].rule is None:
+    law = terms[0] if terms else None
+    if not isinstance(law, Law) or any(isinstance(term, Law) for term in terms[1:]):
         return None
-    order = terms[0].order
-    if any(isinstance(e, Law) or e.rule_for(order) is None for e in terms[1:]):
-        return None
-    key = tuple(term.shape for term in terms)
-    if key not in _FORMULAS:
-        lane = LaneDynamics(order=order)
-        for place, (term, owner) in enumerate(zip(terms, owners(terms), strict=True)):
-            lane = with_term(lane, term, owner, place)
-        _FORMULAS[key] = lane.flat()
-    lane_formula: LaneDynamics = _FORMULAS[key]
-    return lane_formula
+    lane: LaneDynamics | None = _composed(LaneDynamics(order=law.order), terms)
+    return lane
 
 
 def crowd_of(terms: Sequence[Term]) -> CrowdDynamics | None:
     """The formula of a crowd with these terms; None where one is code without a formula."""
-    if any(term.rule_for(2) is None for term in terms):
+    law: CrowdDynamics | None = _composed(CrowdDynamics(), terms)
+    return law if law is not None and law.is_formula else None
+
+
+def _composed(model: Any, terms: Sequence[Term]) -> Any:
+    """The flat formulas of terms, added to an empty model; None where one has no formula."""
+    if any(term.rule_for(model.order) is None for term in terms):
         return None
     key = tuple(term.shape for term in terms)
     if key not in _FORMULAS:
-        law, names = CrowdDynamics(), owners(terms)
+        names = owners(terms)
         # laws come first, so that effects can use them whatever the order of the terms
         for i, term in sorted(enumerate(terms), key=lambda it: not isinstance(it[1], Law)):
-            law = with_term(law, term, names[i], i)
-        _FORMULAS[key] = law.flat() if law.is_formula else None
-    crowd_formula: CrowdDynamics | None = _FORMULAS[key]
-    return crowd_formula
+            model = with_term(model, term, names[i], i)
+        _FORMULAS[key] = model.flat()
+    return _FORMULAS[key]
 
 
 def with_term(model: Any, term: Term, owner: str, place: int, called: bool = False) -> Any:

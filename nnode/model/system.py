@@ -90,16 +90,11 @@ class System(nn.Module):
     @property
     def memory(self) -> int:
         """Number M of the states that terms add."""
-        rules = (term.rule_for(self.order) for term in self.term_list)
-        return sum(rule.memory for rule in rules if rule is not None)
+        return sum(term.n_states(self.order) for term in self.term_list)
 
     def _added(self, batch: Batch, step: float | None) -> list[Tensor]:
         """One array ``(B, N, M)`` of the terms' states at the start, or none."""
         return []
-
-    def acceleration(self, state: State) -> Tensor:
-        """``(B, N, D)``: the sum of all terms, m/s (first order) or m/s² (second order)."""
-        return self._rates(state)
 
     def observe(self, y: Tensor, batch: Batch) -> tuple[Tensor, Tensor | None]:
         """Positions and, in second-order models, velocities of the states at the samples."""
@@ -126,8 +121,7 @@ class System(nn.Module):
         terms, total, first = self.term_list, torch.zeros_like(state.x), 0
         added: list[Tensor] = []
         for term in terms:
-            rule = term.rule_for(self.order)
-            number = 0 if rule is None else rule.memory
+            number = term.n_states(self.order)
             own = slice(first, first + number)
             term_memory = memory[..., own] if memory is not None and number else None
             first = own.stop
@@ -218,14 +212,9 @@ class Traffic(System):
         terms, lane, scene = self.term_list, self.formula, self.scene(batch)
         scene = scene if step is None else replace(scene, step=step)
         if lane is None:  # terms without states do not affect the start values
-            rules = [term.rule_for(self.order) for term in terms]
-            added = [
-                term
-                for term, rule in zip(terms[1:], rules[1:], strict=True)
-                if rule is not None and rule.memory
-            ]
-            lane = lane_of([terms[0], *added])
+            added = [term for term in terms[1:] if term.n_states(self.order)]
             terms = [terms[0], *added]
+            lane = lane_of(terms)
         models = [(terms, lane)]
         if lane is None:
             models = [([terms[0], term], effect_alone(terms[0], term)) for term in added]

@@ -42,13 +42,20 @@ class State:
     measured_others: tuple[Tensor, Tensor] | None = None
 
     @property
-    def others(self) -> tuple[Tensor, Tensor]:
-        """Positions and velocities of the others, ``(B, N, D)`` each."""
-        if self.measured_others is not None:
-            return self.measured_others
+    def velocity(self) -> Tensor:
+        """``(B, N, D)`` m/s.
+
+        Raises:
+            ValueError: the model is of first order.
+        """
         if self.v is None:
             raise ValueError("a term of a second-order model needs velocities")
-        return self.x, self.v
+        return self.v
+
+    @property
+    def others(self) -> tuple[Tensor, Tensor]:
+        """Positions and velocities of the others, ``(B, N, D)`` each."""
+        return (self.x, self.velocity) if self.measured_others is None else self.measured_others
 
 
 @dataclass(frozen=True)
@@ -138,6 +145,11 @@ class Term(nn.Module):
     def rule_for(self, order: int) -> Rule | None:
         """Its formulas in a model of an order; None if there are none."""
         return self.rules.get(order)
+
+    def n_states(self, order: int) -> int:
+        """Number of states that it adds to each agent of a model of an order."""
+        rule = self.rule_for(order)
+        return 0 if rule is None else rule.memory
 
     @classmethod
     def formula_for(cls, order: int) -> str:

@@ -103,19 +103,18 @@ def variations(population: Population) -> dict[str, dict[str, Any]]:
     units = ["m/s" if order == 1 else "m/s²", "s", "m", "m", "s"][: len(noise)]
     shrinkage = [np.nan] * len(noise) + list(np.median(population.marginal.shrinkage, 0))
     ends = deviation_intervals(population)
+    logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
+    bounds = np.where(low < high, at_bounds(logs, low, high, NEAR), "")
     table: dict[str, dict[str, Any]] = {}
     # the standard deviations of starts come after these
     for k, name in enumerate([*noise, *drivers]):
-        value, lowest, highest = variances.row[k], variances.low[k], variances.high[k]
-        factor = 1.0 if k < len(noise) else 100.0
-        logs = (np.log(number) for number in (value, lowest, highest))
-        bound = at_bounds(*logs, near=NEAR) if lowest < highest else ""
+        value, factor = variances.row[k], 1.0 if k < len(noise) else 100.0
         table[name] = {
             "estimate": float(factor * value),
             "lower": float(factor * ends[k, 0]),
             "upper": float(factor * ends[k, 1]),
             "unit": units[k] if k < len(noise) else "%",
-            "at_bound": str(bound),
+            "at_bound": str(bounds[k]),
             "shrinkage": float(shrinkage[k]),
         }
     return table

@@ -22,7 +22,7 @@ from nnode.discover.statistics.score import traces
 from nnode.errors import ConfigError
 from nnode.model import Crowd, System, Traffic, make_law
 from nnode.model.build import build_model
-from nnode.model.crowd import norm, velocity
+from nnode.model.crowd import norm
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect, Probe, Setting, Strength
 from nnode.model.effects.crowd import GaitSway, heading
 from nnode.model.effects.lane import DriverHeterogeneity, Inertia, SpeedZone, gaps
@@ -70,7 +70,7 @@ class Stride(IndividualEffect):
         phase, there = self.agent_numbers(state.scene, state.x)
         clock = (state.scene.start + state.t)[:, None]
         size = self.a * torch.sin(2 * torch.pi * clock + phase) * there
-        return size[..., None] * heading(velocity(state))
+        return size[..., None] * heading(state.velocity)
 
 
 class Limit(Effect):
@@ -85,7 +85,7 @@ class Limit(Effect):
     v_max: Tensor
 
     def forward(self, state: State) -> Tensor:
-        v = velocity(state)
+        v = state.velocity
         return -(norm(v) - self.v_max).clamp(min=0)[..., None] * heading(v)
 
 

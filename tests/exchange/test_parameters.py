@@ -24,7 +24,6 @@ from nnode.exchange.sumo import equilibrium_gap, has_type, sumo_type, traffic_of
 from nnode.model import Crowd, System, Traffic, make_law
 from nnode.model.build import add_effects
 from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, law_from
-from nnode.model.term import State
 
 SCENES = Scenes(people=12.0, points=50.0, spacing=0.25, speed=1.3)
 
@@ -259,9 +258,7 @@ def test_the_time_gap_s_equilibrium_is_the_model_s(h: float) -> None:
     x = np.array([0.0, gap, gap + lead])[None, :, None] + 12 * 0.1 * np.arange(3)[:, None, None]
     batch = collate([Sequence(name="a", recording="a", time=0.1 * np.arange(3), x=x)])
     model.leader = "measured"
-    scene = model.scene(batch)
-    state = State(torch.tensor(0.0), batch.x[0], None, scene)
-    rate = model.acceleration(state).detach()[0, :, 0]
+    rate = model(torch.tensor(0.0), batch.x[0], model.scene(batch)).detach()[0, :, 0]
     np.testing.assert_allclose(rate[:2], 12.0)
 
 

@@ -135,7 +135,7 @@ def test_discrete_gradient_in_crowds(crowd) -> None:  # type: ignore[no-untyped-
 def test_adjoint_gradient_in_crowds_deviates_at_first_order(crowd) -> None:  # type: ignore[no-untyped-def]
     model = people()
     # at 0.35 m neighbours stay in contact all the time: no kink is crossed
-    batch, number = collate([crowd(3, samples=3, apart=0.35)]), np.array([64, 128, 256])
+    batch, number = collate([crowd(3, samples=3, apart=0.35)]), np.array([32, 64, 128])
     deviation = []
     for n in number:
         discrete, adjoint = (gradient(model, batch, kind, 0.2 / n) for kind in KINDS)

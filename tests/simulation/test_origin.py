@@ -42,7 +42,7 @@ def people(shift: float = 0.0) -> Sequence:
 
 
 def cars(shift: float = 0.0, number: int = 5) -> Sequence:
-    time = 0.2 * np.arange(76)[:, None]
+    time = 0.2 * np.arange(36)[:, None]
     x = 25.0 * np.arange(number) + 15 * time + 8 * np.sin(time / 4)
     return lane(x + shift, name=f"cars {number}")
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nnode.discover.residuals.variables import Variable, clock, knots_of, since_start, waves_of
-from nnode.model.crowd import dot, norm, velocity
+from nnode.model.crowd import dot, norm
 from nnode.model.crowd_formula import walls_of
 from nnode.model.effects.crowd import heading
 from nnode.model.term import State
@@ -29,11 +29,11 @@ FAR = 1e4
 
 
 def _ahead(state: State) -> Tensor:
-    return heading(velocity(state))
+    return heading(state.velocity)
 
 
 def _left(state: State) -> Tensor:
-    return -right_of(heading(velocity(state)))
+    return -right_of(heading(state.velocity))
 
 
 def _along(axis: int) -> Of:
@@ -87,7 +87,7 @@ def _density(state: State) -> Tensor:
 
 
 def _speed(state: State) -> Tensor:
-    return torch.linalg.vector_norm(velocity(state), dim=-1)
+    return torch.linalg.vector_norm(state.velocity, dim=-1)
 
 
 def _nearest_wall(state: State) -> tuple[Tensor, Tensor]:
@@ -192,7 +192,7 @@ class Neighbours:
     @classmethod
     def of(cls, state: State) -> Neighbours:
         """Everyone's neighbours, where ``state.others`` has them."""
-        x, v = state.x, velocity(state)
+        x, v = state.x, state.velocity
         neighbour_positions, neighbour_velocities = state.others
         dx = x[:, :, None] - neighbour_positions[:, None]
         d = norm(dx)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -206,13 +207,9 @@ class VehicleClass(LaneEffect):
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
-        counts: dict[str, int] = {}
-        for names in batch.kind:
-            for name in names or ():
-                counts[name] = counts.get(name, 0) + bool(name)
+        counts = Counter(name for names in batch.kind for name in names or () if name)
         # the law describes the most frequent class
-        others = sorted((kind for kind in counts if kind), key=lambda kind: -counts[kind])[1:]
-        return [Probe({"kind": kind}, {"phi": -0.1}) for kind in others]
+        return [Probe({"kind": kind}, {"phi": -0.1}) for kind, _ in counts.most_common()[1:]]
 
     def options(self) -> dict[str, Any]:
         return {"kind": self.kind, **super().options()}

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from nnode.errors import ConfigError
 from nnode.model.arrays import Code, Formulas
-from nnode.model.crowd import velocity
 from nnode.model.crowd_formula import rates_of, settings_of
 from nnode.model.expression import Expr, call, const, substitute, symbol, symbols
 from nnode.model.names import check_names
@@ -577,7 +576,7 @@ class InteractionForce(Law):
 
     def components(self, state: State) -> dict[str, Tensor]:
         """``pair`` and ``wall`` accelerations, ``(B, N, 2)`` m/s² each."""
-        x, v, scene = state.x, velocity(state), state.scene
+        x, v, scene = state.x, state.velocity, state.scene
         other, speed = state.others
         dx, dv = x[:, :, None] - other[:, None], v[:, :, None] - speed[:, None]
         apart = ~torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
