@@ -15,7 +15,7 @@ from nnode.data.dataset import SequenceDataset, make_loader
 from nnode.data.options import LoaderOptions
 from nnode.data.store import Store, write_store
 from nnode.model import build_model
-from nnode.simulation import TorchdiffeqSolver
+from nnode.simulation import FusedSolver
 from tests.builders import linear
 
 LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0, "L_min": 2.0}
@@ -55,7 +55,7 @@ def make_trainer(store: Store) -> Callable[..., Trainer]:
         config = {"model": LIN, "seed": seed, "trainer": {"dtype": "float64"}}
         return Trainer(
             model,
-            TorchdiffeqSolver(dt=dt),
+            FusedSolver(dt),
             build_optimizer(model, chosen, seed),
             train,
             heldout,

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nnode.calibrate import resampling
 from nnode.calibrate.resampling import average_interval, group_weights, holm, paired
+
+
+@pytest.fixture
+def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Enough for frequencies over hundreds of data sets."""
+    monkeypatch.setattr(resampling, "DRAWS", 500)
 
 
 def clustered(
@@ -26,6 +33,7 @@ def test_weights_take_groups_as_a_whole() -> None:
         assert (np.ptp(weights[:, same], axis=1) == 0).all()
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     rng = np.random.default_rng(3)
     inside = naive = 0
@@ -50,6 +58,7 @@ def test_paired_differences() -> None:
     assert one.low == pytest.approx(-1.0)
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_false_alarms_are_as_frequent_as_stated() -> None:
     rng = np.random.default_rng(6)
     p = []
