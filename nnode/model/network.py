@@ -48,15 +48,10 @@ class FeedForward(nn.Module):
         self.layers = nn.ModuleList(
             nn.Linear(n_in, n_out, dtype=torch.float64) for n_in, n_out in pairwise(sizes)
         )
-        self.reset_parameters(generator)
-
-    @torch.no_grad()
-    def reset_parameters(self, generator: torch.Generator | None = None) -> None:
-        """Draw all weights, uniform on [-1, 1]."""
         for weight in self.parameters():
             # drawn in float64, so that a seed gives the same start in every precision
             draw = torch.rand(weight.shape, generator=generator, dtype=torch.float64)
-            weight.copy_(2 * draw - 1)
+            weight.data.copy_(2 * draw - 1)
 
     @torch.no_grad()
     def zero_output_(self) -> None:

@@ -123,12 +123,6 @@ class Term(nn.Module):
         """Key of the formula: terms with equal keys have equal formulas."""
         return type(self), tuple(self.scalars)
 
-    def bound_all(self, prefix: str, bounds: Interval) -> None:
-        """Give every parameter whose name starts with ``prefix`` the same admissible set."""
-        for name, _ in self.named_parameters():
-            if name.startswith(prefix):
-                self.bounds[name] = bounds
-
     def idle(self, name: str) -> None:
         """Exclude a declared parameter from calibration and reports."""
         getattr(self, name).requires_grad_(False)

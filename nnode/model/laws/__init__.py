@@ -188,8 +188,10 @@ class Law(Term):
             raise ValueError(f"the law {self.name} has no option {', '.join(options)}")
         self._connect(description.get("hidden") if hidden is None else hidden, generator)
         if box is not None:
-            for module in self.networks:
-                self.bound_all(f"{module}.", Interval(-box, box))
+            weights = (
+                n for n, _ in self.named_parameters() if n.partition(".")[0] in self.networks
+            )
+            self.bounds |= dict.fromkeys(weights, Interval(-box, box))
         text = self.formulas.rate if self.domain == "traffic" else ", ".join(self.formulas.rate)
         self.formula = description.get("formula", getattr(type(self), "formula", text))  # type: ignore[misc]
         self._coded()
