@@ -27,7 +27,7 @@ from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.statistics.score import Trace, traces
 from nnode.errors import SimulationError
 from nnode.model import build_model
-from nnode.model.effects import CATALOGUE, Effect
+from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.extend import extended
 from nnode.model.system import System
 
@@ -69,7 +69,7 @@ def baselines_on_table(
     exploration, confirmation = division.exploration, division.confirmation
     engine = windows_of(system, [sequences[i] for i in exploration], division.label[exploration])
     fit = converged_fit(engine, copy.deepcopy(system).double())
-    offered = [e for e in CATALOGUE.of(cast(Domain, domain)) if not e.individual]
+    offered = [e for e in CATALOGUE.of(cast(Domain, domain)) if not issubclass(e, IndividualEffect)]
     columns = [trace for effect in offered for trace in traces(engine, fit, effect)]
     values = np.concatenate([trace.columns for trace in columns], axis=1)
     library = Library(values, -fit.residual, fit.tangents, engine.cluster)

@@ -16,7 +16,7 @@ from nnode.data.options import Faults
 from nnode.data.readers.table import TableOptions
 from nnode.discover.inputs import read_inputs
 from nnode.discover.judge.model_comparison import ModelComparison, windows_of
-from nnode.model.effects import CATALOGUE
+from nnode.model.effects import CATALOGUE, IndividualEffect
 from nnode.model.extend import without
 from nnode.model.system import System
 
@@ -43,7 +43,7 @@ def on_fresh(
     """
     nothing = dict.fromkeys(("fresh_before", "fresh_after", "fresh_worse", "fresh_closure"))
     names = [effect.name for effect in report.diagnosis.effects]
-    if not names or any(CATALOGUE.effects[name].individual for name in names):
+    if not names or any(issubclass(CATALOGUE.effects[name], IndividualEffect) for name in names):
         return nothing
     with TemporaryDirectory(prefix="nnode-fresh-") as folder:
         path = Path(folder) / "fresh.csv"

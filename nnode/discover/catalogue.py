@@ -14,7 +14,7 @@ from typing import cast
 from nnode.data.sequence import Domain
 from nnode.errors import ConfigError
 from nnode.files import write_text
-from nnode.model.effects import CATALOGUE, Effect, Setting, Strength
+from nnode.model.effects import CATALOGUE, Effect, IndividualEffect, Setting, Strength
 from nnode.model.effects.own import load_own
 from nnode.model.term import Interval
 
@@ -59,7 +59,7 @@ def _row(effect: type[Effect]) -> str:
     parameters: dict[str, Strength | Setting] = {**effect.strengths, **effect.settings}
     what = (effect.__doc__ or "").strip().partition("\n")[0].rstrip(".")
     ranges = [f"{name}: {_range(given)}" for name, given in parameters.items()]
-    if effect.individual:
+    if issubclass(effect, IndividualEffect):
         ranges.append("one value per agent")
     cells = (
         f"`{effect.name}`",

@@ -96,11 +96,11 @@ _MOTION = {"traffic": "lanes", "crowd": "crowds"}
 
 
 def _reason(effect: type[Effect]) -> str:
-    if effect.individual and effect.remembers():
+    if not issubclass(effect, IndividualEffect):
+        return ""
+    if effect.remembers():
         return "it has a memory"
-    if effect.individual != issubclass(effect, IndividualEffect):
-        return "its class says individual, but is no IndividualEffect"
-    if not issubclass(effect, IndividualEffect) or effect.domain == "crowd":
+    if effect.domain == "crowd":
         return ""
     settings = {name: setting.value for name, setting in effect.settings.items()}
     number = len(effect.directions(settings))

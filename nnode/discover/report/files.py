@@ -19,6 +19,7 @@ from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.result import Coefficient, Diagnosis, Laws, NamedEffect
 from nnode.files import write_text
 from nnode.model import FeedForward, System, build_model
+from nnode.model.effects import IndividualEffect
 from nnode.model.extend import effects_of
 
 REPORT = "report.json"
@@ -224,7 +225,7 @@ def extended_options(options: Mapping[str, Any], system: System) -> dict[str, An
 
 def individual(system: System) -> list[str]:
     """The effects of a model with agent-specific parameters."""
-    return [effect.name for effect in effects_of(system) if effect.individual]
+    return [effect.name for effect in effects_of(system) if isinstance(effect, IndividualEffect)]
 
 
 def has_network(system: System) -> bool:

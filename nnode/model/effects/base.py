@@ -107,8 +107,6 @@ class Effect(Term):
             the effect may lie anywhere within them.
         covariate: ``kind``, ``group`` or ``length``: the property of an agent by which it acts. If
             it is constant within every recording, recordings are the units of evidence.
-        individual: whether every agent has a separate strength, with mean zero over the agents.
-            The reported strength is their standard deviation.
         searched_orders: orders of the laws for which a diagnosis tests the effect.
         built_into_laws: whether other laws of its domain contain a similar effect. A diagnosis
             may then report it correctly where another law is closer to the truth.
@@ -127,7 +125,6 @@ class Effect(Term):
     consecutive: ClassVar[bool] = False
     overlapping: ClassVar[bool] = False
     covariate: ClassVar[str | None] = None
-    individual: ClassVar[bool] = False
     of_drivers: ClassVar[bool] = False
     searched_orders: ClassVar[tuple[int, ...]] = (1, 2)
     built_into_laws: ClassVar[bool] = False
@@ -208,6 +205,8 @@ class Effect(Term):
 class IndividualEffect(Effect):
     """An effect with one estimated number per agent in addition to its parameters.
 
+    The numbers have mean zero over the agents. The reported strength is their standard deviation.
+
     Class attributes:
         in_equation: whether its strengths occur in the equation. Otherwise they only describe the
             distribution of the agents' numbers, and are not calibrated.
@@ -217,7 +216,6 @@ class IndividualEffect(Effect):
         values: the parameters.
     """
 
-    individual = True
     in_equation: ClassVar[bool] = True
 
     def __init__(self, people: dict[str, list[float]] | None = None, **values: float) -> None:

@@ -18,7 +18,7 @@ from nnode.discover.locate.curves import columns_of
 from nnode.discover.residuals.fit import refine
 from nnode.discover.statistics.score import Screen, traces
 from nnode.model import Crowd, make_law
-from nnode.model.effects import CATALOGUE, Effect
+from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.effects.crowd import Alignment, Drift, PairRepulsion
 from nnode.model.extend import extended
 from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law
@@ -299,7 +299,9 @@ def test_a_hidden_effect_scores_best_and_is_measured(
     fit = refine(engine, fit.system)
     screen = Screen(fit, engine.cluster)
     effects = [
-        e for e in CATALOGUE.of("crowd") if not e.individual and e.confusable_group != "place"
+        e
+        for e in CATALOGUE.of("crowd")
+        if not issubclass(e, IndividualEffect) and e.confusable_group != "place"
     ]
     scores = screen.scores([t for e in effects for t in traces(engine, fit, e)])
     assert scores[0].effect.name == name

@@ -18,7 +18,7 @@ from nnode.discover.diagnose import diagnose
 from nnode.discover.division import divide
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.report.files import sentence
-from nnode.model.effects import CATALOGUE
+from nnode.model.effects import CATALOGUE, IndividualEffect
 from nnode.model.extend import effects_of
 from tests.discover.platoons import platoons, relative_speed
 from tests.discover.test_diagnose import MANY, law
@@ -114,7 +114,7 @@ def test_with_too_few_clusters_nothing_is_named_and_it_says_how_many_would_do() 
     d = found.diagnosis
     assert (d.verdict, d.effects, d.leads) == ("not_testable", [], [])
     # eight open clusters have 2^7 outcomes, too few for so many effects
-    effects = [one for one in CATALOGUE.of("traffic") if not one.individual]
+    effects = [one for one in CATALOGUE.of("traffic") if not issubclass(one, IndividualEffect)]
     assert d.clusters.open == 8 < d.clusters.least == least_number(0.05, hypotheses=len(effects))
     assert not any(one.testable for one in d.absences if one.name in {e.name for e in effects})
     assert "8 exploration clusters and 3 confirmation clusters" in sentence(d)

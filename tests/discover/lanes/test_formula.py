@@ -19,7 +19,7 @@ from nnode.discover.residuals.variables import Curve
 from nnode.model import System
 from nnode.model.arrays import Formulas
 from nnode.model.build import add_effects, build_model
-from nnode.model.effects import CATALOGUE
+from nnode.model.effects import CATALOGUE, IndividualEffect
 from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.parse import parse
 from nnode.simulation import rhs
@@ -134,7 +134,7 @@ def test_screens(sequences: list[Sequence], leader: str, effects: tuple[str, ...
         found = [
             engine.screen_columns(system, row, effect, probe)
             for effect in CATALOGUE.of("traffic")
-            if effect.name not in effects and not effect.individual
+            if effect.name not in effects and not issubclass(effect, IndividualEffect)
             for probe in effect.probes(engine.batch, system)[:12]
         ]
         return torch.cat([columns / columns.abs().max().clamp(min=1e-9) for columns in found])

@@ -65,7 +65,7 @@ def system(name: str) -> Crowd:
     )
     add_effects(model, [{"name": name, **VALUES[name]}])
     effect = model.terms[-1]
-    if CATALOGUE.effects[name].individual:
+    if isinstance(effect, IndividualEffect):
         effect.people = NUMBERS
     return model
 
