@@ -15,11 +15,12 @@ from nnode.errors import SimulationError
 from nnode.model import Crowd, Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver
 from tests.builders import social_forces
+from tests.simulation.scenes import crowd, platoon
 
 V0, LENGTH, GAP = 20.0, 5.0, 8.0
 
 
-def simulated_gap(platoon, method: str, dt: float, **tolerances: float) -> np.ndarray:  # type: ignore[no-untyped-def]
+def simulated_gap(method: str, dt: float, **tolerances: float) -> np.ndarray:
     batch = collate([platoon([GAP], samples=8)])
     model = Traffic([make_law("lin", v0=V0, L=LENGTH)])
     x = TorchdiffeqSolver(method, dt=dt, **tolerances)(model, batch).x.detach().numpy()
@@ -33,27 +34,27 @@ ANALYTIC = np.sqrt(GAP**2 + 2 * V0 * LENGTH * 0.2 * np.arange(8))
     ("method", "order"),
     [("euler", 1), ("midpoint", 2), ("heun3", 3), ("rk4", 4)],
 )
-def test_order_of_convergence(platoon, method: str, order: int) -> None:  # type: ignore[no-untyped-def]
+def test_order_of_convergence(method: str, order: int) -> None:
     number = np.array([8, 16, 32, 64]) if order < 4 else np.array([2, 4, 8, 16])
-    error = [abs(simulated_gap(platoon, method, 0.2 / n) - ANALYTIC).max() for n in number]
+    error = [abs(simulated_gap(method, 0.2 / n) - ANALYTIC).max() for n in number]
     slope = np.polyfit(np.log(0.2 / number), np.log(error), 1)[0]
     assert slope == pytest.approx(order, abs=0.15)
 
 
 @pytest.mark.parametrize("method", ["explicit_adams", "implicit_adams"])
-def test_multistep_methods_step_inside_the_sampling_interval(platoon, method: str) -> None:  # type: ignore[no-untyped-def]
-    coarse = abs(simulated_gap(platoon, method, 0.04) - ANALYTIC).max()
-    fine = abs(simulated_gap(platoon, method, 0.01) - ANALYTIC).max()
+def test_multistep_methods_step_inside_the_sampling_interval(method: str) -> None:
+    coarse = abs(simulated_gap(method, 0.04) - ANALYTIC).max()
+    fine = abs(simulated_gap(method, 0.01) - ANALYTIC).max()
     assert coarse > 0
     # order four at least
     assert fine < coarse / 4**3.5
 
 
 @pytest.mark.parametrize("method", ["dopri5", "scipy_solver"])
-def test_adaptive_methods_meet_their_tolerance(platoon, method: str) -> None:  # type: ignore[no-untyped-def]
+def test_adaptive_methods_meet_their_tolerance(method: str) -> None:
     error = {}
     for tolerance in (1e-5, 1e-10):
-        gap = simulated_gap(platoon, method, 0.2, rtol=tolerance, atol=tolerance)
+        gap = simulated_gap(method, 0.2, rtol=tolerance, atol=tolerance)
         error[tolerance] = abs(gap - ANALYTIC).max()
         # positions are of the order of 50 m, and errors of several steps add up
         assert error[tolerance] < tolerance * 50 * 10
@@ -69,7 +70,7 @@ def log(gap: float) -> float:
 
 
 @pytest.mark.parametrize(("term", "law"), [("lin", lin), ("log", log)])
-def test_euler_in_traffic_is_the_plain_loop(platoon, term, law) -> None:  # type: ignore[no-untyped-def]
+def test_euler_in_traffic_is_the_plain_loop(term, law) -> None:  # type: ignore[no-untyped-def]
     item = platoon([12.0, 30.0, 9.0], samples=5)
     found = TorchdiffeqSolver("euler", dt=0.01)(
         Traffic([make_law(term, v0=25.0, L=4.5)]), collate([item])
@@ -82,7 +83,7 @@ def test_euler_in_traffic_is_the_plain_loop(platoon, term, law) -> None:  # type
             x = x + 0.01 * np.array(rate)
 
 
-def test_euler_in_crowds_is_the_plain_loop(crowd) -> None:  # type: ignore[no-untyped-def]
+def test_euler_in_crowds_is_the_plain_loop() -> None:
     item = crowd(3, samples=4)
     model = Crowd([make_law("relaxation", tau=0.5)])
     found = TorchdiffeqSolver("euler", dt=0.05)(model, collate([item]))
@@ -97,7 +98,7 @@ def test_euler_in_crowds_is_the_plain_loop(crowd) -> None:  # type: ignore[no-un
             x, v = x + 0.05 * v, v + 0.05 * (desired - v) / 0.5
 
 
-def test_single_precision_stays_close(platoon, crowd) -> None:  # type: ignore[no-untyped-def]
+def test_single_precision_stays_close() -> None:
     for model, items in (
         (
             Traffic([make_law("lin", v0=25.0, L=4.5)]),
@@ -117,14 +118,14 @@ def test_single_precision_stays_close(platoon, crowd) -> None:  # type: ignore[n
         assert not torch.equal(single.double(), double)
 
 
-def test_the_gradient_does_not_change_the_trajectory(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_the_gradient_does_not_change_the_trajectory() -> None:
     model, batch = Traffic([make_law("lin", v0=25.0, L=4.5)]), collate([platoon([12.0, 30.0])])
     adjoint = TorchdiffeqSolver(gradient="adjoint", dt=0.02)(model, batch).x
     discrete = TorchdiffeqSolver(gradient="discrete", dt=0.02)(model, batch).x
     assert torch.equal(adjoint, discrete)
 
 
-def test_a_blow_up_names_sequence_agent_and_time(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_a_blow_up_names_sequence_agent_and_time() -> None:
     crash = platoon([30.0, 20.0], noise=0.0, name="run/crash")
     crash.x[:, 1] = crash.x[:, 2]  # agent 1 stands where agent 2 does: its gap is 0
     batch = collate([platoon([20.0, 25.0], name="run/good"), crash])
@@ -141,7 +142,7 @@ def runaway() -> Traffic:
     return Traffic([term])
 
 
-def test_a_blow_up_is_dated(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_a_blow_up_is_dated() -> None:
     model = runaway().to(torch.float32)
     batch = collate([platoon([30.0], samples=9, noise=0.0)]).to(dtype=torch.float32)
     # each Euler step of 0.2 s multiplies the gap by 0.2e12: 30 * (2e11)^k overflows at k = 4
@@ -149,7 +150,7 @@ def test_a_blow_up_is_dated(platoon) -> None:  # type: ignore[no-untyped-def]
         TorchdiffeqSolver(dt=0.2)(model, batch)
 
 
-def test_a_sequence_stands_still_after_its_end(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_a_sequence_stands_still_after_its_end() -> None:
     model = runaway().to(torch.float32)
     short, long = platoon([30.0], samples=3, noise=0.0), platoon([], samples=9)
     batch = collate([short, long]).to(dtype=torch.float32)

@@ -23,6 +23,7 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Sequence, collate
 from nnode.model import Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver
+from tests.simulation.scenes import platoon
 
 V0, LENGTH = 21.0, 4.5
 TIGHT = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12}
@@ -71,7 +72,7 @@ def by_hand(item: Sequence) -> tuple[float, np.ndarray]:
     ("method", "dt"), [("rk4", 0.01), ("dopri5", 0.2), ("implicit_adams", 0.005)]
 )
 @pytest.mark.parametrize("gradient", ["adjoint", "discrete"])
-def test_autograd_solves_the_adjoint_equation(platoon, method, dt, gradient) -> None:  # type: ignore[no-untyped-def]
+def test_autograd_solves_the_adjoint_equation(method, dt, gradient) -> None:  # type: ignore[no-untyped-def]
     item = platoon([9.0, 16.0, 12.0], samples=8, noise=1.0)
     expected_cost, expected = by_hand(item)
     model, batch = Traffic([make_law("lin", v0=V0, L=LENGTH)]), collate([item])
@@ -83,7 +84,7 @@ def test_autograd_solves_the_adjoint_equation(platoon, method, dt, gradient) -> 
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-def test_the_paper_s_cost_is_the_limit_of_ever_denser_samples(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_the_paper_s_cost_is_the_limit_of_ever_denser_samples() -> None:
     # continuous source instead of jumps, against a measurement z known at all times
     t_end, n = 1.0, 3
     start = np.array([12.0, 21.0, 37.0])

@@ -17,6 +17,7 @@ from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, Law, System, Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver
+from tests.simulation.scenes import crowd, platoon
 
 HIDDEN, R, B, TAU = 4, 0.25, 0.1, 0.5
 KINDS = ("discrete", "adjoint")
@@ -110,7 +111,7 @@ def gradient(model: System, batch: Batch, kind: str, dt: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", TRAFFIC)
-def test_discrete_gradient_in_traffic(platoon, name: str) -> None:  # type: ignore[no-untyped-def]
+def test_discrete_gradient_in_traffic(name: str) -> None:
     make, speed = TRAFFIC[name]
     # softplus of an argument above 20 is replaced by it in torch: 2e-9 away, so gaps stay small
     item = platoon([6.0, 8.0, 5.5], samples=4, noise=1.0)
@@ -120,7 +121,7 @@ def test_discrete_gradient_in_traffic(platoon, name: str) -> None:  # type: igno
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10 * abs(expected).max())
 
 
-def test_discrete_gradient_in_crowds(crowd) -> None:  # type: ignore[no-untyped-def]
+def test_discrete_gradient_in_crowds() -> None:
     item = crowd(4, samples=4)
     shaken = item.x + 0.05 * np.cos(9 * np.arange(4))[:, None, None]
     item = replace(item, walls=None, x=shaken)
@@ -132,7 +133,7 @@ def test_discrete_gradient_in_crowds(crowd) -> None:  # type: ignore[no-untyped-
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-def test_adjoint_gradient_in_crowds_deviates_at_first_order(crowd) -> None:  # type: ignore[no-untyped-def]
+def test_adjoint_gradient_in_crowds_deviates_at_first_order() -> None:
     model = people()
     # at 0.35 m neighbours stay in contact all the time: no kink is crossed
     batch, number = collate([crowd(3, samples=3, apart=0.35)]), np.array([32, 64, 128])
@@ -145,7 +146,7 @@ def test_adjoint_gradient_in_crowds_deviates_at_first_order(crowd) -> None:  # t
     assert deviation[-1] < 0.05
 
 
-def test_gradient_in_single_precision(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_gradient_in_single_precision() -> None:
     batch = collate([platoon([9.0, 16.0, 7.0], noise=1.0)])
     for kind in KINDS:
         model = Traffic([make_law("lin", v0=21.0, L=4.5)])

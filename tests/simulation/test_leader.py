@@ -10,6 +10,7 @@ from nnode.calibrate.cost import sequence_costs, squared_error
 from nnode.data.sequence import Sequence, collate
 from nnode.model import Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver
+from tests.simulation.scenes import platoon
 
 V0, LENGTH, DT, STEPS = 21.0, 4.0, 0.02, 10
 
@@ -29,7 +30,7 @@ def followers_loop(item: Sequence, v0: complex = V0, length: complex = LENGTH) -
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
-def test_the_record_leads(platoon, dtype: torch.dtype, tolerance: float) -> None:  # type: ignore[no-untyped-def]
+def test_the_record_leads(dtype: torch.dtype, tolerance: float) -> None:
     items = [platoon([12.0, 18.0], samples=14, noise=1.0), platoon([9.0], samples=4, noise=1.0)]
     batch = collate(items).to(dtype=dtype)
     model = Traffic([make_law("lin", v0=V0, L=LENGTH)], leader="measured").to(dtype)
@@ -43,7 +44,7 @@ def test_the_record_leads(platoon, dtype: torch.dtype, tolerance: float) -> None
         )
 
 
-def test_the_leaders_error_is_none(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_the_leaders_error_is_none() -> None:
     batch = collate([platoon([12.0, 18.0]), platoon([12.0], samples=4)])
     model = Traffic([make_law("lin")], leader="measured")
     error = squared_error(TorchdiffeqSolver(dt=DT)(model, batch), batch)
@@ -53,7 +54,7 @@ def test_the_leaders_error_is_none(platoon) -> None:  # type: ignore[no-untyped-
 
 
 @pytest.mark.parametrize("gradient", ["adjoint", "discrete"])
-def test_a_speed_that_nobody_drives_at_has_no_gradient(platoon, gradient: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_speed_that_nobody_drives_at_has_no_gradient(gradient: str) -> None:
     term = make_law("network_speed", hidden=2, generator=torch.Generator().manual_seed(0))
     model, batch = Traffic([term], leader="measured"), collate([platoon([12.0, 18.0])])
     sequence_costs(
@@ -64,7 +65,7 @@ def test_a_speed_that_nobody_drives_at_has_no_gradient(platoon, gradient: str) -
     assert all(p.grad.abs().max() > 0 for p in term.network.parameters())
 
 
-def test_gradient_behind_the_record(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_gradient_behind_the_record() -> None:
     item = platoon([12.0, 18.0, 9.0], samples=6, noise=1.0)
     batch, term = collate([item]), make_law("lin", v0=V0, L=LENGTH)
     solver = TorchdiffeqSolver("euler", "discrete", DT)

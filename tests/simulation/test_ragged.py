@@ -11,6 +11,7 @@ from nnode.data.sequence import Sequence, collate
 from nnode.model import Crowd, System, Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver
 from tests.builders import social_forces
+from tests.simulation.scenes import crowd
 
 
 def seeded() -> torch.Generator:
@@ -32,7 +33,7 @@ CROWD = {
 
 
 @pytest.fixture(scope="session")
-def crowds(crowd) -> list[Sequence]:  # type: ignore[no-untyped-def]
+def crowds() -> list[Sequence]:
     # with 4, 1, 2 and 3 people come two, no, one and two walls
     return [
         crowd(4, samples=4, name="a"),

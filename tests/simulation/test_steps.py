@@ -12,6 +12,7 @@ from nnode.model import System, Traffic, make_law
 from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
 from nnode.model.system import Crowd
 from nnode.simulation import TorchdiffeqSolver, substeps
+from tests.simulation.scenes import crowd, platoon
 
 #: Speeds in a lane, accelerations in a lane, accelerations of people.
 LANE, PEDESTRIAN_LAWS = Traffic([make_law("lin")]), Crowd([make_law("relaxation")])
@@ -38,7 +39,7 @@ def count_evaluations(system: System) -> list[int]:
         (3, 0.2, None, 200),
     ],
 )
-def test_number_of_steps(platoon, dtype, samples, sampling, dt, steps) -> None:  # type: ignore[no-untyped-def]
+def test_number_of_steps(dtype, samples, sampling, dt, steps) -> None:  # type: ignore[no-untyped-def]
     model = Traffic([make_law("lin", v0=15.0)]).to(dtype)
     calls = count_evaluations(model)
     batch = collate([platoon([20.0], samples=samples, dt=sampling)]).to(dtype=dtype)
@@ -48,7 +49,7 @@ def test_number_of_steps(platoon, dtype, samples, sampling, dt, steps) -> None: 
 
 
 @pytest.mark.parametrize(("sampling", "steps"), [(0.04, 25), (0.0625, 25), (0.1, 50)])
-def test_default_step_of_crowds(crowd, sampling: float, steps: int) -> None:  # type: ignore[no-untyped-def]
+def test_default_step_of_crowds(sampling: float, steps: int) -> None:
     model = Crowd([make_law("relaxation")])
     calls = count_evaluations(model)
     TorchdiffeqSolver("euler")(model, collate([crowd(2, samples=26, dt=sampling)]))
@@ -57,7 +58,7 @@ def test_default_step_of_crowds(crowd, sampling: float, steps: int) -> None:  # 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("method", "stages"), [("euler", 1), ("midpoint", 2), ("rk4", 4)])
-def test_the_adjoint_takes_as_many_steps_back(platoon, dtype, method, stages) -> None:  # type: ignore[no-untyped-def]
+def test_the_adjoint_takes_as_many_steps_back(dtype, method, stages) -> None:  # type: ignore[no-untyped-def]
     model = Traffic([make_law("lin", v0=15.0)]).to(dtype)
     calls = count_evaluations(model)
     batch = collate([platoon([20.0], samples=13)]).to(dtype=dtype)
@@ -123,7 +124,7 @@ def test_a_step_that_does_not_divide_is_refused_with_ones_that_do(dt: float) -> 
         assert substeps(0.2, float(value), LANE) >= 1
 
 
-def test_a_single_sample_has_no_sampling_interval(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_a_single_sample_has_no_sampling_interval() -> None:
     batch = collate([platoon([20.0], samples=1)])
     with pytest.raises(DataError, match="at least two samples"):
         TorchdiffeqSolver()(Traffic([make_law("lin")]), batch)

@@ -22,6 +22,7 @@ from nnode.simulation.kernels.crowds import SIZE, CrowdSource
 from tests.builders import social_forces
 from tests.simulation.fused.compare import difference, single
 from tests.simulation.fused.test_fallback import Sway
+from tests.simulation.scenes import crowd
 
 DT = 0.05
 
@@ -50,7 +51,7 @@ def compiled_only(monkeypatch) -> None:  # type: ignore[no-untyped-def]
 
 
 @pytest.fixture
-def people(crowd) -> list[Sequence]:  # type: ignore[no-untyped-def]
+def people() -> list[Sequence]:
     """Crowds of one to eight people, of different duration, with none, one and two walls."""
     return [
         crowd(4, samples=4, name="a"),
@@ -101,7 +102,7 @@ def test_single_precision(name: str, people: list[Sequence]) -> None:
 
 
 @pytest.mark.parametrize("name", ["sf", "nn"])
-def test_many_blocks_and_threads(name: str, crowd) -> None:  # type: ignore[no-untyped-def]
+def test_many_blocks_and_threads(name: str) -> None:
     # more than fit into one block, and rows that are cut into pieces
     items = [crowd(3 + i % 5, samples=3, name=f"m{i}") for i in range(150)]
     batch, model = single(items), Crowd(MODELS[name]())
@@ -114,7 +115,7 @@ def test_many_blocks_and_threads(name: str, crowd) -> None:  # type: ignore[no-u
 
 
 @pytest.mark.parametrize("name", ["sf", "nn"])
-def test_rows_longer_than_a_piece(name: str, crowd) -> None:  # type: ignore[no-untyped-def]
+def test_rows_longer_than_a_piece(name: str) -> None:
     draw = np.random.default_rng(5)
     x = np.tile(draw.uniform(0, 25, (SIZE + 21, 2)), (2, 1, 1))
     x[1] += 0.1
@@ -124,7 +125,7 @@ def test_rows_longer_than_a_piece(name: str, crowd) -> None:  # type: ignore[no-
 
 
 @pytest.mark.parametrize("name", ["sf", "nn"])
-def test_far_from_the_origin(name: str, crowd) -> None:  # type: ignore[no-untyped-def]
+def test_far_from_the_origin(name: str) -> None:
     item = crowd(6, samples=4)
     far = np.array([3000.0, -800.0])
     moved = Sequence(
@@ -139,7 +140,7 @@ def test_far_from_the_origin(name: str, crowd) -> None:  # type: ignore[no-untyp
     check(Crowd(MODELS[name]()), collate([moved]), FusedSolver(DT), limit=1e-9)
 
 
-def test_people_in_one_place(crowd) -> None:  # type: ignore[no-untyped-def]
+def test_people_in_one_place() -> None:
     item = crowd(3, samples=3)
     item.x[:, 1] = item.x[:, 0]
     check(Crowd(MODELS["sf"]()), collate([item]), FusedSolver(DT))
@@ -186,14 +187,14 @@ def test_without_gradient_nothing_changes(people: list[Sequence]) -> None:
         torch.testing.assert_close(found, same, rtol=1e-14, atol=1e-14)
 
 
-def test_a_blow_up_is_reported(crowd) -> None:  # type: ignore[no-untyped-def]
+def test_a_blow_up_is_reported() -> None:
     items = [crowd(1, name="alone"), crowd(3, name="crushed", apart=0.1)]
     model = Crowd(social_forces(A=1e300, k=0.0, kappa=0.0, B=1e-4))
     with pytest.raises(SimulationError, match="crushed blew up"):
         FusedSolver(DT)(model, collate(items))
 
 
-def test_one_compilation_for_all_shapes(people: list[Sequence], crowd) -> None:  # type: ignore[no-untyped-def]
+def test_one_compilation_for_all_shapes(people: list[Sequence]) -> None:
     # arrays of another layout would be compiled for again, unnoticed but for the seconds
     for items in (people, people[3:4], [crowd(2, samples=2)], [crowd(3)] * 70):
         gradient(Crowd(MODELS["sf"]()), FusedSolver(DT), collate(items))

@@ -13,6 +13,7 @@ from nnode.simulation.kernels import lanes
 from tests.builders import social_forces
 from tests.simulation.fused.compare import difference, single
 from tests.simulation.fused.test_fallback import Sway
+from tests.simulation.scenes import crowd, platoon
 
 DT = 0.02
 
@@ -43,7 +44,7 @@ LOG = pytest.param("log", marks=pytest.mark.thorough)  # compiled like the other
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("name", [LOG if name == "log" else name for name in MODELS])
-def test_every_run_is_its_own(name, threads, ragged, crowd) -> None:  # type: ignore[no-untyped-def]
+def test_every_run_is_its_own(name, threads, ragged) -> None:  # type: ignore[no-untyped-def]
     people = [crowd(3, samples=4, name="a"), crowd(2, samples=3, name="b")]
     batch = single(people if name == "crowd" else ragged)
     model, solver = MODELS[name](), FusedSolver(DT, threads)
@@ -78,7 +79,7 @@ def test_missing_parameters_are_the_own_ones(ragged) -> None:  # type: ignore[no
     assert (found[:, 0] - found[:, 1]).abs().max() > 0.01
 
 
-def test_a_run_that_blows_up_stays_alone(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_a_run_that_blows_up_stays_alone() -> None:
     batch, model = single([platoon([10.0, 6.0])]), Traffic([make_law("lin", v0=18.0, L=4.0)])
     v0 = torch.tensor([18.0, float("nan")], dtype=torch.float64, requires_grad=True)
     x = FusedSolver(DT).ensemble(model, {"terms.0.v0": v0}, batch).x

@@ -13,6 +13,7 @@ from nnode.model.term import State, Term
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from tests.builders import social_forces
 from tests.simulation.fused.compare import single
+from tests.simulation.scenes import crowd
 
 DT = 0.02
 
@@ -70,7 +71,7 @@ SAID = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_it_is_said_once_in_a_run_and_why(name, ragged, crowd, caplog) -> None:  # type: ignore[no-untyped-def]
+def test_it_is_said_once_in_a_run_and_why(name, ragged, caplog) -> None:  # type: ignore[no-untyped-def]
     system, solver = MODELS[name](), FusedSolver()
     batch = single([crowd(3, samples=4)] if system.domain == "crowd" else ragged)
     with caplog.at_level(logging.WARNING):
@@ -85,7 +86,7 @@ def test_it_is_said_once_in_a_run_and_why(name, ragged, crowd, caplog) -> None: 
     assert solver.uncompiled in record.getMessage()
 
 
-def test_compiled_models_and_the_baseline_without_forces_say_nothing(ragged, crowd, caplog) -> None:  # type: ignore[no-untyped-def]
+def test_compiled_models_and_the_baseline_without_forces_say_nothing(ragged, caplog) -> None:  # type: ignore[no-untyped-def]
     solver = FusedSolver()
     with caplog.at_level(logging.INFO):
         solver(Traffic([make_law("lin", v0=18.0, L=4.0)]), single(ragged))

@@ -13,6 +13,7 @@ from nnode.model import Law, Traffic, make_law
 from nnode.simulation import FusedSolver, TorchdiffeqSolver, fused
 from nnode.simulation.kernels import lanes
 from tests.simulation.fused.compare import difference, gradient, single
+from tests.simulation.scenes import crowd, platoon
 
 DT = 0.01
 
@@ -71,7 +72,7 @@ def test_single_precision(law, items, leader, request) -> None:  # type: ignore[
     assert difference(own, wanted) < 1e-4
 
 
-def test_small_gaps_of_the_logarithm(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_small_gaps_of_the_logarithm() -> None:
     # the law is held constant below its smallest gap
     batch = single([platoon([1e-4, 5.0, -2.0], samples=3)])
     model = Traffic([make_law("log", v0=3.0, L=4.0)])
@@ -99,7 +100,7 @@ def test_without_gradient_nothing_is_stored(equal) -> None:  # type: ignore[no-u
     torch.testing.assert_close(found, FusedSolver(DT)(model, batch).x.detach(), rtol=0, atol=0)
 
 
-def test_long_rows_and_many_blocks(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_long_rows_and_many_blocks() -> None:
     batch = single([platoon([15.0] * 30, samples=3, name=f"{i}") for i in range(50)])
     model = Traffic([make_law("lin", v0=18.0, L=4.0)])
     exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
@@ -108,13 +109,13 @@ def test_long_rows_and_many_blocks(platoon) -> None:  # type: ignore[no-untyped-
     assert difference(own, wanted) < 1e-10
 
 
-def test_a_blow_up_is_reported(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_a_blow_up_is_reported() -> None:
     batch = collate([platoon([10.0]), platoon([10.0, 0.0], name="touching")])
     with pytest.raises(SimulationError, match=r"touching blew up: agent 1 at 0\.2 s"):
         FusedSolver(DT)(Traffic([make_law("lin")]), batch)
 
 
-def test_refusals(platoon, crowd) -> None:  # type: ignore[no-untyped-def]
+def test_refusals() -> None:
     with pytest.raises(ConfigError, match="threads=0"):
         FusedSolver(threads=0)
     with pytest.raises(ConfigError, match="does not divide"):
@@ -123,7 +124,7 @@ def test_refusals(platoon, crowd) -> None:  # type: ignore[no-untyped-def]
         FusedSolver(DT)(Traffic([make_law("lin")]), collate([crowd(2)]))
 
 
-def test_code_of_one_s_own_is_not_taken_for_the_formula(platoon) -> None:  # type: ignore[no-untyped-def]
+def test_code_of_one_s_own_is_not_taken_for_the_formula() -> None:
     class Slower(Law):
         def speed(self, gap: torch.Tensor) -> torch.Tensor:
             return super().speed(gap) / 2
