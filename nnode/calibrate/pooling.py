@@ -210,8 +210,7 @@ def sequence_parameters(
     pool = (row, strength / judged.scale**2) if strength else None
     rows, _ = best_alone(whole, starts if pool is None else starts[:1], penalty=pool)
     costs = whole.costs(rows)
-    printed = short_names(whole.names)
-    names = [printed[name] for name in whole.names]
+    names = list(short_names(whole.names).values())
     table = pd.DataFrame(
         {
             "sequence": [s.name for s in sequences],

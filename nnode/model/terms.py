@@ -461,19 +461,14 @@ def add_term(
         ConfigError: a formula cannot be read, or its units are incompatible.
     """
     reader = _Reader(model, name, rule, parameters, units, functions or {})
+    symbol_name = reader.symbol_name
+    fixed = {symbol_name[part]: const(value) for part, (value, _) in rule.constants.items()}
     changes: dict[str, Any] = {
         "owned": {**model.owned, **owned},
-        "settings": model.settings
-        | {reader.symbol_name[part]: (whose, part) for part in rule.settings},
-        "inputs": model.inputs | {reader.symbol_name[part]: (whose, part) for part in rule.inputs},
+        "settings": model.settings | {symbol_name[part]: (whose, part) for part in rule.settings},
+        "inputs": model.inputs | {symbol_name[part]: (whose, part) for part in rule.inputs},
         "units": reader.units,
-        "fixed": {
-            **model.fixed,
-            **{
-                reader.symbol_name[part]: const(value)
-                for part, (value, _) in rule.constants.items()
-            },
-        },
+        "fixed": model.fixed | fixed,
     }
     if isinstance(model, LaneDynamics):
         return replace(model, **changes, **_in_lane(model, reader, parameters))

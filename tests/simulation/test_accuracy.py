@@ -125,14 +125,6 @@ def test_the_gradient_does_not_change_the_trajectory() -> None:
     assert torch.equal(adjoint, discrete)
 
 
-def test_a_blow_up_names_sequence_agent_and_time() -> None:
-    crash = platoon([30.0, 20.0], noise=0.0, name="run/crash")
-    crash.x[:, 1] = crash.x[:, 2]  # agent 1 stands where agent 2 does: its gap is 0
-    batch = collate([platoon([20.0, 25.0], name="run/good"), crash])
-    with pytest.raises(SimulationError, match=r"run/crash.*agent 1 at 0\.2 s"):
-        TorchdiffeqSolver(dt=0.02)(Traffic([make_law("lin")]), batch)
-
-
 def runaway() -> Traffic:
     """Speed 1e40 m/s per metre of gap: single precision lasts only a few steps."""
     term = make_law("network_speed", hidden=1, v0=0.0)

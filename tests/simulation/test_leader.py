@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.calibrate.cost import sequence_costs, squared_error
+from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Sequence, collate
 from nnode.model import Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver
@@ -42,15 +42,6 @@ def test_the_record_leads(dtype: torch.dtype, tolerance: float) -> None:
         np.testing.assert_allclose(
             x[:k, b, : n - 1, 0], followers_loop(item), rtol=tolerance, atol=tolerance
         )
-
-
-def test_the_leaders_error_is_none() -> None:
-    batch = collate([platoon([12.0, 18.0]), platoon([12.0], samples=4)])
-    model = Traffic([make_law("lin")], leader="measured")
-    error = squared_error(TorchdiffeqSolver(dt=DT)(model, batch), batch)
-    assert torch.all(error[:, 0, 2] == 0)
-    assert torch.all(error[:, 1, 1] == 0)
-    assert torch.all(error[1:, 0, :2] > 0)
 
 
 @pytest.mark.parametrize("gradient", ["adjoint", "discrete"])
