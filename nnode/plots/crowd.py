@@ -27,7 +27,6 @@ from nnode.plots.interaction import (
     force_range,
     interaction,
 )
-from nnode.plots.settings import six_settings
 from nnode.plots.style import DIVERGING, FONT, GREY, colour_bar, dress, new_figure, thinned
 
 #: Velocity differences (m/s) of the four contour panels. The paper names (2, 0) as its example
@@ -69,12 +68,10 @@ def force_contours(
         part: see :func:`evaluate_force`.
 
     Raises:
-        ConfigError: an unknown component, extent or part, or a model without interaction force.
+        ConfigError: an extent that is not positive, or a model without this force.
 
     Source: Göttlich & Totzeck, figures (HelbingG1), (HelbingG2), (NN_G1), (NN_G2).
     """
-    if component not in (0, 1):
-        raise ConfigError(f"component must be 0 (F_x) or 1 (F_y), got {component!r}")
     figure = new_figure(6.4, 6.2)
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     panels = [(ax, dv, component) for ax, dv in zip(axes.flat, ENCOUNTERS, strict=True)]
@@ -114,26 +111,6 @@ def head_on_figure(
             ax.set(xlim=limits[0], ylim=limits[1])
         _label(ax, f"$F_{letter}$, ", HEAD_ON)
     return figure
-
-
-def crowd_figures(system: System) -> dict[str, Figure]:
-    """All figures of a crowd model.
-
-    These are ``force_x``, ``force_y`` and ``settings``. If the default is the sum of pair and wall
-    force, there are also ``force_x_pair``, ``force_x_wall``, ``force_y_pair`` and ``force_y_wall``.
-
-    Raises:
-        ConfigError: the model has no interaction force.
-    """
-    term = interaction(system)
-    figures = {f"force_{c}": force_contours(system, i) for i, c in enumerate("xy")}
-    figures["settings"] = six_settings(system)[0]
-    if term.walls and chosen_part(term, None) == "sum":
-        parts: tuple[Part, ...] = ("pair", "wall")
-        for i, c in enumerate("xy"):
-            for part in parts:
-                figures[f"force_{c}_{part}"] = force_contours(system, i, part=part)
-    return figures
 
 
 def _label(ax: Axes, what: str, dv: Vector, other: str = "j") -> None:

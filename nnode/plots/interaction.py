@@ -52,7 +52,7 @@ def evaluate_force(
         ``(..., 2)`` N.
 
     Raises:
-        ConfigError: no interaction force, an unknown part, or ``wall`` of a model without walls.
+        ConfigError: no interaction force, or ``wall`` of a model without walls.
     """
     term = interaction(system)
     chosen = chosen_part(term, part)
@@ -73,20 +73,16 @@ def force_range(term: InteractionForce) -> str:
     return "short" if term.entry == "social_force" else "long"
 
 
-def chosen_part(term: InteractionForce, part: str | None) -> str:
+def chosen_part(term: InteractionForce, part: Part | None) -> Part:
     """``part``, or the default of ``term``; see :func:`evaluate_force` for both."""
     if part is None:
         return "pair" if term.entry == "social_force" else "sum"
-    if part not in ("sum", "pair", "wall"):
-        raise ConfigError(f"part must be sum, pair or wall, got {part!r}")
     if part == "wall" and not term.walls:
         raise ConfigError("part=wall: this model was built without walls (model.walls=false)")
     return part
 
 
-def describe(term: InteractionForce, part: str | None) -> str:
+def describe(term: InteractionForce, part: Part | None) -> str:
     """The name of the force and its part, for a title."""
-    part = chosen_part(term, part)
-    if part == "sum":
-        part = "pair + wall" if term.walls else "pair"
-    return f"{term.name.replace('_', ' ')}, {part}"
+    parts = {"sum": "pair + wall" if term.walls else "pair", "pair": "pair", "wall": "wall"}
+    return f"{term.name.replace('_', ' ')}, {parts[chosen_part(term, part)]}"

@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.model.extend import omitted_effects
 from nnode.plots.interaction import (
@@ -77,15 +76,13 @@ def six_settings(
         ``v_blue``, ``v_red`` (m/s), ``force_blue``, ``force_red`` (N); each cell is (x, y).
 
     Raises:
-        ConfigError: no settings, no interaction force, or an unknown part.
+        ConfigError: no interaction force.
 
     Source: Göttlich & Totzeck, tables (data6settings), (data6settingsNN), figures (6Helbing),
     (6NN).
     """
     term = interaction(system)
     chosen = SETTINGS[force_range(term)] if settings is None else tuple(settings)
-    if not chosen:
-        raise ConfigError("six_settings needs at least one setting, got none")
     table = pd.DataFrame(map(vars, chosen)).rename(columns={"name": "setting"})
     dx, dv = (np.subtract([*table[f"{k}_blue"]], [*table[f"{k}_red"]]) for k in "xv")
     for person, sign in (("blue", 1), ("red", -1)):

@@ -39,7 +39,7 @@ SHOWN = (-20.0, 60.0)
 SUPPORT = (1.0, 99.0)
 KMH = 3.6
 SAMPLES = 481
-#: Gaps (m) of a figure.
+#: Smallest and usual largest gap (m) of a figure.
 SPAN = (2.0, 50.0)
 BINS = 48
 #: Largest number of measured samples in a figure.
@@ -113,9 +113,7 @@ def curve_table(models: Mapping[str, System], gaps: np.ndarray) -> pd.DataFrame:
 
     Raises:
         ConfigError: no model, or one without a law of the gap.
-        DataError: gaps that are not a vector of finite numbers.
     """
-    gaps = _vector(gaps)
     if not models:
         raise ConfigError("speed curves need at least one model, got none")
     columns = {}
@@ -130,7 +128,6 @@ def curve_table(models: Mapping[str, System], gaps: np.ndarray) -> pd.DataFrame:
 def speed_curves(
     models: Mapping[str, System],
     gaps: np.ndarray | None = None,
-    span: tuple[float, float] | None = None,
     points: np.ndarray | None = None,
 ) -> Figure:
     """Speed against gap for one or many models.
@@ -143,16 +140,17 @@ def speed_curves(
         models: name to traffic model.
         gaps: measured gaps in m, for a histogram below. Curves fade outside the 1st to 99th
             percentile, where no data support them.
-        span: the gaps shown, m; None: 2 to 50 m, or as far as 99 % of the points go.
         points: ``(P, 2)`` measured gaps (m) and speeds (m/s), drawn as dots behind the curves.
+            The axis extends beyond 50 m if more than 1 % of their gaps are larger.
 
     Raises:
-        ConfigError: no model, one without a law of the gap, or a span without 0 < low < high.
-        DataError: gaps that are not a vector of finite numbers.
+        ConfigError: no model, or one without a law of the gap.
 
     Source: Göttlich & Totzeck, figure (interactionForce).
     """
-    low, high = _shown_gaps(span, points)
+    low, high = SPAN
+    if points is not None:
+        high = max(high, float(np.percentile(points[:, 0], SUPPORT[1])))
     table = curve_table(models, np.linspace(low, high, SAMPLES))
     leaders = {
         name: float(follow_law(system).get_parameter("v0").detach())
@@ -164,7 +162,6 @@ def speed_curves(
         ax = figure.subplots()
         support = None
     else:
-        gaps = _vector(gaps)
         figure = new_figure(6.4, 5.0)
         ax, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.4, 1))
         support = _histogram(below, gaps, (low, high))
@@ -212,40 +209,12 @@ def speed_curves(
     return figure
 
 
-def traffic_figures(
-    models: Mapping[str, System], gaps: np.ndarray | None = None
-) -> dict[str, Figure]:
-    """Every figure of traffic models: ``speed``, see :func:`speed_curves`."""
-    return {"speed": speed_curves(models, gaps)}
-
-
-def _shown_gaps(span: tuple[float, float] | None, points: np.ndarray | None) -> tuple[float, float]:
-    """The ends of the axis of gaps, m."""
-    if span is None:
-        far = 0.0 if points is None else float(np.percentile(points[:, 0], SUPPORT[1]))
-        return SPAN[0], max(SPAN[1], far)
-    low, high = map(float, span)
-    if not 0 < low < high < np.inf:
-        raise ConfigError(f"span must be two gaps in m with 0 < low < high, got {span}")
-    return low, high
-
-
 def _to_kmh(speed: Any) -> Any:
     return speed * KMH
 
 
 def _from_kmh(speed: Any) -> Any:
     return speed / KMH
-
-
-def _vector(gaps: np.ndarray) -> np.ndarray:
-    gaps = np.array(gaps, dtype=np.float64)
-    if gaps.ndim != 1 or not gaps.size or not np.isfinite(gaps).all():
-        raise DataError(
-            f"gaps must be a vector of finite numbers in m, got shape {gaps.shape} with "
-            f"{int((~np.isfinite(gaps)).sum())} entries that are not finite"
-        )
-    return gaps
 
 
 def _few(names: list[str]) -> tuple[list[dict[str, Any]], list[Line2D]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from nnode.errors import ConfigError
 from nnode.model import Crowd, InteractionForce, Traffic, make_law
-from nnode.plots import crowd_figures, force_contours, force_figure, save
+from nnode.plots import force_contours, force_figure, save
 from nnode.plots.crowd import ENCOUNTERS
 from nnode.plots.interaction import evaluate_force
 
@@ -133,25 +132,6 @@ def test_parts_without_walls() -> None:
     )
     with pytest.raises(ConfigError, match="part=wall"):
         force_contours(system, 0, part="wall")
-    assert set(crowd_figures(system)) == {"force_x", "force_y", "settings"}
-
-
-def test_crowd_figures() -> None:
-    assert set(crowd_figures(_social())) == {
-        "force_x",
-        "force_y",
-        "settings",
-    }
-    assert set(crowd_figures(_network())) == {
-        "force_x",
-        "force_y",
-        "settings",
-        "force_x_pair",
-        "force_x_wall",
-        "force_y_pair",
-        "force_y_wall",
-    }
-    assert plt.get_fignums() == []
 
 
 @pytest.mark.filterwarnings("error")
@@ -171,13 +151,9 @@ def test_degenerate_models_are_drawn(kind: str, value: float, tmp_path) -> None:
 
 def test_bad_options_are_named() -> None:
     system = _social()
-    with pytest.raises(ConfigError, match=r"component must be 0 .*got 2"):
-        force_contours(system, 2)
     for extent in (0.0, -1.0, float("nan")):
         with pytest.raises(ConfigError, match="extent"):
             force_contours(system, 0, extent=extent)
-    with pytest.raises(ConfigError, match="part must be sum, pair or wall, got 'pairs'"):
-        force_contours(system, 0, part="pairs")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"crowd model.*relaxation"):
         force_contours(Crowd([make_law("relaxation")]), 0)
     with pytest.raises(ConfigError, match=r"found a traffic model.*lin"):

@@ -7,7 +7,6 @@ import pytest
 import torch
 from matplotlib.quiver import Quiver
 
-from nnode.errors import ConfigError
 from nnode.model import Crowd, make_law
 from nnode.plots import save, six_settings
 from nnode.plots.settings import Setting
@@ -131,8 +130,6 @@ def test_own_settings(tmp_path) -> None:
     force = 0.0044 * np.exp(6.0) + 0.3 * 34.9539
     assert table["force_blue"][0] == pytest.approx((force, 0.0), rel=1e-5)
     save(figure, tmp_path / "a.png")
-    with pytest.raises(ConfigError, match="at least one setting"):
-        six_settings(_social(), [])
 
 
 @pytest.mark.filterwarnings("error")
