@@ -10,9 +10,8 @@ from tempfile import mkdtemp
 import numpy as np
 from omegaconf import DictConfig
 
-from nnode.app.cli.saved import options_of
-from nnode.app.export import checkpoint_of
-from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.app.cli.saved import checkpoint_of, load_run, options_of
+from nnode.calibrate.checkpoint import Checkpoint
 from nnode.data.store import MANIFEST, Store
 from nnode.errors import ConfigError, unknown_value
 from nnode.exchange.drive import Drive, drive
@@ -70,7 +69,7 @@ def drive_run(
             unknown scenario or vehicle type, or other steps.
         SimulationError: the law's speed is not finite.
     """
-    checkpoint = load_checkpoint(checkpoint_of(str(run)))
+    checkpoint = load_run(run)
     model = checkpoint.build()
     order = drivable(model).order
     place = Path(mkdtemp(prefix="nnode-drive-")) if folder is None else Path(folder)

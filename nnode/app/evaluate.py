@@ -2,166 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import torch
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved, options_of
-from nnode.app.training import (
-    batches,
-    build_solver,
-    set_threads,
-    source_hashes,
-    started,
-)
-from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.app.cli.saved import load_run
+from nnode.app.saved_run import SavedRun
 from nnode.calibrate.cost import Convention
-from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import Metrics, Simulate, baselines, evaluate
-from nnode.calibrate.options import Device, SolverOptions
-from nnode.data.dataset import Source
-from nnode.data.options import DataOptions
-from nnode.data.prepare import NOT_PREPARATION, open_data
-from nnode.data.sequence import Batch
-from nnode.data.store import Store
-from nnode.errors import ConfigError, unknown_value
 from nnode.files import write_json
-from nnode.model import System
 from nnode.progress import Stages
-from nnode.simulation import Solver
-from nnode.simulation.base import Trajectory
-
-PARTS = ("auto", "heldout", "train", "unseen", "all")
-
-
-def choose(store: Source, checkpoint: Checkpoint, part: str) -> tuple[str, list[int], int | None]:
-    """Select the sequences of a store for an evaluation.
-
-    ``heldout`` and ``train`` are the checkpoint's parts. ``unseen`` are sequences that it neither
-    trained on nor dropped. ``auto`` takes the held-out sequences if there are any, or else the
-    unseen ones, or else all.
-
-    Returns:
-        The part, its positions in the store, and the number of trained sequences among them, which
-        is None if the same files were cut into sequences in another way.
-
-    Raises:
-        ConfigError: an unknown part, or a part without sequences.
-    """
-    if part not in PARTS:
-        raise unknown_value("part", part, PARTS)
-    before = set(source_hashes(checkpoint.manifest).values())
-    shared = bool(before & set(source_hashes(store.manifest).values()))
-    comparable = not shared or _cut_alike(store.manifest, checkpoint.manifest)
-    saved = checkpoint.split if shared and comparable else {}
-    names = [entry["name"] for entry in store.index]
-    train, dropped = (set(saved.get(key, [])) for key in ("train", "dropped"))
-    members = {
-        "heldout": saved.get("heldout", []),
-        "train": train,
-        "unseen": set(names) - train - dropped if comparable else (),
-        "all": names,
-    }
-    indices = {
-        key: [i for i, name in enumerate(names) if name in chosen]
-        for key, chosen in members.items()
-    }
-    if part == "auto":
-        part = next(name for name in ("heldout", "unseen", "all") if indices[name])
-    if not indices[part]:
-        raise ConfigError(
-            f"part={part}: these data have no such sequences of the checkpoint; use part=all"
-        )
-    trained = len(set(indices[part]) & set(indices["train"])) if comparable else None
-    return part, indices[part], trained
-
-
-def _cut_alike(*manifests: dict[str, Any]) -> bool:
-    """Whether files were cut into sequences in the same way.
-
-    Options that an earlier version did not have are not compared.
-    """
-    first, second = ({**m.get("options", {}), "reader": m.get("reader")} for m in manifests)
-    ignored = ("recording", "faults", "agents", "path", "name", *NOT_PREPARATION)
-    return all(first[key] == second[key] for key in first.keys() & second.keys() - {*ignored})
-
-
-@dataclass(frozen=True)
-class SavedRun:
-    """A checkpoint's model, and sequences that it can be evaluated on.
-
-    Attributes:
-        checkpoint: the checkpoint.
-        data: options of the data.
-        store: all sequences.
-        part, indices, trained: the chosen sequences, see :func:`choose`.
-        model: the model, on the device.
-        solver: the solver.
-        device: the device.
-    """
-
-    checkpoint: Checkpoint
-    data: DataOptions
-    store: Store
-    part: str
-    indices: list[int]
-    trained: int | None
-    model: System
-    solver: Solver
-    device: torch.device
-
-    @classmethod
-    def of(cls, checkpoint: Checkpoint, config: DictConfig, folder: Path) -> SavedRun:
-        """Read the data of a command whose defaults are those of the checkpoint.
-
-        Args:
-            config: the command's configuration, with ``data``, ``solver``, ``part`` and ``device``.
-            folder: folder of the command's results.
-
-        Raises:
-            NNodeError: the data do not exist, or have no sequences of the part.
-        """
-        config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
-        data: DataOptions = options_of(config.data)
-        solver_options: SolverOptions = options_of(config.solver)
-        set_threads(checkpoint.config["trainer"]["threads"], data.domain)
-        store = open_data(data, folder / "data")
-        device = World().use(Device(config.device), "device")
-        solver = build_solver(solver_options, device)
-        chosen = choose(store, checkpoint, config.part)
-        return cls(checkpoint, data, store, *chosen, checkpoint.build().to(device), solver, device)
-
-    @property
-    def name(self) -> str:
-        """Name of the model."""
-        return str(self.checkpoint.config["model"]["name"])
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Floating-point type of the training."""
-        dtype: torch.dtype = getattr(torch, self.checkpoint.config["trainer"]["dtype"])
-        return dtype
-
-    @property
-    def convention(self) -> Convention:
-        """The cost of the training."""
-        return Convention(self.checkpoint.config["trainer"]["cost"])
-
-    def simulate(self, batch: Batch) -> Trajectory:
-        """Simulate a batch by the model."""
-        return self.solver(self.model, batch)
-
-    def batches(self, store: Source) -> Iterator[Batch]:
-        """The chosen sequences of a store, in batches on the device."""
-        size = self.data.loader.batch_size
-        return batches(store, self.indices, size, self.dtype, self.device)
 
 
 def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
@@ -172,19 +24,18 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     Raises:
         NNodeError: the checkpoint or the data do not exist, or the data have another domain.
     """
-    checkpoint = load_checkpoint(config.checkpoint)
-    run = SavedRun.of(checkpoint, config, folder)
+    checkpoint = load_run(config.checkpoint)
+    run = SavedRun.of_command(checkpoint, config, folder)
     if run.trained is None:
         print("these files were cut into sequences in another way than in training: some of what")
         print("is evaluated may have been trained on")
     elif run.trained and run.part != "train":
         print(f"{run.trained} of the {len(run.indices)} sequences were trained on")
-    source = started(checkpoint, run.store)
     others = baselines(run.model, run.solver, checkpoint.free_speed)
 
     def measured(title: str, simulate: Simulate) -> Metrics:
         stages.begin(title)
-        return evaluate(simulate, run.batches(source), run.convention)
+        return evaluate(simulate, run.batches(), run.convention)
 
     shares = {run.name: 1.0, **{f"baseline {key}": 0.5 for key in others}}
     with Stages("evaluating", shares) as stages:
@@ -195,7 +46,7 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
         {
             **metrics.plain(),
             "model": run.name,
-            "data": run.data.name,
+            "data": run.data,
             "part": run.part,
             "trained_on": run.trained,
             "unit": run.convention.unit,
@@ -208,13 +59,13 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     )
     _print(
         {run.name: metrics, **errors},
-        f"{run.data.name}, {run.part}: {metrics.sequences} sequences",
+        f"{run.data}, {run.part}: {metrics.sequences} sequences",
         run.convention,
     )
-    if run.data.domain == "traffic":
+    if run.model.domain == "traffic":
         from nnode.app.followers import follower_errors, write_followers  # loads Matplotlib
 
-        rows = follower_errors(run.simulate, run.batches(source), run.store.index)
+        rows = follower_errors(run.simulate, run.batches(), run.source.index)
         if len(rows):
             write_followers(rows, folder)
     print(f"metrics: {folder / 'metrics.json'}")
@@ -225,7 +76,7 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
             stages.begin("drawing")
             path = write_replay(
                 folder / "replay.html",
-                run.store,
+                run.source,
                 run.indices,
                 run.simulate,
                 run.model,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,10 +11,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from nnode.app.cli.runs import RESULT
-from nnode.app.cli.saved import path_given, saved_groups
-from nnode.app.evaluate import SavedRun
-from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.app.cli.saved import load_run
+from nnode.app.saved_run import SavedRun, result_of
 from nnode.calibrate.evaluate import evaluate
 from nnode.data.sequence import Sequence
 from nnode.errors import CheckpointError, ConfigError, unknown_value
@@ -40,33 +37,6 @@ SOURCES = {
     "both": ("measured", "simulated"),
 }
 
-#: Place of the calibrated model in the folder of a training or a diagnosis.
-BEST = Path("checkpoints") / "best.pt"
-
-
-def checkpoint_of(run: str) -> Path:
-    """The checkpoint in a run's folder; a path to a checkpoint is returned unchanged."""
-    place = Path(run).expanduser()
-    return place if place.suffix == ".pt" else place / BEST
-
-
-def result_of(run: str) -> dict[str, Any]:
-    """The content of a run's ``result.json``.
-
-    Raises:
-        CheckpointError: the file is missing or damaged.
-    """
-    path = checkpoint_of(run).parent.parent / RESULT
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CheckpointError(
-            f"{path} cannot be read; give the folder of a complete training"
-        ) from error
-    if not isinstance(content, dict):
-        raise CheckpointError(f"{path} has no entries; give the folder of a complete training")
-    return content
-
 
 def intervals_of(run: str) -> Intervals:
     """The parameters in a run's ``result.json``; empty without the file."""
@@ -75,13 +45,6 @@ def intervals_of(run: str) -> Intervals:
     except (CheckpointError, KeyError):
         return {}
     return parameters if isinstance(parameters, dict) else {}
-
-
-def groups_of_run(overrides: list[str], groups: tuple[str, ...] = ("data", "solver")) -> list[str]:
-    """Overrides that choose the run's data and solver if the user chooses none."""
-    run = path_given(overrides, "run")
-    checkpoint = [] if run is None else [f"checkpoint={checkpoint_of(run)}"]
-    return saved_groups([*overrides, *checkpoint], "checkpoint", groups)
 
 
 @dataclass(frozen=True)
@@ -95,11 +58,11 @@ class _Export:
 
     def trajectories(self, source: str) -> Iterator[Sequence]:
         run = self.run
-        measured = (run.store[i] for i in run.indices)
         if source == "measured":
-            return measured
-        size = run.data.loader.batch_size or len(run.indices)
-        return simulated(run.simulate, measured, size=size, dtype=run.dtype, device=run.device)
+            return (run.measured[i] for i in run.indices)
+        started = (run.source[i] for i in run.indices)
+        size = run.batch_size or len(run.indices)
+        return simulated(run.simulate, started, size=size, dtype=run.dtype, device=run.device)
 
 
 def export(config: DictConfig, folder: Path) -> None:
@@ -109,15 +72,15 @@ def export(config: DictConfig, folder: Path) -> None:
         NNodeError: the run or the data do not exist, or a target is unknown or does not fit the
             model.
     """
-    checkpoint = load_checkpoint(checkpoint_of(config.run))
+    checkpoint = load_run(config.run)
     targets = targets_of(config.to, checkpoint.build())
     if config.trajectories not in SOURCES:
         raise unknown_value("trajectories", config.trajectories, SOURCES)
-    run = SavedRun.of(checkpoint, config, folder)
-    run.model.scene(next(run.batches(run.store)))  # checks the domain
+    run = SavedRun.of_command(checkpoint, config, folder)
+    run.model.scene(next(run.batches()))  # checks the domain
     job = _Export(run, folder, SOURCES[config.trajectories], intervals_of(config.run))
     number = len(run.indices)
-    print(f"{run.data.name}, {run.part}: {number} sequences, model {run.name}")
+    print(f"{run.data}, {run.part}: {number} sequences, model {run.name}")
     written: dict[str, Any] = {}
     for target in targets:
         files, counterpart = WRITERS[target](job)
@@ -196,7 +159,7 @@ def _parquet(job: _Export) -> _Written:
 
 def _csv(job: _Export) -> _Written:
     run = job.run
-    metrics = evaluate(run.simulate, run.batches(run.store), run.convention)
+    metrics = evaluate(run.simulate, run.batches(), run.convention)
     folder, unit = job.folder / "csv", run.convention.unit
     return write_results(folder, run.checkpoint, run.model, metrics, unit), Counterpart()
 

@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig
 
-from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved, options_of
-from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
-from nnode.data.options import DataOptions
-from nnode.data.prepare import open_data
+from nnode.app.cli.saved import load_run
+from nnode.app.saved_run import opened
+from nnode.calibrate.checkpoint import Checkpoint
 from nnode.errors import ConfigError, DownloadError
 from nnode.files import file_name, write_csv
 from nnode.model import System
@@ -52,7 +50,7 @@ def plot_forces(config: DictConfig, folder: Path) -> None:
     paths = [given] if isinstance(given, str) else list(given)
     if not paths:
         raise ConfigError("checkpoint=[] names no checkpoint; give one or more paths")
-    checkpoints = [load_checkpoint(path) for path in paths]
+    checkpoints = [load_run(path) for path in paths]
     taken: set[str] = set()
     models = {_label(checkpoint, taken): checkpoint.build() for checkpoint in checkpoints}
     domains = {model.domain for model in models.values()}
@@ -71,10 +69,8 @@ def plot_forces(config: DictConfig, folder: Path) -> None:
 def _traffic(
     models: dict[str, System], config: DictConfig, first: Checkpoint, folder: Path
 ) -> list[Path]:
-    merged = with_prepared(merge_saved(config, first.config, ("data",)))
-    data: DataOptions = options_of(merged.data)
     try:
-        store = open_data(data, folder / "data")
+        _, store = opened(first, config, folder)
         gaps = measured_gaps(store[i] for i in range(len(store)))
     except DownloadError as error:
         print(f"no histogram of gaps: {error}")

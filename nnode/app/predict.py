@@ -13,18 +13,12 @@ from omegaconf import DictConfig
 from scipy.stats import norm
 
 from nnode.app.calibration import Calibration
-from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved, options_of
-from nnode.app.evaluate import choose
-from nnode.app.export import checkpoint_of, result_of
-from nnode.app.python.inputs import Table, data_used
-from nnode.app.training import started
-from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.app.cli.saved import load_run
+from nnode.app.python.inputs import Table
+from nnode.app.saved_run import SavedRun, result_of
+from nnode.app.training import threads_given_back
 from nnode.calibrate.resampling import Paired, paired
 from nnode.data.clusters import clusters
-from nnode.data.dataset import Source
-from nnode.data.options import DataOptions
-from nnode.data.prepare import open_data
 from nnode.data.sequences import Sequences
 from nnode.errors import CheckpointError, ConfigError
 from nnode.files import write_csv, write_json
@@ -122,6 +116,7 @@ class Predictions:
         return [save(self.plot(), folder / "prediction.png"), table, scores]
 
 
+@threads_given_back()
 def predict_run(
     run: str | Path | Calibration,
     data: Table | Sequences | None = None,
@@ -148,14 +143,10 @@ def predict_run(
             sequence is longer.
     """
     if isinstance(run, Calibration):
-        checkpoint = run.checkpoint
         drivers = None if run.drivers is None else run.drivers.plain()
     else:
-        checkpoint = load_checkpoint(checkpoint_of(str(run)))
-        drivers = result_of(str(run)).get("drivers")
-    noise = _noise(drivers)
-    store = data_used(checkpoint) if data is None else Sequences.of(data)
-    return _predicted(checkpoint, store, *noise, seconds, part)
+        drivers = result_of(run).get("drivers")
+    return _predicted(SavedRun.of_python(run, data, part), *_noise(drivers), seconds)
 
 
 def predict(config: DictConfig, folder: Path) -> None:
@@ -164,12 +155,9 @@ def predict(config: DictConfig, folder: Path) -> None:
     Raises:
         NNodeError: see :func:`predict_run`.
     """
-    checkpoint = load_checkpoint(checkpoint_of(config.run))
     noise = _noise(result_of(config.run).get("drivers"))
-    config = with_prepared(merge_saved(config, checkpoint.config, ("data",)))
-    data: DataOptions = options_of(config.data)
-    store = open_data(data, folder / "data")
-    predictions = _predicted(checkpoint, store, *noise, float(config.seconds), config.part)
+    run = SavedRun.of_command(load_run(config.run), config, folder)
+    predictions = _predicted(run, *noise, float(config.seconds))
     print(predictions)
     for path in predictions.write(folder):
         print(f"{'plot' if path.suffix == '.png' else path.name.partition('.')[0]}: {path}")
@@ -205,12 +193,7 @@ def _noise(drivers: Any) -> tuple[dict[str, float], float]:
 
 
 def _predicted(
-    checkpoint: Checkpoint,
-    store: Source,
-    variances: Mapping[str, float],
-    apart: float,
-    seconds: float,
-    part: str,
+    run: SavedRun, variances: Mapping[str, float], apart: float, seconds: float
 ) -> Predictions:
     from nnode.population.drivers import STEP, obstacle  # compiled code takes a second
     from nnode.population.followers import paths_of
@@ -222,15 +205,13 @@ def _predicted(
             f"seconds={seconds:g}: expected at least {SHORTEST:g} s, as bands after shorter "
             "beginnings are too narrow"
         )
-    model = checkpoint.build().double()
-    store = started(checkpoint, store)
-    _, indices, _ = choose(store, checkpoint, part)
-    chosen = {i: store[i] for i in indices}
+    model, store = run.model.double(), run.source
+    chosen = {i: store[i] for i in run.indices}
     chosen = {i: s for i, s in chosen.items() if s.time[-1] - s.time[0] > seconds + s.dt}
     sequences = list(chosen.values())
     if not sequences:
         raise ConfigError(
-            f"seconds={seconds:g}: none of the {len(indices)} sequences is longer; give fewer"
+            f"seconds={seconds:g}: none of the {len(run.indices)} sequences is longer; give fewer"
         )
     if reason := obstacle(model, sequences, needed=1):
         raise ConfigError(f"followers cannot be predicted: {reason}")

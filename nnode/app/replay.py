@@ -11,10 +11,10 @@ import torch
 
 from nnode.app.python.inputs import Table
 from nnode.calibrate.evaluate import Simulate
+from nnode.data.dataset import Source
 from nnode.data.readers.columns import Table as DataTable
 from nnode.data.readers.table import TableOptions, read_table
 from nnode.data.sequence import Sequence
-from nnode.data.store import Store
 from nnode.discover.report.replay import zone_of
 from nnode.errors import DataError
 from nnode.exchange.trajectories import simulated as simulated_by
@@ -113,7 +113,7 @@ def _at(simulated: Sequence, measured: Sequence) -> np.ndarray:
 
 def write_replay(
     path: Path,
-    store: Store,
+    store: Source,
     indices: list[int],
     simulate: Simulate,
     model: System,

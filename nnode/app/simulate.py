@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
 
 from nnode.app.calibration import Calibration
-from nnode.app.cli.prepared import with_prepared
-from nnode.app.cli.saved import merge_saved, options_of
-from nnode.app.evaluate import choose
-from nnode.app.export import checkpoint_of
-from nnode.app.python.inputs import Table, data_used
-from nnode.app.training import set_threads, started, threads_given_back
-from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
+from nnode.app.cli.saved import load_run
+from nnode.app.python.inputs import Table
+from nnode.app.saved_run import SavedRun, choose
+from nnode.app.training import threads_given_back
 from nnode.calibrate.resampling import paired
 from nnode.data.clusters import clusters
-from nnode.data.dataset import Source
-from nnode.data.options import DataOptions
-from nnode.data.prepare import open_data
 from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError
 from nnode.exchange.trajectories import check_format
@@ -33,6 +26,7 @@ from nnode.generate.simulated import SampledModel, Sampling, Simulated, batches
 FITTED = 200
 
 
+@threads_given_back()
 def simulate_run(
     run: str | Path | Calibration,
     data: Table | Sequences | None = None,
@@ -61,23 +55,9 @@ def simulate_run(
         ConfigError: too few samples, or an unknown part.
         DataError: the data do not exist, or sequences are too short for the fit of the noise.
     """
-    if isinstance(run, Calibration):
-        checkpoint, where = run.checkpoint, ""
-    else:
-        checkpoint, where = load_checkpoint(checkpoint_of(str(run))), str(run)
     _check(samples)
-    store = data_used(checkpoint) if data is None else Sequences.of(data)
-    with threads_given_back():
-        return _simulated(
-            checkpoint,
-            store,
-            checkpoint.config["solver"],
-            run=where,
-            samples=samples,
-            part=part,
-            seed=seed,
-            data=str(checkpoint.config["data"]["name"]),
-        )
+    place = "" if isinstance(run, Calibration) else str(run)
+    return _simulated(SavedRun.of_python(run, data, part), place, samples, seed)
 
 
 def simulate(config: DictConfig, folder: Path) -> None:
@@ -87,21 +67,11 @@ def simulate(config: DictConfig, folder: Path) -> None:
         NNodeError: the run or the data do not exist, or there are too few samples.
     """
     _check(config.samples)
-    checkpoint = load_checkpoint(checkpoint_of(config.run))
+    checkpoint = load_run(config.run)
     if config.format is not None:  # checked before the long computation
         check_format("format", config.format, checkpoint.build().domain)
-    config = with_prepared(merge_saved(config, checkpoint.config, ("data", "solver")))
-    data: DataOptions = options_of(config.data)
-    result = _simulated(
-        checkpoint,
-        open_data(data, folder / "data"),
-        config.solver,
-        run=str(config.run),
-        samples=int(config.samples),
-        part=config.part,
-        seed=int(config.seed),
-        data=data.name,
-    )
+    run = SavedRun.of_command(checkpoint, config, folder)
+    result = _simulated(run, str(config.run), int(config.samples), int(config.seed))
     print(result)
     files = result.write(folder, format=config.format)
     for path in dict.fromkeys(p.parent if p.suffix == ".txt" else p for p in reversed(files)):
@@ -115,24 +85,12 @@ def _check(samples: int) -> None:
         )
 
 
-def _simulated(
-    checkpoint: Checkpoint,
-    store: Source,
-    solver: Any,
-    *,
-    run: str,
-    data: str,
-    samples: int,
-    part: str,
-    seed: int,
-) -> Simulated:
-    model, name = free_running(checkpoint.build()), str(checkpoint.config["model"]["name"])
-    set_threads(checkpoint.config["trainer"]["threads"], model.domain)
-    store = started(checkpoint, store)
-    part, indices, trained = choose(store, checkpoint, part)
+def _simulated(run: SavedRun, place: str, samples: int, seed: int) -> Simulated:
+    model, name, store = free_running(run.model), run.name, run.source
     label = clusters(store.index)
-    training_indices = _some(choose(store, checkpoint, "train")[1], seed)
+    training_indices = _some(choose(store, run.checkpoint, "train")[1], seed)
     training_batches = [batch for batch, _ in batches(store, training_indices, 1)]
+    solver = run.config["solver"]
     steps = {"dt": solver.get("dt"), "method": solver.get("method")}
     constant_speed_model = constant_speed(model.domain)
     noise = {
@@ -146,19 +104,19 @@ def _simulated(
         f"{name}, no noise": SampledModel(model, Noise(0.0, 1.0), steps),
         "constant_speed": SampledModel(constant_speed_model, noise["constant_speed"].noise, {}),
     }
-    job = Sampling(store, indices, samples, seed)
+    job = Sampling(store, run.indices, samples, seed)
     scores = {key: job.scored(sampled_model) for key, sampled_model in samplers.items()}
-    _, numbers = np.unique(label[indices], return_inverse=True)
+    _, numbers = np.unique(label[run.indices], return_inverse=True)
     first = scores[name].sequence_means()
     return Simulated(
-        run=run,
+        run=place,
         model=name,
-        data=data,
-        part=part,
-        trained_on=trained,
+        data=run.data,
+        part=run.part,
+        trained_on=run.trained,
         clusters=int(numbers.max()) + 1,
         noise=noise,
-        means={key: score.means(label[indices]) for key, score in scores.items()},
+        means={key: score.means(label[run.indices]) for key, score in scores.items()},
         minus={
             key: paired(first, score.sequence_means(), numbers, 0)
             for key, score in scores.items()

@@ -69,14 +69,6 @@ def build_solver(options: SolverOptions, device: torch.device | None = None) -> 
     )
 
 
-def started(checkpoint: Checkpoint, store: Source) -> Source:
-    """Sequences with the start speeds of a checkpoint's simulations, as in its training."""
-    model = checkpoint.build()
-    if checkpoint.config["trainer"].get("start_speeds") != StartSpeeds.auto.value:
-        return store
-    return sound_speeds(store, model.domain, model.order)
-
-
 def straight_loader(
     store: Source, indices: list[int], size: int, world: World | None = None
 ) -> DataLoader[Any]:

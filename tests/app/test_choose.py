@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nnode.app.evaluate import choose
+from nnode.app.saved_run import choose
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.data.sequence import Sequence
 from nnode.data.store import Store, write_store

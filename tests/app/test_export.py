@@ -11,10 +11,9 @@ import pandas as pd
 import pytest
 
 import nnode
+from nnode.app.cli.saved import checkpoint_of, saved_groups
 from nnode.app.export import (
     TARGETS,
-    checkpoint_of,
-    groups_of_run,
     intervals_of,
     targets_of,
 )
@@ -173,11 +172,11 @@ def test_a_run_is_named_by_folder_or_checkpoint(tmp_path: Path) -> None:
     assert checkpoint_of(str(tmp_path)) == tmp_path / "checkpoints" / "best.pt"
     assert checkpoint_of(str(tmp_path / "last.pt")) == tmp_path / "last.pt"
     with pytest.raises(CheckpointError, match=r"no checkpoint .*best\.pt"):
-        groups_of_run([f"run={tmp_path}"])
-    assert groups_of_run(["to=csv"]) == []
+        saved_groups([f"run={tmp_path}"], "run")
+    assert saved_groups(["to=csv"], "run") == []
 
 
 def test_the_run_s_own_data_and_solver_are_chosen(traffic: Path) -> None:
-    run = f"run={traffic}"
-    assert groups_of_run([run]) == ["data=demo_traffic", "solver=torchdiffeq"]
-    assert groups_of_run([run, "solver=fused"]) == ["data=demo_traffic"]
+    run, groups = f"run={traffic}", ("data", "solver")
+    assert saved_groups([run], "run", groups) == ["data=demo_traffic", "solver=torchdiffeq"]
+    assert saved_groups([run, "solver=fused"], "run", groups) == ["data=demo_traffic"]

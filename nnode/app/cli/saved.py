@@ -10,7 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from nnode.calibrate.checkpoint import load_checkpoint
+from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint
 from nnode.config import choices
 from nnode.data.options import with_present_names
 from nnode.errors import CheckpointError, ConfigError
@@ -19,6 +19,9 @@ from nnode.program import configuration, own_choices
 
 GROUPS = ("model", "data", "optimizer", "solver")
 
+
+#: Place of the calibrated model in the folder of a training or a diagnosis.
+BEST = Path("checkpoints") / "best.pt"
 
 #: Groups that were taken from the first checkpoint instead of the user.
 _chosen: set[str] = set()
@@ -71,6 +74,21 @@ def make_absolute(data: dict[str, Any]) -> None:
             data[key] = str(Path(place).absolute())
 
 
+def checkpoint_of(run: str | Path) -> Path:
+    """The checkpoint in a run's folder; a path to a checkpoint is returned unchanged."""
+    place = Path(run).expanduser()
+    return place if place.suffix == ".pt" or place.is_file() else place / BEST
+
+
+def load_run(run: str | Path) -> Checkpoint:
+    """The checkpoint of a run, which its folder or its checkpoint names.
+
+    Raises:
+        CheckpointError: the checkpoint is missing or damaged.
+    """
+    return load_checkpoint(checkpoint_of(run))
+
+
 def path_given(overrides: list[str], option: str) -> str | None:
     """The first path that ``option=PATH`` or ``option=[PATH, ...]`` names."""
     given = [value for key, _, value in (o.partition("=") for o in overrides) if key == option]
@@ -81,6 +99,9 @@ def path_given(overrides: list[str], option: str) -> str | None:
 def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GROUPS) -> list[str]:
     """Overrides that choose a checkpoint's groups if the user chooses none.
 
+    Args:
+        option: option that names the checkpoint or its run.
+
     Raises:
         CheckpointError: there is no file ``conf/GROUP/NAME.yaml`` for a group's name. The check is
             necessary because Hydra accepts any path as a name, and such a file can run code.
@@ -88,7 +109,9 @@ def saved_groups(overrides: list[str], option: str, groups: tuple[str, ...] = GR
     path = path_given(overrides, option)
     if path is None:
         return []
-    saved = load_checkpoint(path).config.get("groups", {})
+    # a training is resumed from a checkpoint, since its folder has several
+    checkpoint = load_checkpoint(path) if option == "resume" else load_run(path)
+    saved = checkpoint.config.get("groups", {})
     given = {override.partition("=")[0] for override in overrides}
     chosen = [group for group in groups if group in saved.keys() - given]
     for group in chosen:

@@ -13,10 +13,13 @@ Data are those of the run by default.
 
 from __future__ import annotations
 
+from functools import partial
+
 from nnode.app.cli.run import run
-from nnode.app.export import export, groups_of_run
+from nnode.app.cli.saved import saved_groups
+from nnode.app.export import export
 
 
 def main() -> None:
     """Run this command on the options of the command line."""
-    run("export", export, groups_of_run)
+    run("export", export, partial(saved_groups, option="run", groups=("data", "solver")))

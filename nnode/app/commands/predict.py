@@ -17,10 +17,10 @@ from __future__ import annotations
 from functools import partial
 
 from nnode.app.cli.run import run
-from nnode.app.export import groups_of_run
+from nnode.app.cli.saved import saved_groups
 from nnode.app.predict import predict
 
 
 def main() -> None:
     """Run this command on the options of the command line."""
-    run("predict", predict, partial(groups_of_run, groups=("data",)))
+    run("predict", predict, partial(saved_groups, option="run", groups=("data",)))

@@ -16,11 +16,13 @@ the fit of the noise. Data are those of the run.
 
 from __future__ import annotations
 
+from functools import partial
+
 from nnode.app.cli.run import run
-from nnode.app.export import groups_of_run
+from nnode.app.cli.saved import saved_groups
 from nnode.app.simulate import simulate
 
 
 def main() -> None:
     """Run this command on the options of the command line."""
-    run("simulate", simulate, groups_of_run)
+    run("simulate", simulate, partial(saved_groups, option="run", groups=("data", "solver")))

@@ -14,7 +14,6 @@ from omegaconf import OmegaConf
 
 from nnode.app.cli.saved import GROUPS, merge_saved, refuse_changes, saved_groups
 from nnode.app.cli.typed import group_defaults
-from nnode.app.export import groups_of_run
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
 from nnode.config import choices
 from nnode.errors import CheckpointError, ConfigError
@@ -80,7 +79,7 @@ def test_any_other_name_is_refused(tmp_path: Path, group: str, name: object) -> 
     assert f"give {group}=NAME yourself" in str(error.value)
     if group in ("data", "solver"):
         with pytest.raises(CheckpointError, match=f"no such file in conf/{group}"):
-            groups_of_run([f"run={tmp_path}"])
+            saved_groups([f"run={tmp_path}"], "run")
     # what the user says himself is his own
     assert saved_groups([f"checkpoint={path}", f"{group}=x"], "checkpoint", (group,)) == []
 
