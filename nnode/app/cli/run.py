@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import patch
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -36,9 +37,6 @@ from nnode.program import configuration, running
 from nnode.version import VERSION
 
 Job = Callable[[DictConfig, Path], None]
-
-#: Environment variable that makes Hydra raise errors.
-_RAISE = "HYDRA_FULL_ERROR"
 
 #: Supported flags of Hydra, and those with a value, with the allowed values.
 _FLAGS = ("-h", "--help", "-m", "--multirun", "--version", "--resolve")
@@ -93,8 +91,8 @@ def run(
     except NNodeError as error:
         end(error)
     GlobalHydra.instance().clear()  # a forked process inherits the state
-    os.environ[_RAISE] = "1"
-    with _out_of_sight() as places:
+    # Hydra raises its errors instead of printing them
+    with patch.dict(os.environ, {"HYDRA_FULL_ERROR": "1"}), _out_of_sight() as places:
         sys.argv[1:] = [*given, *places, *flags]
         command = hydra.main(version_base="1.3", config_path=str(configuration()), config_name=name)
         try:
