@@ -227,7 +227,7 @@ def blocks(examination: Examination, lines: list[str]) -> list[Block]:
 
 def _rows(findings: list[Finding]) -> pd.DataFrame:
     rows = [(finding.level, finding.kind, finding.text) for finding in findings]
-    return pd.DataFrame(rows, columns=["", "what", "in words"]).set_index("")
+    return pd.DataFrame(rows, columns=["", "kind", "finding"]).set_index("")
 
 
 def _findings(findings: list[Finding]) -> list[Block]:
@@ -237,8 +237,7 @@ def _findings(findings: list[Finding]) -> list[Block]:
         "*Error*: results would be wrong. *Warning*: check the data before you continue. *Note*: "
         "information."
     )
-    heads = {"what": "kind", "in words": "finding"}
-    return [TableBlock("findings", _rows(findings), caption, heads=heads)]
+    return [TableBlock("findings", _rows(findings), caption)]
 
 
 def _usage(examination: Examination, lines: list[str]) -> str:
@@ -267,22 +266,17 @@ def _columns(examination: Examination) -> list[Block]:
         numeric = len(values) > 0
         rows[column] = {
             "meaning": meaning,
-            "because": "" if guess is None else reasons[guess.sure],
-            "least": f"{values.min():.6g}" if numeric else "",
-            "greatest": f"{values.max():.6g}" if numeric else "",
-            "different": cells.dropna().map(quoted).nunique(),
-            "empty": int(cells.isna().sum()),
+            "recognised by": "" if guess is None else reasons[guess.sure],
+            "minimum": f"{values.min():.6g}" if numeric else "",
+            "maximum": f"{values.max():.6g}" if numeric else "",
+            "distinct values": cells.dropna().map(quoted).nunique(),
+            "missing values": int(cells.isna().sum()),
         }
     table = pd.DataFrame(rows).T.rename_axis("column")
-    heads = {
-        "because": "recognised by",
-        "least": "minimum",
-        "greatest": "maximum",
-        "different": "distinct values",
-        "empty": "missing values",
-    }
-    caption = "Recognised meaning of each column."
-    return [Heading("Columns"), TableBlock("columns", table, caption, heads=heads)]
+    return [
+        Heading("Columns"),
+        TableBlock("columns", table, "Recognised meaning of each column."),
+    ]
 
 
 def _units_blocks(examination: Examination) -> list[Block]:
@@ -309,7 +303,11 @@ def _units_blocks(examination: Examination) -> list[Block]:
         ),
     ]
     rows = {
-        name: {"here": value, "usual": f"{usual.low:g} to {usual.high:g}", "source": usual.source}
+        name: {
+            "median": value,
+            "usual range": f"{usual.low:g} to {usual.high:g}",
+            "source": usual.source,
+        }
         for name, value, usual in values
         if np.isfinite(value) and usual is not None
     }
@@ -320,11 +318,10 @@ def _units_blocks(examination: Examination) -> list[Block]:
             "medians",
             pd.DataFrame(rows).T,
             "Medians in SI units, and usual ranges.",
-            heads={"here": "median", "usual": "usual range"},
         ),
     ]
     if len(examination.scales) > 1:
-        columns = ["of", "positions", "times", "frames/s", "speeds", "probability"]
+        columns = ["domain", "positions", "times", "frames/s", "speeds", "probability"]
         table = pd.DataFrame(
             [
                 (s.domain, s.position, s.time, s.rate, s.speed, s.probability)
@@ -340,7 +337,6 @@ def _units_blocks(examination: Examination) -> list[Block]:
                 "The CSV file contains all combinations.",
                 digits={"probability": 3},
                 full=table,
-                heads={"of": "domain"},
             )
         )
     return blocks

@@ -405,7 +405,7 @@ def _absent(report: Report) -> list[Block]:
         {
             "effect": absence.name,
             "coefficient": absence.coefficient,
-            "found from": amount(absence.detectable if absence.testable else None),
+            "detectable": amount(absence.detectable if absence.testable else None),
             "unit": "" if absence.unit == "1" else absence.unit,
             "remark": absence.reason,
         }
@@ -422,7 +422,6 @@ def _absent(report: Report) -> list[Block]:
             f"80 %. The search has a level of {100 * DiscoverOptions().alpha:g} % over all "
             "effects, so about this share of tables without a hidden effect yields a false "
             "hypothesis.",
-            heads={"found from": "detectable"},
         ),
     ]
 

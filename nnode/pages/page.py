@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,6 @@ class TableBlock:
         bold: True for the cells in bold.
         digits: number of digits after the point, for all columns or by column.
         full: the content of the CSV file, if it is more than the shown table.
-        heads: column to its heading on the page, if it differs from that in the CSV file.
     """
 
     name: str
@@ -79,11 +78,10 @@ class TableBlock:
     bold: pd.DataFrame | None = None
     digits: dict[str, int] | int = tables.DIGITS
     full: pd.DataFrame | None = None
-    heads: dict[str, str] = field(default_factory=dict)
 
     def grid(self) -> tables.Grid:
         """The table as cells of text."""
-        return tables.grid(self.frame, digits=self.digits, bold=self.bold, heads=self.heads)
+        return tables.grid(self.frame, digits=self.digits, bold=self.bold)
 
     def csv(self) -> str:
         """The full table as CSV."""
@@ -226,7 +224,7 @@ def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
 
 def _markdown_table(block: TableBlock) -> str:
     grid = block.grid()
-    names = [block.heads.get(name, tables.column_name(name)) for name in block.frame.columns]
+    names = [tables.column_name(name) for name in block.frame.columns]
     head = grid.head[-1]
     labels = [cell.text for cell in head[: len(head) - len(names)]]
     sides = ["---:" if cell.right else "---" for cell in head[len(labels) :]]

@@ -84,11 +84,7 @@ def number(value: Any, digits: int = DIGITS) -> str:
 
 
 def grid(
-    frame: pd.DataFrame,
-    *,
-    digits: Mapping[str, int] | int,
-    bold: pd.DataFrame | None,
-    heads: Mapping[str, str] | None = None,
+    frame: pd.DataFrame, *, digits: Mapping[str, int] | int, bold: pd.DataFrame | None
 ) -> Grid:
     """A data frame as text; its index becomes the labels of the rows.
 
@@ -98,7 +94,6 @@ def grid(
         frame: numbers, strings, or both.
         digits: number of digits after the point, for all columns or by column.
         bold: table of the same shape, True for cells in bold.
-        heads: column to its heading, if it differs from the name.
 
     Raises:
         ValueError: ``bold`` has other rows or columns than the frame.
@@ -122,8 +117,7 @@ def grid(
         ([column[i] for column in label_cells], [column[i] for column in columns])
         for i in range(len(frame))
     ]
-    shown = frame.rename(columns=dict(heads or {}))
-    return Grid(_head(shown, list(labels.columns), columns), rows)
+    return Grid(_head(frame, list(labels.columns), columns), rows)
 
 
 def _label(value: Any) -> str:

