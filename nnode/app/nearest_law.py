@@ -13,8 +13,9 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
-from nnode.app.python.inputs import MODELS, model_options
+from nnode.app.python.inputs import model_options
 from nnode.app.training import set_threads
+from nnode.config import choices
 from nnode.discover import thresholds
 from nnode.discover.compare.laws import BetterLaw, compare_laws, with_effects
 from nnode.discover.diagnose import STAGES, diagnose
@@ -94,7 +95,7 @@ def candidates(
     names = LAWS[asked.domain] if options.compare is None else options.compare
     models: dict[str, System] = {}
     for name in names:
-        if name not in MODELS:
+        if name not in choices("model"):
             raise ConfigError(
                 f"discover.compare: there is no model {name}, expected some of "
                 f"{', '.join(LAWS[asked.domain])}, or another name as in conf/model"

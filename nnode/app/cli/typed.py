@@ -76,16 +76,18 @@ def group_defaults(section: str, group: str, command: str | None = None) -> dict
     return values
 
 
-def written(section: str, group: str) -> tuple[type, DictConfig]:
-    """A group's schema, and the values in its file.
+def written(section: str, group: str) -> tuple[Any, DictConfig]:
+    """A group's schema, and the values in its file; a law of the package has no file.
 
     Raises:
-        ConfigError: the file does not exist.
+        ConfigError: the group does not exist.
     """
     from nnode.config import SCHEMAS, choices
 
     if group not in choices(section):
         raise unknown_value(section, group, choices(section))
+    if (section, group) in SCHEMAS:
+        return SCHEMAS[section, group], OmegaConf.create()
     values = cast(DictConfig, OmegaConf.load(configuration() / section / f"{group}.yaml"))
     return SCHEMAS[section, str(values.pop("defaults")[0])], values
 

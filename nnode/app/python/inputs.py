@@ -27,20 +27,6 @@ from nnode.data.sequence import Sequence
 from nnode.data.sequences import Sequences, say_recognised
 from nnode.data.store import Store
 from nnode.errors import ConfigError, unknown_value
-from nnode.model.laws import LAW_MODELS
-
-#: Models by their names: those of ``conf/model``, and the laws of the package.
-MODELS: dict[str, dict[str, Any]] = {
-    "lin": {"term": "lin"},
-    "log": {"term": "log"},
-    "n2": {"term": "network_speed", "hidden": 2},
-    "n4": {"term": "network_speed", "hidden": 4},
-    "n10": {"term": "network_speed", "hidden": 10},
-    **LAW_MODELS,
-    "formula": {"term": "formula"},
-    "sf": {"term": "social_force"},
-    "nn": {"term": "network_force"},
-}
 
 Table = str | Path | pd.DataFrame
 
@@ -60,14 +46,8 @@ def model_options(
     Raises:
         ConfigError: an unknown name, term or option.
     """
-    from nnode.config import SCHEMAS
-
-    given = named(model)
-    term = str(given.get("term", ""))
-    schema = SCHEMAS.get(("model", f"{term}_schema"))
-    if schema is None:
-        terms = sorted({node.term for (group, _), node in SCHEMAS.items() if group == "model"})
-        raise unknown_value("model.term", term, terms)
+    schema, values = _schema_and_values("model", model)
+    given = {**values}
     if hasattr(schema, "leader") and leader is not None:
         given.setdefault("leader", leader)
     if effects:
@@ -118,31 +98,29 @@ def choice(
     Raises:
         ConfigError: an unknown name or option.
     """
-    from nnode.config import SCHEMAS
-
-    given = {"name": chosen} if isinstance(chosen, str) else dict(chosen)
-    schemas = {
-        key.removesuffix("_schema"): schema
-        for (section, key), schema in SCHEMAS.items()
-        if section == group
-    }
-    name = str(given.get("name", ""))
-    if name not in schemas:
-        raise unknown_value(group, name, schemas)
-    return merged(group, schemas[name], given, further or {})
+    return merged(group, *_schema_and_values(group, chosen), further or {})
 
 
-def named(model: str | Mapping[str, Any]) -> dict[str, Any]:
-    """A model's options by its name.
+def _schema_and_values(
+    group: str, chosen: str | Mapping[str, Any]
+) -> tuple[Any, Mapping[Any, Any]]:
+    """The schema of a choice, and its values: those of its name, or given ones.
 
     Raises:
-        ConfigError: an unknown name.
+        ConfigError: an unknown name or term.
     """
-    if not isinstance(model, str):
-        return {"name": model.get("term", ""), **model}
-    if model not in MODELS:
-        raise unknown_value("model", model, MODELS)
-    return {"name": model, **MODELS[model]}
+    if isinstance(chosen, str):
+        return written(group, chosen)
+    from nnode.config import SCHEMAS
+
+    key = "term" if group == "model" else "name"
+    kind = str(chosen.get(key, ""))
+    schema = SCHEMAS.get((group, f"{kind}_schema"))
+    if schema is None:
+        names = [name for section, name in SCHEMAS if section == group]
+        kinds = sorted(n.removesuffix("_schema") for n in names if n.endswith("_schema"))
+        raise unknown_value(f"{group}.{key}", kind, kinds)
+    return schema, {"name": kind, **chosen}
 
 
 @python_words()

@@ -16,7 +16,7 @@ from scipy.stats import norm
 from scipy.stats import t as students_t
 
 import nnode
-from nnode.app.python.inputs import named
+from nnode.app.python.inputs import model_options
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.evaluate import evaluate
 from nnode.config import choices
@@ -329,9 +329,9 @@ def test_models_bear_the_names_of_the_configuration() -> None:
     own = {"lin", "log", "n2", "n4", "n10", "formula", "sf", "nn"}
     known = choices("model")
     assert own | set(CAR_FOLLOWING_LAWS) | set(PEDESTRIAN_LAWS) == set(known)
-    assert all(named(name)["name"] == name for name in known)
-    with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of lin, log"):
-        named("lwr")
+    assert all(model_options(name)["name"] == name for name in known)
+    with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of cfsm, esf"):
+        model_options("lwr")
 
 
 def test_the_summary_agrees_with_the_residuals(fitted: nnode.Calibrator) -> None:
