@@ -20,6 +20,13 @@ _CONTROL = re.compile(
     "\ufff9-\ufffb\ud800-\udfff\U000e0000-\U000e007f]"
 )
 
+_DATA_OPTION = re.compile(r"\bdata(=|\.\w)")
+#: Note of an error that names an option of data.
+IN_PYTHON = (
+    "In Python, options of data are arguments without the prefix: data.faults=keep is "
+    "faults='keep', data.columns.x=pos is columns={'x': 'pos'}, data.split.heldout=0 is heldout=0."
+)
+
 
 def printable(text: str, limit: int = LONGEST) -> str:
     """A text that holds parts of files, as it may be shown.
@@ -67,11 +74,14 @@ class NNodeError(Exception):
     """Root of every error that the package raises on purpose.
 
     Texts are made printable, and are at most :data:`LONGEST` characters long: they may quote cells,
-    names of columns and other parts of files.
+    names of columns and other parts of files. They name options of data as on the command line; a
+    note, which only a traceback shows, explains how Python takes them.
     """
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*(printable(a) if isinstance(a, str) else a for a in args))
+        if _DATA_OPTION.search(str(self)):
+            self.add_note(IN_PYTHON)
 
 
 class DataError(NNodeError):

@@ -26,7 +26,6 @@ from nnode.app.python.inputs import (
     table_options,
 )
 from nnode.app.python.report import Report
-from nnode.app.python.words import python_words
 from nnode.app.training import brief, check_domain
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
@@ -113,7 +112,6 @@ def discover(config: DictConfig, folder: Path) -> None:
         raise Interrupted(f"stopped by {name} when all was written", guard.requested)
 
 
-@python_words()
 def diagnose_table(
     data: Table | Sequences,
     domain: str | None = None,

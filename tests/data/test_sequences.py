@@ -121,9 +121,9 @@ def test_what_holds_no_trajectories_is_refused(tidy: pd.DataFrame) -> None:
     ):
         with pytest.raises(DataError, match=message):
             nnode.Sequences(wrong)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match=r"data='esima' is unknown.*did you mean esimas"):
+    with pytest.raises(ConfigError, match=r"data=esima is unknown.*did you mean esimas"):
         nnode.sequences(data="esima")
-    with pytest.raises(ConfigError, match=r"no option colums; .*did you mean columns"):
+    with pytest.raises(ConfigError, match=r"no option data.colums; .*did you mean data.columns"):
         nnode.sequences(tidy, data="pairs", colums={})
     with pytest.raises(ConfigError, match="no data frame; give their path"):
         nnode.sequences(tidy, data="juelich")

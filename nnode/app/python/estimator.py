@@ -25,7 +25,6 @@ from nnode.app.python.inputs import (
     model_options,
     sequences,
 )
-from nnode.app.python.words import python_words
 from nnode.app.training import (
     build_solver,
     check,
@@ -102,7 +101,6 @@ class Calibrator:
     heldout: float = 0.0
     seed: int = 0
 
-    @python_words()
     @threads_given_back()
     def fit(self, X: Any, y: object = None, groups: object = None) -> Self:
         """Calibrate.
@@ -131,7 +129,6 @@ class Calibrator:
         self.history_: pd.DataFrame = self.result_.history
         return self
 
-    @python_words()
     @threads_given_back()
     def predict(self, X: Any) -> Sequences:
         """Simulate every sequence from its measured start.
@@ -154,7 +151,6 @@ class Calibrator:
         manifest = {"simulated": self.result_.name, "led": model.leader_measured}
         return Sequences(self.result_.simulated(given), manifest)
 
-    @python_words()
     def score(self, X: Any, y: object = None) -> float:
         """Minus the root mean square distance (m) of simulated from measured positions.
 

@@ -15,7 +15,6 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException, Vali
 from nnode.app.cli.mistakes import unknown_option, wrong_value
 from nnode.app.cli.saved import options_of, plain
 from nnode.app.cli.typed import changed_options, written
-from nnode.app.python.words import python_words
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.data.check.recognise import NEEDED, has_columns, recognised
 from nnode.data.dataset import Source
@@ -123,7 +122,6 @@ def _schema_and_values(
     return schema, {"name": kind, **chosen}
 
 
-@python_words()
 def sequences(
     table: pd.DataFrame | str | Path | Iterable[Sequence] | None = None,
     *,
