@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import options_of, plain_config
 from nnode.app.cli.typed import changes, group_defaults, plain_options, shell_override
-from nnode.app.nearest_law import Job, candidates, diagnosed, unwatched
+from nnode.app.nearest_law import Job, candidates, diagnosed
 from nnode.app.python.inputs import (
     Table,
     data_of,
@@ -97,7 +97,7 @@ def discover(config: DictConfig, folder: Path) -> None:
         data: DataOptions = options_of(config.data)
         read = partial(read_inputs, data, folder / "data")
         job = _job(plain["model"], data, plain["data"], plain["groups"], options, read)
-        diagnoses = diagnosed(job, Stages)
+        diagnoses = diagnosed(job)
         with Stages("drawing", {"drawing": 5.0}) as stages:
             stages.begin("drawing")
             written = [_drawn(*result) for result in _places(diagnoses, folder)]
@@ -160,7 +160,7 @@ def diagnose_table(
         return inputs_of(Sequences.of(source, with_faulty(data_options)), data_options)
 
     job = _job(plain_model, data_options, plain_options(data_options), groups, chosen, read)
-    diagnoses = diagnosed(job, unwatched)
+    diagnoses = diagnosed(job)
     if place is not None:
         for result in reversed(_places(diagnoses, place)):
             _drawn(*result)()

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -70,14 +69,6 @@ class Job:
         return str(self.model["name"])
 
 
-#: A function that shows the progress of a task, from its name and the durations of its stages.
-Watch = Callable[[str, dict[str, float]], AbstractContextManager[Stages | None]]
-
-
-def unwatched(name: str, stages: dict[str, float]) -> AbstractContextManager[None]:
-    return nullcontext()
-
-
 def candidates(
     model: Mapping[str, Any], asked: System, options: DiscoverOptions
 ) -> dict[str, System]:
@@ -119,7 +110,7 @@ def law_options(name: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     return {**options, **{key: asked[key] for key in SHARED if key in asked and key in options}}
 
 
-def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
+def diagnosed(job: Job) -> list[tuple[Job, DiagnosisOutcome]]:
     """Diagnoses of the requested law and of the nearest law, if it is another one.
 
     Laws are compared without effects, then with the effects that the nearest law lacks, and then
@@ -134,14 +125,22 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
     ) -> tuple[Laws, dict[str, System]]:
         nonlocal seconds
         start = time.monotonic()
-        ranking, calibrated = _compared(job, with_effects(models, effects), watch)
+        with Stages("laws", {"comparing laws": 10.0}) as stages:
+            stages.begin("comparing laws")
+            ranking, calibrated = compare_laws(
+                with_effects(models, effects),
+                job.name,
+                job.inputs.sequences,
+                job.options,
+                stages.within,
+            )
         ranking.effects = [effect.name for effect in effects]
         seconds += time.monotonic() - start
         return ranking, calibrated
 
     laws, systems = compared(job.laws, []) if job.laws else (None, {})
     nearest = _with_law(job, _nearest(laws, job)) if laws else job
-    outcome = _diagnose(nearest, watch)
+    outcome = _diagnose(nearest)
     effects, second_comparison = _added_effects(nearest, outcome), None
     calibrated_laws: dict[str, System] = {}
     if systems and effects:
@@ -149,8 +148,8 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
         best = _nearest(second_comparison, nearest)
         if best != nearest.name:
             nearest = _with_law(job, best)
-            outcome = _diagnose(nearest, watch, hint=calibrated_laws[best])
-    diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws, watch)
+            outcome = _diagnose(nearest, hint=calibrated_laws[best])
+    diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws)
     # effects that are built into other laws are excluded, because they would favour laws that
     # imitate those
     names = {effect.name for effect in effects}
@@ -161,8 +160,8 @@ def diagnosed(job: Job, watch: Watch) -> list[tuple[Job, DiagnosisOutcome]]:
         last, calibrated_laws = compared(systems, effects + further)
         if last.p_values.get(nearest.name, 1.0) <= thresholds.LEVEL:
             second_comparison, nearest = last, _with_law(job, last.best)
-            outcome = _diagnose(nearest, watch, hint=calibrated_laws[last.best])
-            diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws, watch)
+            outcome = _diagnose(nearest, hint=calibrated_laws[last.best])
+            diagnoses = _diagnoses(job, nearest, outcome, calibrated_laws)
     first = diagnoses[0][1].diagnosis
     first.laws, first.laws_again = laws, second_comparison
     for comparison in filter(None, (laws, second_comparison)):
@@ -189,29 +188,20 @@ def _diagnoses(
     nearest: Job,
     outcome: DiagnosisOutcome,
     calibrated_laws: dict[str, System],
-    watch: Watch,
 ) -> list[tuple[Job, DiagnosisOutcome]]:
     """The diagnosis of the requested law, if it is not the nearest, and of the nearest law."""
     if nearest.name == job.name:
         return [(nearest, outcome)]
     nearer = BetterLaw(nearest.name, outcome.searched)
-    return [(job, _diagnose(job, watch, nearer, calibrated_laws.get(job.name))), (nearest, outcome)]
-
-
-def _compared(job: Job, laws: dict[str, System], watch: Watch) -> tuple[Laws, dict[str, System]]:
-    with watch("laws", {"comparing laws": 10.0}) as stages:
-        if stages is not None:
-            stages.begin("comparing laws")
-        within = [] if stages is None else [stages.within]
-        return compare_laws(laws, job.name, job.inputs.sequences, job.options, *within)
+    return [(job, _diagnose(job, nearer, calibrated_laws.get(job.name))), (nearest, outcome)]
 
 
 def _diagnose(
-    job: Job, watch: Watch, nearer: BetterLaw | None = None, hint: System | None = None
+    job: Job, nearer: BetterLaw | None = None, hint: System | None = None
 ) -> DiagnosisOutcome:
     """Run the diagnosis, and add faults of the data, notes and the name of the model."""
     inputs, name = job.inputs, job.name
-    with watch(f"diagnosis of {name}", STAGES) as stages:
+    with Stages(f"diagnosis of {name}", STAGES) as stages:
         outcome = diagnose(
             job.system, inputs.sequences, job.options, stages=stages, nearer=nearer, hint=hint
         )
