@@ -1,7 +1,7 @@
-"""The configuration's schema: dataclasses, registered with Hydra.
+"""The configuration's schemas: dataclasses that are registered with Hydra.
 
-Every group file in ``conf/`` starts from one of these, so that an unknown or wrong-typed option
-is refused before any work starts.
+Every group file in ``conf/`` starts from one of them, so an unknown option or a value of the wrong
+type is refused before any work starts. The comments are the texts of ``--help``.
 """
 
 from __future__ import annotations
@@ -63,36 +63,37 @@ class TrainConfig:
     solver: Any = MISSING
     optimizer: Any = MISSING
     trainer: TrainerOptions = field(default_factory=TrainerOptions)
-    seed: int = 0  # of start weights, order of mini-batches and noise
-    resume: str | None = None  # a checkpoint to go on from
+    seed: int = 0  # seed of start weights, of the order of mini-batches and of noise
+    resume: str | None = None  # checkpoint of a stopped run, which is continued
 
 
 @dataclass
 class PrepareConfig:
-    """``nnode prepare_data``: raw recordings to sequences."""
+    """``nnode prepare_data``: conversion of raw recordings to sequences."""
 
     data: Any = MISSING
 
 
 @dataclass
 class CheckConfig:
-    """``nnode check``: what a file holds and what is wrong with it."""
+    """``nnode check``: content and problems of a file."""
 
-    file: str = MISSING  # CSV, text of numbers, Parquet, or any other file that docs/data.md lists
-    domain: str | None = None  # traffic | crowd; null guesses
-    frame_rate: float | None = None  # 1/s, that the file is said to have; null: as it tells
+    file: str = MISSING  # CSV, text of numbers, Parquet, or another format in docs/data.md
+    domain: str | None = None  # traffic | crowd; null recognises the domain
+    frame_rate: float | None = None  # frames per second, 1/s; null reads the rate from the file
 
 
 @dataclass
 class EvaluateConfig:
-    """``nnode evaluate``: errors of a checkpoint beside its baselines."""
+    """``nnode evaluate``: errors of a checkpoint and of baselines."""
 
     checkpoint: str = MISSING  # RUN/checkpoints/best.pt
     data: Any = MISSING
     solver: Any = MISSING
     device: Device = Device.auto
-    part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
-    replay: bool = True  # replay.html: measured and simulated agents side by side
+    part: str = "auto"  # heldout | train | unseen | all; auto: the first that exists, except train
+    # whether replay.html is written, an animation of measured and simulated agents
+    replay: bool = True
 
 
 @dataclass
@@ -100,7 +101,8 @@ class ExportConfig:
     """``nnode export``: a run's results in the formats of other programs."""
 
     run: str = MISSING  # folder of a training or a diagnosis
-    to: Any = "auto"  # jupedsim | sumo | pedpy | fcd | parquet | csv, or a list; auto: all that fit
+    # jupedsim | sumo | pedpy | fcd | parquet | csv, or a list; auto: all formats that fit the model
+    to: Any = "auto"
     trajectories: str = "both"  # measured | simulated | both
     part: str = "all"  # heldout | train | unseen | all | auto
     data: Any = MISSING
@@ -110,52 +112,57 @@ class ExportConfig:
 
 @dataclass
 class DriveConfig:
-    """``nnode drive``: a calibrated law drives vehicles in SUMO."""
+    """``nnode drive``: control of vehicles in SUMO by a calibrated law."""
 
     run: str = MISSING  # folder of a training or a diagnosis
     sumo: str = MISSING  # SUMO's configuration, *.sumocfg
-    vehicles: Any = MISSING  # type of the vehicles to drive, or a list of types
-    program: str = "libsumo"  # libsumo | traci
-    steps: str = "match"  # match | run | scenario: whose steps SUMO makes
-    end: float | None = None  # s of SUMO's clock; null: the scenario's, or when all have arrived
-    far: float | None = None  # m at which a vehicle ahead counts as none; null: 5000
-    lengths: bool | None = None  # gaps are bumper to bumper; null: as the run's data had lengths
-    lane_changes: bool = False  # whether SUMO may change lanes of driven vehicles
-    seed: int = 0  # of the numbers of drivers who differ
+    vehicles: Any = MISSING  # type of the controlled vehicles, or a list of types
+    program: str = "libsumo"  # libsumo (in this process) | traci (in another process)
+    # match: the scenario must have the run's steps | run: SUMO uses the run's steps |
+    # scenario: SUMO uses the scenario's steps
+    steps: str = "match"
+    # end on SUMO's clock, s; null: the scenario's end, or the arrival of all vehicles
+    end: float | None = None
+    far: float | None = None  # distance beyond which a vehicle ahead is ignored, m; null: 5000
+    # whether gaps are bumper to bumper; null: if the run's data had lengths of vehicles
+    lengths: bool | None = None
+    lane_changes: bool = False  # whether SUMO may change the lanes of controlled vehicles
+    seed: int = 0  # seed of random drivers
 
 
 @dataclass
 class SimulateConfig:
-    """``nnode simulate``: sampled motion of a calibrated model, with its scores."""
+    """``nnode simulate``: sampled motion of a calibrated model, with scores."""
 
     run: str = MISSING  # folder of a training or a diagnosis
-    samples: int = 99  # of every sequence, at least 39
-    part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
-    # of the samples: parquet | csv (data=table reads both) | pedpy (people) | fcd (vehicles, as
-    # SUMO writes them); null: no samples
+    samples: int = 99  # number of samples of every sequence, at least 39
+    part: str = "auto"  # heldout | train | unseen | all; auto: the first that exists, except train
+    # format of the samples: parquet | csv (both are read by data=table) | pedpy (people) | fcd
+    # (vehicles, SUMO's floating car data); null writes no samples
     format: str | None = "parquet"
-    seed: int = 0  # of all that is drawn
+    seed: int = 0  # seed of all random numbers
     data: Any = MISSING
     solver: Any = MISSING
 
 
 @dataclass
 class PredictConfig:
-    """``nnode predict``: followers predicted from the first seconds of their paths."""
+    """``nnode predict``: prediction of followers from the first seconds of their paths."""
 
     run: str = MISSING  # folder of a training with drivers who differ
     seconds: float = 3.0  # length of the known beginning, at least 2
-    part: str = "auto"  # heldout | train | unseen | all; auto: the first there is, not train
+    part: str = "auto"  # heldout | train | unseen | all; auto: the first that exists, except train
     data: Any = MISSING
 
 
 @dataclass
 class PlotForcesConfig:
-    """``nnode plot_forces``: what calibrated models have learned."""
+    """``nnode plot_forces``: forces and speed curves of calibrated models."""
 
     checkpoint: Any = MISSING  # one path or a list of paths
     data: Any = MISSING
-    extent: float | None = None  # m, of contours; null suits the model
+    # half width of the contour plots, m; null: a width that suits the model
+    extent: float | None = None
 
 
 @dataclass
@@ -167,7 +174,7 @@ class StudyConfig:
 
 @dataclass
 class DiscoverConfig:
-    """``nnode discover``: what a model lacks."""
+    """``nnode discover``: diagnosis of a model."""
 
     model: Any = MISSING
     data: Any = MISSING
@@ -189,7 +196,7 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
     ("model", "lin_schema"): LawOptions(term="lin"),
     ("model", "log_schema"): LawOptions(term="log"),
     ("model", "formula_schema"): FormulaOptions(term="formula"),
-    # a law is chosen by its name; its file among the laws is all that it needs
+    # laws of the package need no file in conf/model
     **{
         ("model", name): FormulaOptions(name=name, **options)
         for name, options in LAW_MODELS.items()
@@ -222,20 +229,22 @@ SCHEMAS: dict[tuple[str | None, str], Any] = {
 
 
 def choices(group: str) -> list[str]:
-    """Names that a group of the configuration has: those of the files ``conf/GROUP/NAME.yaml``, and
-    of the laws."""
+    """The names in a group of the configuration: those of the files ``conf/GROUP/NAME.yaml``, and
+    those of the laws."""
     files = {path.stem for path in (configuration() / group).glob("*.yaml")}
-    return sorted(files | {n for own, n in SCHEMAS if own == group and not n.endswith("_schema")})
+    return sorted(
+        files | {n for section, n in SCHEMAS if section == group and not n.endswith("_schema")}
+    )
 
 
 @cache
 def register() -> None:
-    """Make all schemas known to Hydra, once in a process."""
+    """Register all schemas with Hydra, once in a process."""
     store = ConfigStore.instance()
     for (group, name), schema in SCHEMAS.items():
         node = OmegaConf.structured(schema)
         for key in node:
             if OmegaConf.get_type(node, key) is dict:
-                # so that data.columns.time=t can be typed without the plus that Hydra asks for
+                # allows data.columns.time=t without the plus sign that Hydra would require
                 OmegaConf.set_struct(node[key], False)
         store.store(group=group, name=name, node=node)

@@ -70,8 +70,8 @@ class StartSpeeds(str, Enum):
 class SolverOptions:
     """Options of all solvers."""
 
-    name: str = MISSING  # of the solver
-    # s, step; null: 0.002 for speeds and 0.1 for accelerations of vehicles, 0.0625 in crowds
+    name: str = MISSING  # name of the solver
+    # step, s; null: 0.002 for speeds and 0.1 for accelerations of vehicles, 0.0625 in crowds
     dt: float | None = None
     # euler, ballistic, semi_implicit, rk4, or others of torchdiffeq; null: the law's method, rk4
     # for smooth laws, ballistic for other accelerations of vehicles, otherwise euler
@@ -85,7 +85,7 @@ class TorchdiffeqOptions(SolverOptions):
     name: str = "torchdiffeq"
     gradient: Gradient = Gradient.adjoint
     rtol: float = 1e-6  # relative tolerance of methods that choose their steps
-    atol: float = 1e-8  # absolute tolerance of those, m
+    atol: float = 1e-8  # absolute tolerance of methods that choose their steps, m
 
 
 @dataclass
@@ -93,8 +93,9 @@ class FusedOptions(SolverOptions):
     """See :class:`nnode.simulation.FusedSolver`."""
 
     name: str = "fused"
-    threads: int = 1  # of the compiled kernels
-    cutoff: float | None = None  # m, crowds: largest distance of interactions; null: cutoff_error
+    threads: int = 1  # number of threads of the compiled kernels
+    # crowds: largest distance of interactions, m; null: by cutoff_error
+    cutoff: float | None = None
     cutoff_error: float = 1e-10  # without cutoff: largest omitted social force, in units of A
 
 
@@ -106,19 +107,21 @@ class TrainerOptions:
     evaluate_every: int = 1  # epochs between costs, checkpoints and points of the curves
     # sequences whose cost selects the best checkpoint; heldout makes them part of the training
     monitor: Monitor = Monitor.train
-    patience: int | None = None  # evaluations without progress before stopping; null never
-    min_delta: float = 0.0  # the smallest improvement that counts as progress
+    # evaluations without progress before the training stops; null: no limit
+    patience: int | None = None
+    min_delta: float = 0.0  # smallest decrease of the cost that counts as progress
     cost: Convention = Convention.integral
-    pooling: Pooling = Pooling.pooled  # parameters of all sequences, or of each
+    pooling: Pooling = Pooling.pooled  # shared by all sequences, or separate for each
     # none | auto | [T, v0]: parameters that differ between drivers, see nnode.population; auto:
     # those whose variance the data determine; null: auto for laws of second order with
     # optimizer=gauss_newton if position errors are at most 0.45 m and not smoothed, otherwise none
     drivers: Any = None
-    # first speeds of training sequences: given by the data, or fitted; auto: by the noise of the
-    # measurement
+    # first speeds of training sequences: given by the data, or fitted; auto: depending on the noise
+    # of the measurement
     start_speeds: StartSpeeds = StartSpeeds.auto
     dtype: Precision = Precision.float64
     device: Device = Device.auto
-    threads: int | None = None  # of torch; null: one for traffic, all cores for crowds
-    save_every: float = 30.0  # s between checkpoints within an epoch
-    figure_every: int = 50  # epochs between force curves in TensorBoard; 0 draws none
+    # number of torch's threads; null: one for traffic, one per core for crowds
+    threads: int | None = None
+    save_every: float = 30.0  # time between checkpoints within an epoch, s
+    figure_every: int = 50  # epochs between force curves in TensorBoard; 0: no curves

@@ -17,7 +17,7 @@ from nnode.errors import ConfigError
 
 
 class Faults(str, Enum):
-    """What becomes of sequences in which a fault of the measurement was found."""
+    """Treatment of sequences with faults of the measurement."""
 
     drop = "drop"
     keep = "keep"
@@ -55,9 +55,9 @@ class Starts(str, Enum):
 class SplitOptions:
     """Which sequences are held out from training."""
 
-    heldout: float = 0.2  # share of the sequences, 0 keeps all for training
+    heldout: float = 0.2  # share of the sequences; 0: all are used for training
     mode: SplitMode = SplitMode.auto
-    seed: int = 0  # of a random split
+    seed: int = 0  # seed of a random split
     gap: float = 5.0  # s; without identifiers, sequences closer in time may share an agent
 
 
@@ -65,9 +65,9 @@ class SplitOptions:
 class LoaderOptions:
     """How prepared sequences are streamed as mini-batches."""
 
-    batch_size: int = 32  # at most so many sequences per mini-batch; 0 takes all at once
-    workers: int = 0  # processes that load; 0 loads in the training's own
-    shuffle: bool = True  # a new order in every epoch
+    batch_size: int = 32  # largest number of sequences per mini-batch; 0: all sequences
+    workers: int = 0  # number of processes that load sequences; 0: the process of the training
+    shuffle: bool = True  # whether every epoch has a new order
 
 
 @dataclass
@@ -79,22 +79,23 @@ class DataOptions:
 
     name: str = MISSING  # label in results and plots
     domain: str = MISSING  # traffic (positions x) | crowd (x and y)
-    # folder with the raw files, or a URL; NNODE_DATA in the environment sets that of public data;
-    # null downloads those
+    # folder with the raw files, or a URL; null: the folder in the environment variable NNODE_DATA,
+    # or else public data are downloaded
     source: str | None = None
     download: str | None = None  # folder for downloaded files; null: raw/ in the run's folder
     prepared: str | None = None  # folder that prepare_data wrote; null prepares on the fly
     recording: Any = "all"  # "all", a name, or a list of names
     faults: Faults = Faults.drop
-    # s; missing samples are interpolated where no more time than this is missing, longer holes cut
-    # a record in two; 0: nothing is interpolated
+    # longest time without samples that is interpolated, s; longer gaps cut a record in two; 0: no
+    # interpolation
     fill: float = 0.5
-    # s, window of the local cubics that smooth positions and give speeds; null: as measured
+    # window of the local cubic polynomials that smooth positions and give speeds, s; null: no
+    # smoothing
     smooth: float | None = None
-    # whether one identifier in two sequences of a recording is one agent
+    # whether an identifier is one agent within a sequence only, or within the whole recording
     agents: Agents = Agents.auto
-    # speeds at the first sample, with which simulations start; smoothed: those of parabolas through
-    # the first 2 s of positions
+    # speeds at the first sample, with which simulations start; smoothed: those of parabolas that
+    # are fitted to the first 2 s of positions
     start_speeds: Starts = Starts.measured
     split: SplitOptions = field(default_factory=SplitOptions)
     loader: LoaderOptions = field(default_factory=LoaderOptions)

@@ -18,24 +18,25 @@ from nnode.model.effects.own import VARIABLE
 class DiscoverOptions:
     """Options of the diagnosis."""
 
-    sealed: float = 0.3  # share of the clusters that nothing looks at before the last step
+    sealed: float = 0.3  # share of the clusters that are used only for the confirmation
     gap: float = 5.0  # s; sequences without identifiers that are closer in time are one cluster
-    alpha: float = 0.05  # rate of false alarms over all effects together
-    seed: int = 0  # of the split, of resampling and of a network's start weights
-    effects: list[str] | None = None  # names of the catalogue to look for; null: all
-    exclude: list[str] = field(default_factory=list)  # names not to look for
-    # models to compare before effects are looked for; null: the domain's laws; []: none
+    alpha: float = 0.05  # rate of false alarms over all effects
+    seed: int = 0  # seed of the split, of resampling and of a network's start weights
+    # names of the effects that are tested; null: all of the catalogue
+    effects: list[str] | None = None
+    exclude: list[str] = field(default_factory=list)  # names of effects that are not tested
+    # models that are compared before effects are tested; null: the domain's laws; []: none
     compare: list[str] | None = None
-    # positions without white errors were smoothed before: their errors are autocorrelated, and one
-    # position in a second is used; null: whether the data source is known for it
+    # whether positions were smoothed before they were published, so that their errors are
+    # autocorrelated and one position per second is used; null: true for known sources of such data
     smoothed: bool | None = None
-    max_effects: int = 4  # at most so many are added
-    structure: bool = (
-        True  # look for what has no name; without, it is faster and nothing is unknown
-    )
-    step: float | None = None  # s, of the simulations that maps show; null takes the domain's
+    max_effects: int = 4  # largest number of added effects
+    # whether structure without a named effect is tested; without this test the diagnosis is faster,
+    # and its verdict is never "unknown"
+    structure: bool = True
+    step: float | None = None  # step of the simulations in maps, s; null takes the domain's
     page: bool = True  # report.html with figures, and figures in TensorBoard
-    replay: bool = True  # sealed sequences in a player on the page
+    replay: bool = True  # whether the page has a player with the confirmation sequences
 
 
 def check_options(options: DiscoverOptions, domain: Domain, order: int = 1) -> list[str]:

@@ -29,10 +29,10 @@ _FIELD = re.compile(r"((?:^    # .*\n)*)^    (\w+): [^#\n]*(?:  # (.*))?$", re.M
 WIDTH, LEFT = 100, 34
 
 _FLAGS = {
-    "-h, --help": "this text; with choices, such as --help model=n4, the options of those",
-    "-m, --multirun": "a run for every combination of values given as NAME=A,B",
+    "-h, --help": "print this text; --help model=n4, for example, prints the options of a choice",
+    "-m, --multirun": "run every combination of values, given as NAME=A,B",
     "--cfg job": "print the whole configuration and do nothing",
-    "--config-dir FOLDER": "take further choices from FOLDER/GROUP/NAME.yaml",
+    "--config-dir FOLDER": "add the choices in FOLDER/GROUP/NAME.yaml",
     "--version": "print the version",
 }
 
@@ -55,12 +55,12 @@ def help_text(name: str, *, _root_: DictConfig) -> str:
             rows = [_row(f"{' *'[n == chosen]} {n}", text, 18) for n, text in sorted(about.items())]
             choices.append("\n".join([f"{group}=", *rows]))
     if choices:
-        choices.insert(0, "Choices, GROUP=NAME; those with * are taken now")
+        choices.insert(0, "Choices, GROUP=NAME; * marks the present choice")
     config = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
-    head = "Options, NAME=VALUE, with their values now; null means none"
+    head = "Options, NAME=VALUE, with their present values; null means none"
     parts = [words(name), *choices, head, "\n".join(_options(_root_, plain(config)))]
     place = re.sub(r"\d{4}(-\d\d){2}_\d\d(-\d\d){2}", "TIME", hydra.run.dir)
-    flags = {"hydra.run.dir=FOLDER": f"folder of the results; without it {place}", **_FLAGS}
+    flags = {"hydra.run.dir=FOLDER": f"folder of the results; the default is {place}", **_FLAGS}
     parts.append("\n".join(["Running", *(_row(*flag) for flag in flags.items())]))
     return "\n\n".join(parts).replace("$", "$$")
 
@@ -76,7 +76,7 @@ def _options(node: DictConfig, values: dict[str, Any], prefix: str = "") -> Iter
     texts = remarks(kind) if is_dataclass(kind) else {}
     for key, value in values.items():
         if OmegaConf.is_missing(node, key):
-            yield _row(f"{prefix}{key}=...", f"must be given: {texts.get(key, '')}")
+            yield _row(f"{prefix}{key}=...", f"required: {texts.get(key, '')}")
         elif is_dataclass(OmegaConf.get_type(node, key)):
             yield from _options(node[key], value, f"{prefix}{key}.")
         else:

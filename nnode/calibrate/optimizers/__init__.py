@@ -21,7 +21,7 @@ from nnode.model.system import System
 class OptimizerOptions:
     """Options of all optimisers."""
 
-    name: str = MISSING  # of the optimiser
+    name: str = MISSING  # name of the optimiser
 
 
 @dataclass
@@ -31,9 +31,9 @@ class AdadeltaOptions(OptimizerOptions):
     name: str = "adadelta"
     lr: float = 1.0  # factor on the steps
     rho: float = 0.95  # memory of squared gradients and steps, below 1
-    eps: float = 1e-6  # added to both under the root
+    eps: float = 1e-6  # constant that is added to both averages
     eta1: float = 1.0  # variance of the noise: eta1 / (1 + k)^eta2
-    eta2: float = 0.55  # how fast the noise decays with the step k
+    eta2: float = 0.55  # exponent of the decay of the noise with the step k
 
 
 @dataclass
@@ -44,7 +44,7 @@ class AdamOptions(OptimizerOptions):
     lr: float = 0.05  # step
     beta1: float = 0.9  # memory of gradients
     beta2: float = 0.999  # memory of squared gradients
-    eps: float = 1e-8  # added to their root
+    eps: float = 1e-8  # constant that is added to the root of the average square
 
 
 @dataclass
@@ -52,9 +52,9 @@ class LbfgsOptions(OptimizerOptions):
     """L-BFGS with a strong Wolfe line search; requires all sequences in one mini-batch."""
 
     name: str = "lbfgs"
-    lr: float = 1.0  # first length tried by the line search
+    lr: float = 1.0  # first step length of the line search
     max_iter: int = 20  # iterations per step, which is an epoch
-    history: int = 20  # steps that the curvature is taken from
+    history: int = 20  # number of steps from which the curvature is estimated
 
 
 @dataclass
@@ -62,8 +62,8 @@ class GaussNewtonOptions(OptimizerOptions):
     """Damped Gauss-Newton; formulas of lanes or people, solver=fused, all sequences at once."""
 
     name: str = "gauss_newton"
-    damping: float = 1e-3  # of the first step, relative to each parameter's curvature
-    tolerance: float = 1e-9  # ends when a step lowers the cost by less than this share
+    damping: float = 1e-3  # damping of the first step, relative to each parameter's curvature
+    tolerance: float = 1e-9  # relative decrease of the cost per step at which the calibration ends
 
 
 def _trained(model: System) -> list[torch.nn.Parameter]:
