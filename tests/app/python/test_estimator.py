@@ -330,7 +330,7 @@ def test_models_bear_the_names_of_the_configuration() -> None:
     known = choices("model")
     assert own | set(CAR_FOLLOWING_LAWS) | set(PEDESTRIAN_LAWS) == set(known)
     assert all(model_options(name)["name"] == name for name in known)
-    with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of cfsm, esf"):
+    with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of a10, a2"):
         model_options("lwr")
 
 
