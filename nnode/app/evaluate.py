@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pandas as pd
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 
 from nnode.app.cli.saved import load_run
 from nnode.app.saved_run import SavedRun
-from nnode.calibrate.cost import Convention
 from nnode.calibrate.evaluate import Metrics, Simulate, baselines, evaluate
+from nnode.errors import printable
 from nnode.files import write_json
 from nnode.progress import Stages
 
@@ -27,8 +26,10 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     checkpoint = load_run(config.checkpoint)
     run = SavedRun.of_command(checkpoint, config, folder)
     if run.trained is None:
-        print("these files were cut into sequences in another way than in training: some of what")
-        print("is evaluated may have been trained on")
+        print(
+            "These files are divided into other sequences than in the training, so the evaluated "
+            "sequences may contain training data."
+        )
     elif run.trained and run.part != "train":
         print(f"{run.trained} of the {len(run.indices)} sequences were trained on")
     others = baselines(run.model, run.solver, checkpoint.free_speed)
@@ -60,7 +61,7 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
     _print(
         {run.name: metrics, **errors},
         f"{run.data}, {run.part}: {metrics.sequences} sequences",
-        run.convention,
+        run.convention.unit,
     )
     if run.model.domain == "traffic":
         from nnode.app.followers import follower_errors, write_followers  # loads Matplotlib
@@ -74,29 +75,24 @@ def evaluate_checkpoint(config: DictConfig, folder: Path) -> None:
 
         with Stages("drawing", {"drawing": 1.0}) as stages:
             stages.begin("drawing")
-            path = write_replay(
-                folder / "replay.html",
-                run.source,
-                run.indices,
-                run.simulate,
-                run.model,
-                run.name,
-                dtype=run.dtype,
-                device=run.device,
-            )
+            path = write_replay(folder / "replay.html", run)
         print(f"replay: {path}")
 
 
-def _print(rows: dict[str, Metrics], title: str, convention: Convention) -> None:
-    table = Table(title=title)
-    unit = convention.unit
-    heads = ("", f"J ({unit})", "RMSE (m)", "final displacement (m)", "collisions (%)")
+def _print(rows: dict[str, Metrics], title: str, unit: str) -> None:
     last = next(iter(rows.values())).horizons
-    chosen = sorted({len(last) // 4, len(last) // 2, len(last) - 1} & set(range(len(last))))
-    for head in (*heads, *(f"RMSE at {last[i]['t']:g} s" for i in chosen)):
-        table.add_column(head, justify="right")
-    for name, m in rows.items():
-        values = (m.J, m.rmse, m.final_displacement, 100 * m.collisions)
-        at = (m.horizons[i]["rmse"] for i in chosen)
-        table.add_row(name, *(f"{value:.4g}" for value in (*values, *at)))
-    Console(width=140).print(table)
+    shown = sorted({len(last) // 4, len(last) // 2, len(last) - 1} & set(range(len(last))))
+    table = pd.DataFrame.from_dict(
+        {
+            printable(name): {
+                f"J ({unit})": m.J,
+                "RMSE (m)": m.rmse,
+                "final displacement (m)": m.final_displacement,
+                "collisions (%)": 100 * m.collisions,
+                **{f"RMSE at {last[i]['t']:g} s": m.horizons[i]["rmse"] for i in shown},
+            }
+            for name, m in rows.items()
+        },
+        orient="index",
+    )
+    print(title, table.to_string(float_format="{:.4g}".format), sep="\n")

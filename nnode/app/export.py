@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from omegaconf import DictConfig
 
 from nnode.app.cli.saved import load_run
@@ -19,7 +20,6 @@ from nnode.errors import CheckpointError, ConfigError, unknown_value
 from nnode.exchange.counterpart import Counterpart, Intervals
 from nnode.exchange.jupedsim import has_parameters, jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import has_type, sumo_type, traffic_of
-from nnode.exchange.tables import write_results
 from nnode.exchange.trajectories import (
     FORMATS,
     check_format,
@@ -27,7 +27,7 @@ from nnode.exchange.trajectories import (
     write_trajectories,
     write_walls,
 )
-from nnode.files import write_json, write_text
+from nnode.files import write_csv, write_json, write_text
 from nnode.model import System
 
 #: Value of ``trajectories=`` to the sets of trajectories.
@@ -158,10 +158,39 @@ def _parquet(job: _Export) -> _Written:
 
 
 def _csv(job: _Export) -> _Written:
-    run = job.run
+    """``parameters``, ``history``, ``sequences`` and ``horizons``, each ``.csv``, with one value per
+    row."""
+    run, unit = job.run, job.run.convention.unit
     metrics = evaluate(run.simulate, run.batches(), run.convention)
-    folder, unit = job.folder / "csv", run.convention.unit
-    return write_results(folder, run.checkpoint, run.model, metrics, unit), Counterpart()
+    part = {name: key for key, names in run.checkpoint.split.items() for name in names}
+    tables: dict[str, tuple[list[str], list[tuple[Any, ...]]]] = {
+        "parameters": (
+            ["parameter", "value", "unit"],
+            [(name, float(value), of) for name, (value, of) in run.model.physical().items()],
+        ),
+        "history": (
+            ["epoch", "quantity", "value"],
+            [
+                (row.get("epoch"), name, value)
+                for row in run.checkpoint.history
+                for name, value in row.items()
+                if name != "epoch"
+            ],
+        ),
+        "sequences": (
+            ["sequence", "part", "cost", "unit"],
+            [(name, part.get(name, ""), cost, unit) for name, cost in metrics.costs.items()],
+        ),
+        "horizons": (
+            ["time_s", "rmse_m", "samples"],
+            [(row["t"], row["rmse"], row["n"]) for row in metrics.horizons],
+        ),
+    }
+    files = [
+        write_csv(job.folder / "csv" / f"{name}.csv", pd.DataFrame(rows, columns=columns))
+        for name, (columns, rows) in tables.items()
+    ]
+    return files, Counterpart()
 
 
 WRITERS: dict[str, Callable[[_Export], _Written]] = {

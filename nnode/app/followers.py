@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from nnode.calibrate.evaluate import Simulate
 from nnode.data.clusters import Index
@@ -112,10 +109,7 @@ def write_followers(rows: pd.DataFrame, folder: Path) -> None:
 
 def _print(name: str, table: pd.DataFrame, heads: tuple[str, ...], number: int) -> None:
     shown = f"the {len(table)} largest spacing errors of {number}; all in {name}.csv"
-    printed = Table(title=f"{name}: {shown}" if number > len(table) else name)
-    for head in (*heads, *COLUMNS.values()):
-        printed.add_column(head, justify="right")
-    for _, row in table.iterrows():
-        names = (escape(printable(str(row[head]))) for head in heads)
-        printed.add_row(*names, *(f"{row[key]:.3g}" for key in COLUMNS))
-    Console(width=140).print(printed)
+    print(f"{name}: {shown}" if number > len(table) else name)
+    names = table[[*heads]].map(lambda cell: printable(str(cell)))
+    errors = table[[*COLUMNS]].rename(columns=COLUMNS)
+    print(names.join(errors).to_string(index=False, float_format="{:.3g}".format))

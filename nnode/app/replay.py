@@ -7,18 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import torch
 
 from nnode.app.python.inputs import Table
-from nnode.calibrate.evaluate import Simulate
-from nnode.data.dataset import Source
+from nnode.app.saved_run import SavedRun
 from nnode.data.readers.columns import Table as DataTable
 from nnode.data.readers.table import TableOptions, read_table
 from nnode.data.sequence import Sequence
 from nnode.discover.report.replay import zone_of
 from nnode.errors import DataError
 from nnode.exchange.trajectories import simulated as simulated_by
-from nnode.model import System
 from nnode.model.effects import Effect
 from nnode.model.extend import effects_of
 from nnode.pages.page import write_player
@@ -111,31 +108,22 @@ def _at(simulated: Sequence, measured: Sequence) -> np.ndarray:
     return x
 
 
-def write_replay(
-    path: Path,
-    store: Source,
-    indices: list[int],
-    simulate: Simulate,
-    model: System,
-    name: str,
-    *,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Path:
-    """Write a page with measured and simulated trajectories of sequences of a store.
+def write_replay(path: Path, run: SavedRun) -> Path:
+    """Write a page with measured and simulated trajectories of a run's sequences.
 
-    Args:
-        indices: positions of the sequences, of which at most ``MOST`` are shown.
-        name: name of the model.
+    At most :data:`nnode.pages.replay.MOST` sequences are shown.
     """
-    shown = indices[:: -(-len(indices) // MOST)]
-    real = [store[i] for i in shown]
-    simulations = simulated_by(simulate, real, dtype=dtype, device=device)
-    led = model.leader_measured
-    scenes = [Scene(s, {name: x.x}, led=led) for s, x in zip(real, simulations, strict=True)]
-    zones = [zone for effect in effects_of(model) if (zone := _zone(effect)) is not None]
-    block = ReplayBlock("replay", scenes, _CAPTION, _alt(scenes), zones, len(indices))
-    return write_player(block, path, title=f"{name}, measured and simulated")
+    shown = run.indices[:: -(-len(run.indices) // MOST)]
+    measured = [run.source[i] for i in shown]
+    simulations = simulated_by(run.simulate, measured, dtype=run.dtype, device=run.device)
+    led = run.model.leader_measured
+    scenes = [
+        Scene(s, {run.name: path_of_model.x}, led=led)
+        for s, path_of_model in zip(measured, simulations, strict=True)
+    ]
+    zones = [zone for effect in effects_of(run.model) if (zone := _zone(effect)) is not None]
+    block = ReplayBlock("replay", scenes, _CAPTION, _alt(scenes), zones, len(run.indices))
+    return write_player(block, path, title=f"{run.name}, measured and simulated")
 
 
 def _zone(effect: Effect) -> Zone | None:
