@@ -1,4 +1,4 @@
-"""The program ``nnode``: one command for each file in ``nnode/app/commands``."""
+"""The program ``nnode`` with a command for each file in ``nnode/app/commands``."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from nnode.errors import suggestion
 from nnode.program import COMMANDS, words
 from nnode.version import VERSION
 
-#: Names of Python's functions, and a usual word, for commands of other names.
+#: Other words for commands: names of functions in Python, and a common synonym.
 SYNONYMS = {"calibrate": "train", "diagnose": "discover", "fit": "train"}
 
 
 def main() -> None:
-    """Run the command that the command line names; ends the process where there is none such."""
+    """Run the command that the command line names; end the process if there is no such command."""
     given = sys.argv[1:]
     names = sorted(path.stem for path in COMMANDS.glob("[a-z]*.py"))
     name = given[0] if given else "--help"

@@ -1,6 +1,6 @@
-"""The package's exceptions, one tree, so that one ``except NNodeError`` catches them all.
+"""The exceptions of the package, which are all derived from :class:`NNodeError`.
 
-Every message says what was expected, what was found, where (file, row, option) and what to do.
+Every message states what was expected, what was found, where (file, row, option) and what to do.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from typing import Any
 
-#: Characters of a message, at most.
+#: Largest number of characters of a message.
 LONGEST = 2000
 
-#: What a terminal obeys or does not show: control characters other than line feed and tab, marks of
-#: the direction of writing and of no width, separators of lines, and halves of surrogate pairs.
+#: Characters that a terminal interprets or does not show: control characters other than line feed
+#: and tab, marks of the writing direction and of zero width, line separators, and surrogates.
 _CONTROL = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
     "\ufff9-\ufffb\ud800-\udfff\U000e0000-\U000e007f]"
@@ -29,17 +29,17 @@ IN_PYTHON = (
 
 
 def printable(text: str, limit: int = LONGEST) -> str:
-    """A text that holds parts of files, as it may be shown.
+    """A text with parts of files, in a form that is safe to show.
 
-    Control characters are written as escapes, such as ``\\x1b``. A longer text loses its middle:
-    a message begins with the place of an error and ends with what to do.
+    Control characters become escapes, such as ``\\x1b``. A longer text is cut in the middle,
+    because a message begins with the place of an error and ends with what to do.
     """
-    shown = _CONTROL.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
+    shown = _CONTROL.sub(lambda match: match.group().encode("unicode_escape").decode(), text)
     if len(shown) <= limit:
         return shown
     note = f" [... {len(shown)} characters in all ...] "
-    left = limit - len(note)
-    return shown[: left - left // 3] + note + shown[len(shown) - left // 3 :]
+    kept = limit - len(note)
+    return shown[: kept - kept // 3] + note + shown[len(shown) - kept // 3 :]
 
 
 def suggestion(word: str, words: Iterable[str] | Mapping[str, str], cutoff: float = 0.6) -> str:
@@ -71,10 +71,10 @@ def unknown_value(
 
 
 class NNodeError(Exception):
-    """Root of every error that the package raises on purpose.
+    """Base class of all errors of the package.
 
-    Texts are made printable, and are at most :data:`LONGEST` characters long: they may quote cells,
-    names of columns and other parts of files. They name options of data as on the command line; a
+    Messages may quote cells, names of columns and other parts of files, so they are made printable
+    and have at most :data:`LONGEST` characters. They name options of data as on the command line; a
     note, which only a traceback shows, explains how Python takes them.
     """
 
@@ -85,15 +85,15 @@ class NNodeError(Exception):
 
 
 class DataError(NNodeError):
-    """A file or table does not hold what its format promises."""
+    """The content of a file or table does not agree with its format."""
 
 
 class FaultError(DataError):
-    """Measured sequences hold faults and ``data.faults=error`` was asked for."""
+    """Measured sequences have faults, and ``data.faults`` is ``error``."""
 
 
 class DownloadError(DataError):
-    """Public data could not be fetched, or what came is not what was published."""
+    """Public data could not be downloaded, or differ from the published data."""
 
 
 class ConfigError(NNodeError):
@@ -101,7 +101,7 @@ class ConfigError(NNodeError):
 
 
 class SimulationError(NNodeError):
-    """A simulation left the range in which its numbers mean anything."""
+    """A simulation has values that are not finite or not meaningful."""
 
 
 class CheckpointError(NNodeError):
@@ -109,16 +109,16 @@ class CheckpointError(NNodeError):
 
 
 class StudyError(NNodeError):
-    """Tasks of a study failed, or its worker processes cannot run; what is done is kept."""
+    """Tasks of a study failed, or its workers cannot run; finished tasks are kept."""
 
 
 class WriteError(NNodeError):
-    """Nothing can be written, as where a disk is full; what was written before is kept."""
+    """A file cannot be written, for example on a full disk; earlier files are kept."""
 
 
 class FolderInUseError(NNodeError):
-    """Another run works in the folder."""
+    """Another run uses the folder."""
 
 
 class NotFittedError(NNodeError, ValueError, AttributeError):
-    """An estimator is asked for what it has only after a fit."""
+    """An estimator has not been fitted yet."""

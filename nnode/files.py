@@ -1,4 +1,4 @@
-"""Files that are never half there."""
+"""Files that are written as a whole, and safe CSV and JSON."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from nnode.errors import ConfigError, DataError, WriteError
 if TYPE_CHECKING:
     import pandas as pd
 
-#: Ends the names of files that are being written; ``.NAME.PROCESS`` stands before it.
+#: End of the names of files that are being written, ``.NAME.PROCESS.partial``.
 PARTIAL = ".partial"
 
-#: Levels of lists and mappings in what a file holds; a configuration has fewer than 10.
+#: Largest depth of nested lists and mappings in a file; a configuration has fewer than 10 levels.
 DEPTH = 100
 
-#: What the system answers where there is no room, or where nothing may be written.
+#: Errors of the system for a full disk, and for missing permissions.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
 
-#: What it answers where a file stands in place of a folder, or the other way round.
+#: Errors of the system for a file in the place of a folder, and the reverse.
 _NO_FOLDER = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG}
 
-
-#: Texts that a spreadsheet takes for a formula, and those that were made safe already.
+#: Texts that a spreadsheet would evaluate as a formula, with or without an apostrophe before them.
 _FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A name beside ``path`` to write to; what was written takes its place at the end.
+    """A temporary path in the same folder, whose file replaces ``path`` at the end.
 
-    Missing folders are made. After an error ``path`` is as it was before, and nothing is left.
+    Missing folders are created. After an error, ``path`` is unchanged and the temporary file is
+    removed.
 
     Raises:
-        OSError: the folder cannot be made or written to.
+        OSError: the folder cannot be created or written to.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
@@ -57,15 +57,14 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def disk_words(folder: Path) -> Iterator[None]:
-    """Say in words that a disk is full, or that nothing may be written.
+    """Translate errors of the system for a full disk or missing permissions.
 
     Args:
-        folder: where the work inside writes.
+        folder: folder to which the context writes.
 
     Raises:
-        WriteError: for the system's errors of that kind, and where a file stands in place of the
-            folder; all others pass.
-        DataError: for a file that may not be read.
+        WriteError: a file cannot be written, or the folder is a file; other errors are not changed.
+        DataError: a file exists, but its permissions do not allow reading.
     """
     try:
         yield
@@ -79,25 +78,25 @@ def disk_words(folder: Path) -> Iterator[None]:
             raise
         if _shut(error):
             raise DataError(
-                f"{error.filename} cannot be read: {error.strerror}; allow it, or take another file"
+                f"{error.filename} cannot be read: {error.strerror}; change its permissions"
             ) from error
         raise WriteError(
-            f"{error.filename or folder} cannot be written: {error.strerror}. What was written "
-            "before is kept; make room, or choose another folder with hydra.run.dir="
+            f"{error.filename or folder} cannot be written: {error.strerror}. Earlier files are "
+            "kept; make room on the disk, or choose another folder with hydra.run.dir="
         ) from error
 
 
 def _shut(error: OSError) -> bool:
-    """Whether it is a file that is there, but may not be read."""
+    """Whether an error concerns a file that exists and cannot be read."""
     place = error.filename
     return isinstance(place, str) and os.path.isfile(place) and not os.access(place, os.R_OK)
 
 
 def file_name(text: str) -> str:
-    """A name of a model or a recording as the stem of a file's name in one folder.
+    """A name of a model or a recording as the stem of a file name.
 
-    Signs of paths and control characters become ``_``, and a name does not begin with a point.
-    Names are cut to 100 characters, so that there is room for what a file's name ends with.
+    Path separators and control characters become ``_``, and leading points are removed. Names are
+    cut to 100 characters, which leaves room for endings.
     """
     return re.sub(r"^\.+|[^\w .,+~'=()-]", "_", text)[:100] or "_"
 
@@ -112,9 +111,9 @@ def write_text(path: Path, text: str) -> Path:
 def csv_text(frame: pd.DataFrame) -> str:
     """A data frame as CSV with full precision and without row numbers.
 
-    Spreadsheets run cells that begin with ``=``, ``+``, ``-`` or ``@``. An apostrophe is put before
-    such a text, and before such a name of a column; numbers, also those that are text, stay as they
-    are. :func:`csv_cell` takes the apostrophe away.
+    Spreadsheets evaluate cells that begin with ``=``, ``+``, ``-`` or ``@``. Such texts and such
+    names of columns get an apostrophe in front, which :func:`csv_cell` removes. Numbers do not
+    change, nor do numbers that are stored as text.
     """
     from pandas import Series
 
@@ -125,7 +124,7 @@ def csv_text(frame: pd.DataFrame) -> str:
             texts += [cell for cell in cells if isinstance(cell, str)]
             safe.isetitem(place, Series(cells, frame.index, dtype=object).array)
     safe.columns = frame.columns.map(csv_safe)
-    # pandas leaves a carriage return without quotes, and then reads two rows
+    # pandas does not quote a carriage return, and would then read two rows
     if any("\r" in text for text in texts):
         return safe.to_csv(index=False, quoting=csv.QUOTE_NONNUMERIC)
     return safe.to_csv(index=False)
@@ -137,7 +136,7 @@ def write_csv(path: Path, frame: pd.DataFrame) -> Path:
 
 
 def csv_safe(cell: Any) -> Any:
-    """A cell that a spreadsheet does not take for a formula, see :func:`csv_text`."""
+    """A cell that a spreadsheet does not evaluate as a formula, see :func:`csv_text`."""
     if not isinstance(cell, str) or not _FORMULA.match(cell):
         return cell
     try:
@@ -148,27 +147,27 @@ def csv_safe(cell: Any) -> Any:
 
 
 def csv_cell(text: str) -> str:
-    """A cell's text as it was before :func:`csv_text`."""
+    """The text of a cell before :func:`csv_text`."""
     return text[1:] if text[:1] == "'" and _FORMULA.match(text) else text
 
 
 def write_json(path: Path, content: dict[str, Any], indent: int | None = 2) -> Path:
-    """Write JSON; NaN and infinities are kept, as Python's own reader takes them."""
+    """Write JSON with NaN and infinities, which Python's reader accepts."""
     text = json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=True)
     return write_text(path, text + "\n")
 
 
 def interpolation(content: Any, most: float = math.inf) -> str | None:
-    """The first text with ``${...}`` in nested lists and mappings; None where there is none.
+    """The first text with ``${...}`` in nested lists and mappings; None if there is none.
 
-    The configuration replaces such a text by other values, among them variables of the
-    environment. What comes from a file of others must not contain it.
+    The configuration would replace such a text by other values, for example by environment
+    variables. Therefore files from other sources must not contain it.
 
     Args:
-        most: values that there may be; a list that contains itself has no end.
+        most: largest allowed number of values; a list that contains itself has infinitely many.
 
     Raises:
-        ValueError: more values than that, or nested more than 100 deep.
+        ValueError: there are more values, or more than 100 levels.
     """
     waiting, number = [(content, 0)], 0
     while waiting:

@@ -1,6 +1,6 @@
-"""One run at a time in a folder.
+"""Locks of folders, so that a folder is used by one run at a time.
 
-The lock belongs to the process, not to the file: one that was killed blocks nobody.
+A lock is released when its process ends, also when the process is killed.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from nnode.files import PARTIAL, disk_words
 
 log = logging.getLogger(__name__)
 
-#: Name of the lock's file, which tells who holds it.
+#: Name of the lock file, which names its holder.
 LOCK = ".lock"
 
-#: What a file system answers that knows no locks.
+#: Errors of file systems without locks.
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL}
 
-_REST = re.compile(rf"\..+\.\d+\{PARTIAL}")
+_LEFTOVER = re.compile(rf"\..+\.\d+\{PARTIAL}")
 
-#: Locks of this process by folder; one that was forked holds none.
+#: Locks by process and folder; a forked process has none.
 _held: dict[tuple[int, Path], FileLock] = {}
 
 
 def take(folder: Path) -> None:
-    """Take the folder, which is made where it is missing; a process may take it several times.
+    """Lock a folder, which is created if it is missing. A process may lock it several times.
 
-    What a killed run left half written is removed, except below folders that other runs have taken.
+    Partly written files of killed runs are removed, except in folders of other runs.
 
     Raises:
-        FolderInUseError: another process has it; says which.
+        FolderInUseError: another process, which the message names, has the lock.
         WriteError: the folder cannot be written to.
     """
     key = os.getpid(), folder.resolve()
@@ -50,7 +50,7 @@ def take(folder: Path) -> None:
         return
     with disk_words(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        # a moment, for a file that its holder removes just now
+        # a short wait, because its holder may be removing the file
         lock = FileLock(key[1] / LOCK, timeout=0.1, thread_local=False, fallback_to_soft=False)
         try:
             lock.acquire()
@@ -59,32 +59,36 @@ def take(folder: Path) -> None:
             with suppress(OSError):
                 holder = (folder / LOCK).read_text(errors="replace")
             raise FolderInUseError(
-                f"another run works in {folder} ({holder or 'it does not say which'}); wait for "
-                "its end, or choose another folder with hydra.run.dir="
+                f"another run works in {folder} ({holder or 'unknown process'}); wait for its "
+                "end, or choose another folder with hydra.run.dir="
             ) from None
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
-            log.warning("%s cannot be locked (%s): use it for one run at a time", folder, error)
+            log.warning(
+                "%s cannot be locked (%s); do not use it for several runs at the same time",
+                folder,
+                error,
+            )
         else:
             _held[key] = lock
             since = time.strftime("%Y-%m-%d %H:%M:%S")
             words = f"process {os.getpid()} on {socket.gethostname()}, since {since}"
             (folder / LOCK).write_text(words)
-        _remove_rests(folder)
+        _remove_leftovers(folder)
 
 
-def _remove_rests(folder: Path) -> None:
-    """Remove what killed runs left half written, but not below folders of other runs.
+def _remove_leftovers(folder: Path) -> None:
+    """Remove partly written files of killed runs, except in folders of other runs.
 
-    A folder with a lock file of its own belongs to another run. That run may be at work, and if it
-    was killed, the next run in its folder removes what it left.
+    A folder with its own lock file belongs to another run, which may be active. The next run in
+    that folder removes its partly written files.
     """
     for place, folders, files in os.walk(folder):
         if LOCK in files and Path(place) != folder:
             folders.clear()
             continue
-        for name in [name for name in (*folders, *files) if _REST.fullmatch(name)]:
+        for name in [name for name in (*folders, *files) if _LEFTOVER.fullmatch(name)]:
             path = Path(place, name)
             if name in folders and not path.is_symlink():
                 shutil.rmtree(path)
@@ -95,21 +99,21 @@ def _remove_rests(folder: Path) -> None:
 
 
 def give(folder: Path) -> None:
-    """Give the folder back, when as often as it was taken; nothing happens without it."""
+    """Release a folder after as many calls as :func:`take`; without a lock, do nothing."""
     key = os.getpid(), folder.resolve()
     if key not in _held:
         return
     lock = _held[key]
     if lock.lock_counter == 1:
         del _held[key]
-        with suppress(OSError):  # while it is still held: a later one makes a new file
+        with suppress(OSError):  # before the release, because the next holder creates a new file
             (folder / LOCK).unlink()
     lock.release()
 
 
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Nobody else works in ``folder`` inside the context.
+    """Lock a folder within the context.
 
     Raises:
         FolderInUseError, WriteError: see :func:`take`.

@@ -1,4 +1,4 @@
-"""What a result was computed on."""
+"""The machine and the versions with which a result was computed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def machine(packages: Iterable[str]) -> dict[str, Any]:
 
 
 def how_made(packages: Iterable[str]) -> dict[str, str]:
-    """What a page says of how it was made: command, date, machine, versions."""
+    """Facts on how a page was made: command, date, machine, versions."""
     here = machine(packages)
     versions = {"nnode": VERSION, **here["versions"]}
     return {

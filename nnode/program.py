@@ -8,18 +8,18 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
-#: The commands: their files are read before they are imported, because an import takes seconds.
+#: Folder of the commands. Their files are read without an import, which would take seconds.
 COMMANDS = Path(__file__).parent / "app" / "commands"
 
-#: Hydra's option for a folder of the user's own choices.
+#: Hydra's flag for a folder with further choices of the user.
 _CONFIG_DIR = ("--config-dir", "-cd")
 
-#: The command that this process runs; empty: a program of somebody else.
+#: The command of this process; empty in other programs.
 _running = ""
 
 
 def running(name: str) -> None:
-    """Note which command this process runs."""
+    """Set the command of this process."""
     global _running
     _running = name
 
@@ -32,21 +32,21 @@ def command_line() -> str:
 
 
 def configuration() -> Path:
-    """The folder ``conf/``: in the installed package, or beside the package of a checkout."""
+    """The folder ``conf/`` in the installed package, or next to the package in a checkout."""
     package = Path(__file__).parent
     installed = package / "conf"
     return installed if installed.is_dir() else package.parent / "conf"
 
 
 def own_choices(group: str) -> list[str]:
-    """Names that a group has in the user's own folder, which ``--config-dir`` names."""
-    found = [after for word, after in pairwise(sys.argv) if word in _CONFIG_DIR]
-    found += [w.partition("=")[2] for w in sys.argv if w.startswith(f"{_CONFIG_DIR[0]}=")]
-    return sorted(path.stem for name in found for path in (Path(name) / group).glob("*.yaml"))
+    """Names of a group in the folder of the user that ``--config-dir`` states."""
+    folders = [after for word, after in pairwise(sys.argv) if word in _CONFIG_DIR]
+    folders += [w.partition("=")[2] for w in sys.argv if w.startswith(f"{_CONFIG_DIR[0]}=")]
+    return sorted(path.stem for folder in folders for path in (Path(folder) / group).glob("*.yaml"))
 
 
 def words(name: str) -> str:
-    """What a command, or a script of the benchmarks, does, with examples: its docstring."""
+    """The purpose and examples of a command or of a benchmark's script: its docstring."""
     path = COMMANDS / f"{name}.py"
     if not path.is_file():
         path = configuration().parent / "scripts" / path.name

@@ -1,4 +1,4 @@
-"""How far a work is, with the time left: a bar on a terminal, a line now and then elsewhere."""
+"""Progress of a task with the remaining time: a bar on a terminal, otherwise lines in the log."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeE
 
 log = logging.getLogger(__name__)
 
-#: Seconds between lines where no terminal shows the bar.
+#: Seconds between lines in the log.
 LINE_EVERY = 10.0
-#: Seconds between looks whether a line is due.
+#: Seconds between checks whether a line is due.
 _LOOK_EVERY = 0.5
 
 
 class OnTerminal:
-    """Shows a bar where standard error is a terminal, for as long as the context lasts.
+    """Shows a bar within the context if standard error is a terminal.
 
-    Elsewhere the log gets a line about every ten seconds, also during a long step.
+    Otherwise a line is written to the log about every ten seconds, also during a long step.
 
     Args:
-        columns: of the bar.
-        forks: whether the work forks processes; the bar then moves, and a line is written, only
-            when the work reports its state, without a thread.
+        columns: columns of the bar.
+        forks: whether the task forks processes; then there is no thread, and the bar and the log
+            are updated only when the task reports its state.
     """
 
     def __init__(self, *columns: ProgressColumn, forks: bool = False) -> None:
@@ -36,15 +36,15 @@ class OnTerminal:
         self._ended, self._lines = threading.Event(), threading.Lock()
         self._beat: threading.Thread | None = None
         self._forks = forks
-        #: handlers of the log that write to the terminal, above the bar for as long as it is there
+        #: handlers of the log that write to the terminal, which must write above the bar
         self._moved: list[tuple[logging.StreamHandler[Any], Any]] = []
         if sys.stderr.isatty():
-            # what is printed belongs to the results; the bar shall not be among them in a file
+            # on standard error, because standard output has the results and may be a file
             self._bar = Progress(
                 *columns,
                 console=Console(stderr=True),
                 auto_refresh=not forks,
-                redirect_stdout=not forks,  # what children print is theirs
+                redirect_stdout=not forks,  # children print by themselves
                 redirect_stderr=not forks,
             )
         self._start = self._last_line = time.monotonic()
@@ -57,11 +57,11 @@ class OnTerminal:
             self._bar.start()
             if not self._forks:
                 self._moved = [
-                    (one, one.setStream(sys.stderr))  # which the bar has made its own
-                    for one in logging.getLogger().handlers
-                    if isinstance(one, logging.StreamHandler)
-                    and one.stream.isatty()
-                    and one.stream is not sys.stderr
+                    (handler, handler.setStream(sys.stderr))  # which the bar has replaced
+                    for handler in logging.getLogger().handlers
+                    if isinstance(handler, logging.StreamHandler)
+                    and handler.stream.isatty()
+                    and handler.stream is not sys.stderr
                 ]
         return self
 
@@ -80,7 +80,7 @@ class OnTerminal:
             self._bar.stop()
 
     def line_is_due(self) -> bool:
-        """Whether the last line is so long ago that another one may be written; it then counts."""
+        """Whether it is time for another line; if so, it counts as written now."""
         with self._lines:
             now = time.monotonic()
             due = now - self._last_line >= LINE_EVERY
@@ -89,11 +89,11 @@ class OnTerminal:
             return due
 
     def line(self) -> str:
-        """How far the work is, in words."""
+        """The state of the task as text."""
         raise NotImplementedError
 
     def log_if_due(self) -> None:
-        """Write a line to the log where the last one is long ago."""
+        """Write a line to the log if it is due."""
         if self.line_is_due():
             log.info("%s", self.line())
 
@@ -103,11 +103,11 @@ class OnTerminal:
 
 
 class Stages(OnTerminal):
-    """A work of several stages, one after the other; use as a context manager.
+    """A task of several consecutive stages; use as a context manager.
 
     Args:
-        title: of the work.
-        shares: stage to its usual share of the whole time, in any unit.
+        title: title of the task.
+        shares: stage to its usual share of the time, in any unit.
         forks: see :class:`OnTerminal`.
     """
 
@@ -136,7 +136,7 @@ class Stages(OnTerminal):
         super().__exit__(kind, error, trace)
 
     def begin(self, stage: str) -> None:
-        """A stage begins; those before it are done. An earlier one starts the estimate anew."""
+        """Begin a stage and end those before it. An earlier stage restarts the estimate."""
         names = list(self.shares)
         before = sum(self.shares[name] for name in names[: names.index(stage)])
         if before < self._before:
@@ -145,7 +145,7 @@ class Stages(OnTerminal):
         self.within(0.0)
 
     def within(self, part: float) -> None:
-        """So much of the stage is done, between 0 and 1; called often."""
+        """Report which part of the stage is done, between 0 and 1."""
         self.done = self._before + self.shares[self._stage] * min(max(part, 0.0), 1.0)
         self._reported = time.monotonic()
         if self._bar:
@@ -156,11 +156,11 @@ class Stages(OnTerminal):
             self.log_if_due()
 
     def line(self) -> str:
-        """Title, stage and time left."""
+        """Title, stage and remaining time."""
         return f"{self.title}: {self.text()}"
 
     def text(self) -> str:
-        """Stage and time left."""
+        """Stage and remaining time."""
         passed, since = self._reported - self._start, time.monotonic() - self._reported
         if not self.done or passed < 1:
             return self._stage

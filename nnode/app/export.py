@@ -158,8 +158,7 @@ def _parquet(job: _Export) -> _Written:
 
 
 def _csv(job: _Export) -> _Written:
-    """``parameters``, ``history``, ``sequences`` and ``horizons``, each ``.csv``, with one value per
-    row."""
+    """The tables ``parameters``, ``history``, ``sequences`` and ``horizons``, one value per row."""
     run, unit = job.run, job.run.convention.unit
     metrics = evaluate(run.simulate, run.batches(), run.convention)
     part = {name: key for key, names in run.checkpoint.split.items() for name in names}
