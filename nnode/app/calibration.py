@@ -255,19 +255,12 @@ class Calibration:
     def _table(self) -> list[str]:
         """The table of parameters, with remarks on estimates, line by line."""
         short = short_names(map(str, self.parameters.index))
-        width = max([*map(len, short.values()), 10])
-        heads = ("estimate", "std err", "[0.025", "0.975]")
-        lines = [f"{'':<{width}}" + "".join(f"{head:>12}" for head in heads) + "  unit"]
-        for name, row in _rows(self.parameters).items():
-            values = (row[key] for key in ("estimate", "std_error", "lower", "upper"))
-            cells = (f"{value:.4g}" if np.isfinite(value) else "-" for value in values)
-            remark = f"  {_remark(row)}" if _remark(row) else ""
-            lines.append(
-                f"{short[name]:<{width}}"
-                + "".join(f"{cell:>12}" for cell in cells)
-                + f"  {row['unit']}{remark}"
-            )
-        return lines
+        heads = {"std_error": "std err", "lower": "[0.025", "upper": "0.975]"}
+        cells = self.parameters[["estimate", *heads]].rename(index=short, columns=heads)
+        table = cells.map(lambda value: f"{value:.4g}" if np.isfinite(value) else "-")
+        table["unit"] = self.parameters["unit"].to_list()
+        table[""] = [_remark(row) for row in _rows(self.parameters).values()]
+        return [line.rstrip() for line in table.to_string().splitlines()]
 
     def _costs(self) -> list[str]:
         costs = {

@@ -19,7 +19,7 @@ from nnode.exchange.trajectories import simulated as simulated_by
 from nnode.model.effects import Effect
 from nnode.model.extend import effects_of
 from nnode.pages.page import write_player
-from nnode.pages.replay import MOST, ReplayBlock, Scene, Zone
+from nnode.pages.replay import MOST, ReplayBlock, Scene, Zone, evenly
 
 _CAPTION = (
     "Outlines are measured agents. Arrows lead from the simulated to the measured position. The "
@@ -113,8 +113,7 @@ def write_replay(path: Path, run: SavedRun) -> Path:
 
     At most :data:`nnode.pages.replay.MOST` sequences are shown.
     """
-    shown = run.indices[:: -(-len(run.indices) // MOST)]
-    measured = [run.source[i] for i in shown]
+    measured = [run.source[i] for i in evenly(run.indices, MOST)]
     simulations = simulated_by(run.simulate, measured, dtype=run.dtype, device=run.device)
     led = run.model.leader_measured
     scenes = [

@@ -177,9 +177,7 @@ def _table(title: str, rows: list[tuple[str, float, float, float, str]]) -> list
     """Lines of a titled table of estimates with 95 % intervals; empty without rows."""
     if not rows:
         return []
-    heads = "".join(f"{head:>12}" for head in ("estimate", "[0.025", "0.975]"))
-    lines = ["", title, f"{'':<28}{heads}  unit"]
-    for name, *values, unit in rows:
-        cells = "".join(f"{amount(value, 4):>12}" for value in values)
-        lines.append(f"{name:<28}{cells}  {unit}")
-    return lines
+    heads = ["", "estimate", "[0.025", "0.975]", "unit"]
+    cells = [(name, *(amount(value, 4) for value in values), unit) for name, *values, unit in rows]
+    table = pd.DataFrame(cells, columns=heads)
+    return ["", title, *table.to_string(index=False).splitlines()]
