@@ -6,7 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from nnode.app.cli.recognised import with_recognised
+from nnode.app.cli.prepared import with_recognised
 from nnode.app.cli.saved import options_of
 from nnode.data.clusters import clusters, relation
 from nnode.data.dataset import noise_of

@@ -81,21 +81,19 @@ def force_contours(
     return figure
 
 
-def relative_positions(sequences: Iterable[Sequence], number: int = POINTS) -> np.ndarray:
+def relative_positions(sequences: Iterable[Sequence]) -> np.ndarray:
     """``(P, 2)`` x_i - x_j (m) of people of one sequence and time, evenly thinned out to at most
-    ``number`` pairs within the widest figure."""
+    :data:`POINTS` pairs within the widest figure."""
     parts = [np.empty((0, 2))]
     for s in sequences:
         away = s.x[:, :, None] - s.x[:, None]
         parts.append(away[:, ~np.eye(s.n_agents, dtype=bool)].reshape(-1, 2))
     points = np.concatenate(parts)
     points = points[np.abs(points).max(1, initial=0.0) <= max(EXTENT.values())]
-    return thinned(points, number)
+    return thinned(points, POINTS)
 
 
-def head_on_figure(
-    system: System, *, extent: float | None = None, points: np.ndarray | None = None
-) -> Figure:
+def head_on_figure(system: System, *, points: np.ndarray | None = None) -> Figure:
     """Both force components for v_i - v_j = (2, 0) m/s, as :func:`force_contours` draws them.
 
     Args:
@@ -103,7 +101,7 @@ def head_on_figure(
     """
     figure = new_figure(7.2, 3.6)
     axes = figure.subplots(1, 2, sharey=True)
-    _contours(figure, system, [(axes[c], HEAD_ON, c) for c in (0, 1)], extent, None)
+    _contours(figure, system, [(axes[c], HEAD_ON, c) for c in (0, 1)], None, None)
     for ax, letter in zip(axes, "xy", strict=True):
         if points is not None:
             limits = ax.get_xlim(), ax.get_ylim()

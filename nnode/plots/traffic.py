@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import matplotlib
@@ -78,11 +79,9 @@ def measured_gaps(sequences: Iterable[Sequence]) -> np.ndarray:
     return np.concatenate(parts) if parts else np.empty(0)
 
 
-def measured_speeds(
-    sequences: Iterable[Sequence], system: System, number: int = POINTS
-) -> np.ndarray:
-    """``(P, 2)`` gaps (m) and speeds (m/s) of followers, evenly thinned out to at most ``number``
-    samples. Speeds that were not measured are central differences.
+def measured_speeds(sequences: Iterable[Sequence], system: System) -> np.ndarray:
+    """``(P, 2)`` gaps (m) and speeds (m/s) of followers, evenly thinned out to at most
+    :data:`POINTS` samples. Speeds that were not measured are central differences.
 
     A gap is x_{i+1} - x_i, less the length of the vehicle ahead if the model's law takes gaps from
     bumper to bumper.
@@ -99,7 +98,7 @@ def measured_speeds(
             gap = gap - np.tile(ahead, len(s.x))
         speed = s.v if s.v is not None else np.gradient(s.x, s.dt, axis=0)
         parts.append(np.column_stack([gap, speed[:, :-1, 0].ravel()]))
-    return thinned(np.concatenate(parts), number)
+    return thinned(np.concatenate(parts), POINTS)
 
 
 @torch.no_grad()
@@ -191,7 +190,9 @@ def speed_curves(
     ax.set_xlim(low, high)
     shown = [] if points is None else list(np.percentile(points[:, 1], SUPPORT))
     _limit(ax, table, [*leaders.values(), *shown], _left_out(models))
-    right = ax.secondary_yaxis("right", functions=(_to_kmh, _from_kmh))
+    right = ax.secondary_yaxis(
+        "right", functions=(partial(np.multiply, KMH), partial(np.multiply, 1 / KMH))
+    )
     right.set_ylabel(f"{what} (km/h)", fontsize=ax.yaxis.label.get_fontsize())
     set_ticks(right)
     right.spines["right"].set(linewidth=0.6, edgecolor=GREY)
@@ -207,14 +208,6 @@ def speed_curves(
         edgecolor="none",
     )
     return figure
-
-
-def _to_kmh(speed: Any) -> Any:
-    return speed * KMH
-
-
-def _from_kmh(speed: Any) -> Any:
-    return speed / KMH
 
 
 def _few(names: list[str]) -> tuple[list[dict[str, Any]], list[Line2D]]:
