@@ -110,7 +110,7 @@ def drive_run(
 def drive_scenario(config: DictConfig, folder: Path) -> None:
     """The command: run :func:`drive_run`, and print the result."""
     result = drive_run(folder=folder, **vars(options_of(config)))
-    speed = "nobody drove" if result.mean_speed is None else f"mean {result.mean_speed:.2f} m/s"
+    speed = "no mean speed" if result.mean_speed is None else f"mean {result.mean_speed:.2f} m/s"
     print(
         f"driven: {result.driven} vehicles, {speed}; {result.seconds:g} s in {result.steps} "
         f"{result.method} steps of {result.step:g} s"
@@ -121,8 +121,8 @@ def drive_scenario(config: DictConfig, folder: Path) -> None:
     )
     if result.stranded:
         hint = "" if config.lane_changes else "; lane_changes=true lets SUMO choose their lanes"
-        print(f"stopped where a lane did not lead on: {result.stranded} driven vehicles{hint}")
-    print(f"took {result.wall:.2f} s, {result.in_sumo:.2f} s of them in SUMO's steps")
+        print(f"stopped at the end of their lane: {result.stranded} driven vehicles{hint}")
+    print(f"time: {result.wall:.2f} s, of which {result.in_sumo:.2f} s in SUMO's steps")
     print(f"trajectories: {result.trajectories}")
     print(f"account: {folder / 'drive.json'}")
 
@@ -151,8 +151,7 @@ def _has_lengths(checkpoint: Checkpoint, run: str, model: System) -> bool:
             length = Store(Path(folder))[0].length
             return length is not None and bool(np.isfinite(length).any())
     raise ConfigError(
-        f"the law asks for the length of the vehicle ahead, and the run's data, {prepared_folder}, "
-        "are not "
-        "there to tell whether they had lengths; say lengths=true, gaps are bumper to bumper, or "
-        "lengths=false, the law's gap at rest contains a length"
+        "the law depends on the length of the vehicle ahead, and the run's data, "
+        f"{prepared_folder}, are not there to show whether they had lengths; set lengths=true if "
+        "gaps are bumper to bumper, or lengths=false if the law's gap at rest contains a length"
     )

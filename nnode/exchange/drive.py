@@ -120,9 +120,9 @@ def check_steps(steps: Steps, expected: Steps, scenario: Path) -> None:
     same = abs(steps.seconds - expected.seconds) <= 1e-9 and steps.method == expected.method
     if not same:
         raise ConfigError(
-            f"{scenario} makes {steps}, the run was calibrated with {expected}; set step-length "
-            "and step-method.ballistic in the scenario, take steps=run for SUMO to make the run's, "
-            "steps=scenario to go on with those of the scenario, or calibrate again with "
+            f"{scenario} has {steps}, the run was calibrated with {expected}; set step-length and "
+            "step-method.ballistic in the scenario, take steps=run for the run's steps or "
+            "steps=scenario for those of the scenario, or calibrate again with "
             f"solver.dt={steps.seconds:g} solver.method={steps.method}"
         )
 
@@ -135,8 +135,8 @@ def _steps(sumo: RunningSumo, order: int, scenario: Path) -> Steps:
     """
     if order == 1 and sumo.ballistic:
         raise ConfigError(
-            f"{scenario} has step-method.ballistic, which places vehicles with the mean of two "
-            "speeds; the run's law says a speed and needs SUMO's default, Euler's steps"
+            f"{scenario} has step-method.ballistic, which moves vehicles with the mean of two "
+            "speeds; a law of first order needs SUMO's default, Euler's steps"
         )
     if order == 1:
         return Steps(sumo.seconds, "euler")

@@ -159,8 +159,8 @@ class Drivers:
         if bad.any():
             i = int(bad.argmax())
             raise SimulationError(
-                f"the law says no finite number at {time:g} s, v = {views.v[i]:g} m/s and a gap of "
-                f"{views.gap[i]:g} m; take a shorter step, or other parameters"
+                f"the law has no finite value at {time:g} s for v = {views.v[i]:g} m/s and a gap "
+                f"of {views.gap[i]:g} m; take a shorter step, or other parameters"
             )
         return np.maximum(speed, 0.0)
 
@@ -169,7 +169,7 @@ class Drivers:
         given = self._given(time, views)
         if self._fresh.any():
             self._begin(time, views, given)
-        top, *others = self._said(given)
+        top, *others = self._rates_of(given)
         for state, rate in zip(self._added, others, strict=True):
             self._states[state] = self._states[state] + self.dt * rate
         speed: np.ndarray = top if self.lane.order == 1 else given["v"] + self.dt * top
@@ -179,7 +179,7 @@ class Drivers:
         """The rates of the law and of added states."""
         return Rates([self.lane.rates[s] for s in (self.lane.top, *self._added)], _GAPS)
 
-    def _said(self, given: dict[str, Any]) -> list[np.ndarray]:
+    def _rates_of(self, given: dict[str, Any]) -> list[np.ndarray]:
         """``(n,)`` each: the rates. Chained rates are computed after those of the vehicle ahead."""
         n, lead = len(self), given["lead"]
         ready = [np.broadcast_to(part, n) for part in self._rates.at_once(given, given["gaps"])]
@@ -187,14 +187,14 @@ class Drivers:
             return ready
         chained: list[np.ndarray] = []
         ahead = np.array(given["dx_1"])
-        for who in leaders_first(lead):
-            led = who[lead[who] >= 0]
+        for group in leaders_first(lead):
+            led = group[lead[group] >= 0]
             if chained:
                 ahead[led] = np.maximum(chained[0][lead[led]], 0.0)
-            rates = self._rates.after({"dx_1": ahead[who]}, [part[who] for part in ready])
+            rates = self._rates.after({"dx_1": ahead[group]}, [part[group] for part in ready])
             chained = chained or [np.empty(n) for _ in rates]
             for target, rate in zip(chained, rates, strict=True):
-                target[who] = rate
+                target[group] = rate
         return chained
 
     def _given(self, time: float, views: DriverInputs) -> dict[str, Any]:
@@ -266,9 +266,9 @@ class Drivers:
         if not same:
             raise ConfigError(
                 f"{' with '.join(str(term.name) for term in self._terms)} has no speed on an "
-                "empty road: what it says, or remembers, grows with the gap; name far=100, say: m, "
-                "at which a vehicle ahead counts as none, and none as a vehicle there with one's "
-                "own speed"
+                "empty road, because its value or a state grows with the gap; set a distance such "
+                "as far=100 (m): vehicles farther ahead are ignored, and without a vehicle ahead "
+                "the law has a leader at this distance with the same speed"
             )
 
 
@@ -297,24 +297,26 @@ def drivable(system: System) -> LaneDynamics:
     """
     if not isinstance(system, Traffic):
         raise ConfigError(
-            "the run's model is one of people, and drive moves vehicles in SUMO; JuPedSim's "
-            "released wheels take no model of one's own: export.py to=jupedsim writes the "
-            "parameters of models that it has"
+            "the run's model is one of people, and nnode drive controls vehicles in SUMO; "
+            "JuPedSim cannot run a user's model, and nnode export to=jupedsim writes the "
+            "parameters of its own models"
         )
     lane = system.formula
     if type(system) is not Traffic or lane is None or not lane.is_formula:
         raise ConfigError(
-            "the run's model has a term that is Python code; to drive vehicles it needs a formula, "
-            "see docs/method.md"
+            "the run's model has a term that is Python code, and only formulas can control "
+            "vehicles, see docs/method.md"
         )
     if "measured" in symbols([*lane.rates.values(), *lane.starts.values()]):
-        raise ConfigError("the run's model names measured speeds, which SUMO's vehicles have not")
+        raise ConfigError(
+            "the run's model depends on measured speeds, which vehicles in SUMO do not have"
+        )
     for place, part in lane.inputs.values():
         term = system.terms[place]
         if not isinstance(term, VehicleClass | IndividualEffect):
             raise ConfigError(
                 f"effect {term.name} needs {part} of each vehicle from the recorded data, which "
-                "SUMO cannot tell; leave the effect out and calibrate again"
+                "SUMO cannot tell; calibrate a model without the effect"
             )
     return lane
 

@@ -87,7 +87,7 @@ def points_per_edge(r: float, B: float, spacing: float) -> float:
 
 #: Laws that JuPedSim has.
 SAME = ("cfsm", "gcfm")
-_PACE = "desired_speed: the median of people's preferred speeds; each has his own"
+_PACE = "desired_speed: the median of the preferred speeds, which differ between people"
 
 
 def has_parameters(system: System) -> bool:
@@ -161,9 +161,9 @@ def _same_law(system: System, name: str, scenes: Scenes) -> tuple[Counterpart, d
         }
         content = _content("GeneralizedCentrifugalForceModel", model, agent)
         counterpart.missing.append(
-            "the distance of bodies: JuPedSim takes points of the ellipses that are not on the "
-            "line between the centres, and interpolates the force where they are near or far, "
-            "from walls as well"
+            "the distance of bodies: JuPedSim uses points of the ellipses that are not on the line "
+            "between the centres, and interpolates the force at small and large distances, also "
+            "for walls"
         )
     counterpart.notes.append(_PACE)
     counterpart.missing += effects_without(system)
@@ -176,8 +176,8 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
     if force is None:
         raise ConfigError(
             "to=jupedsim: the run's model has no social force and is neither "
-            f"{' nor '.join(SAME)}; JuPedSim has no counterpart to it, and its released wheels "
-            "take no model of one's own; leave it out of to="
+            f"{' nor '.join(SAME)}, and JuPedSim has no counterpart of it; leave jupedsim out "
+            "of to="
         )
     counterpart = Counterpart()
     walls = force.walls and scenes.points > 0
@@ -188,24 +188,24 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
         share = scenes.people / scenes.points
         obstacle = strength * share * points_per_edge(force.r, force.B, scenes.spacing)
         counterpart.notes.append(
-            "obstacle_scale: equals the wall points' force on a person who touches a long "
-            "straight wall; farther away and at corners the two differ"
+            "obstacle_scale: equal to the force of wall points on a person who touches a long "
+            "straight wall; at larger distances and at corners the forces differ"
         )
         counterpart.missing.append(
             "k and kappa at walls: JuPedSim has one body_force and one friction for people and "
-            "walls; here contact with walls is averaged over wall points instead"
+            "walls, and nnode averages contact with walls over wall points"
         )
     counterpart.notes.append(
         f"mass: {force.mass:g} kg times the {scenes.people:.3g} people of a mean sequence, because "
-        "forces are averaged over people here and summed there; accelerations between people are "
-        "equal in a scene of so many"
+        "nnode averages forces over people and JuPedSim sums them; accelerations between people "
+        "are equal in a scene with this number of people"
     )
     preferred = relaxation is not None and relaxation.preferred
     counterpart.notes.append(
         _PACE
         if preferred
-        else "desired_speed: the median of the measured speeds; the model itself keeps everybody's "
-        "present speed, which JuPedSim cannot"
+        else "desired_speed: the median of the measured speeds; in the model, people keep their "
+        "present speed, which is not possible in JuPedSim"
     )
     if force.walls and not walls:
         counterpart.notes.append("obstacle_scale: 0, the data have no walls")
@@ -213,7 +213,7 @@ def _social_force(system: System, scenes: Scenes) -> tuple[Counterpart, dict[str
         counterpart.missing.append(
             "opposing_wall_friction: JuPedSim's friction at walls has the opposite sign"
         )
-    counterpart.missing.append("reach: JuPedSim lets nobody feel people farther away than 2.5 m")
+    counterpart.missing.append("range: in JuPedSim, forces between people end at 2.5 m")
     counterpart.missing += effects_without(system, 2 if relaxation else 1)
     content = _content(
         "SocialForceModel",

@@ -65,7 +65,9 @@ class RunningSumo:
         self, program: str, scenario: Path, output: Path, steps: Steps | None = None
     ) -> None:
         if not scenario.is_file():
-            raise ConfigError(f"sumo={scenario} is not there; name a SUMO configuration, *.sumocfg")
+            raise ConfigError(
+                f"sumo={scenario} is not there; state a SUMO configuration, *.sumocfg"
+            )
         self.api, binary = _loaded(program)
         options = [
             "-c",
@@ -135,7 +137,7 @@ class RunningSumo:
             if pause > self.seconds * (1 + 1e-9):
                 raise ConfigError(
                     f"vehicles={name}: its actionStepLength is {pause:g} s and SUMO's step "
-                    f"{self.seconds:g} s, so that speeds would wait; leave actionStepLength out of "
+                    f"{self.seconds:g} s, so speeds would be delayed; remove actionStepLength from "
                     "the vType"
                 )
 
@@ -247,5 +249,7 @@ def _loaded(program: str) -> tuple[Any, str]:
             f"program={PROGRAMS[program == PROGRAMS[0]]}"
         ) from error
     if binary is None and program == "traci":
-        raise ConfigError("no program sumo is found; pip install eclipse-sumo, or set SUMO_HOME")
+        raise ConfigError(
+            "the program sumo is not installed; pip install eclipse-sumo, or set SUMO_HOME"
+        )
     return module, binary or "sumo"

@@ -113,21 +113,21 @@ def _same_law(system: System, law: str, name: str, length: float | None) -> Coun
         del counterpart.values["sigma"]
     if length is None:
         counterpart.notes.append(
-            f"length + minGap = s0 = {s0:.4g} m: the data have no lengths, and s0 contains one"
+            f"length + minGap = s0 = {s0:.4g} m: the data have no lengths, so s0 contains a length"
         )
         if law == "idm":
             counterpart.missing.append(
-                "gaps from front to front: SUMO's IDM divides by the gap between bumpers, the "
-                "run's by one that is a length longer; calibrate with lengths for the same paths"
+                "gaps from front to front: SUMO's IDM divides by the gap between bumpers, and the "
+                "run's law by a gap that contains a length; calibrate with lengths for equal paths"
             )
     else:
         counterpart.notes.append(f"length: the data's median, {body:.4g} m")
     counterpart.notes.append(
-        "maxSpeed: no faster than a lane allows; leave speedFactor at 1 and limits above v0"
+        "maxSpeed: lanes also limit the speed; keep speedFactor at 1 and speed limits above v0"
     )
     if law == "krauss":
         counterpart.missing.append(
-            "the last metre behind a vehicle at rest, which SUMO drives at decel times one step"
+            "the last metre behind a vehicle at rest, where SUMO's speed is decel times one step"
         )
     counterpart.missing += effects_without(system)
     return counterpart
@@ -145,8 +145,8 @@ def _krauss_of_gap(system: System, name: str, speed: float, length: float | None
     if law is None:
         raise ConfigError(
             f"to=sumo: the run's model is neither {' nor '.join(SAME)} nor a law with a gap at "
-            "rest, and SUMO has no counterpart to it; leave it out of to=, or let it drive SUMO's "
-            "vehicles itself: nnode drive"
+            "rest, and SUMO has no counterpart of it; leave sumo out of to=, or control SUMO's "
+            "vehicles by the model: nnode drive"
         )
     counterpart = Counterpart()
     effects = {str(term.name): term for term in list(system.terms)[1:]}
@@ -161,7 +161,7 @@ def _krauss_of_gap(system: System, name: str, speed: float, length: float | None
         "minGap": _digits(min_gap),
     }
     text = f"{of_body:.3g} m of it are the length, "
-    text += "SUMO's own, cut to L" if length is None else "the data's median, cut to L"
+    text += "SUMO's default, at most L" if length is None else "the data's median, at most L"
     counterpart.notes.append(f"length + minGap = L = {L:.4g} m, the gap at rest; {text}")
 
     limits = [v0] if law.entry == "lin" else []
@@ -173,8 +173,8 @@ def _krauss_of_gap(system: System, name: str, speed: float, length: float | None
         values["maxSpeed"] = _digits(min(limits))
     else:
         counterpart.missing.append(
-            f"v0 = {v0:.4g} m/s: it is no greatest speed in the logarithmic law, which knows none; "
-            "maxSpeed stays SUMO's"
+            f"v0 = {v0:.4g} m/s: the logarithmic law has no greatest speed, so maxSpeed is SUMO's "
+            "default"
         )
     time_gap = 0.0
     if "time_gap" in effects:
@@ -185,24 +185,25 @@ def _krauss_of_gap(system: System, name: str, speed: float, length: float | None
         tau = (gap - L) / speed
         values["tau"] = _digits(tau)
         counterpart.notes.append(
-            f"tau: at the data's median speed of {speed:.4g} m/s gaps are the law's, {gap:.4g} m; "
-            f"SUMO's steps must not be longer than tau, {tau:.3g} s"
+            f"tau: at the data's median speed of {speed:.4g} m/s, the gap is that of the law, "
+            f"{gap:.4g} m; SUMO's steps must not be longer than tau, {tau:.3g} s"
         )
     else:
         counterpart.missing.append(
-            f"tau: the law has no gap at the data's median speed of {speed:.4g} m/s; SUMO's stays"
+            f"tau: the law has no gap at the data's median speed of {speed:.4g} m/s, so tau is "
+            "SUMO's default"
         )
     if "reaction_delay" in effects:
         delay = _value(effects["reaction_delay"], "T")
         values["actionStepLength"] = _digits(delay)
         counterpart.notes.append(
-            "actionStepLength: the reaction delay; SUMO's drivers decide at such intervals, which "
-            "delays them by half of it on average"
+            "actionStepLength: the reaction delay; SUMO's drivers decide at these intervals, so "
+            "their mean delay is half an interval"
         )
         counted.add("reaction_delay")
     counterpart.missing.append(
-        "the law's curvature, and speed as a function of the gap alone: Krauss' drivers also mind "
-        "the speed ahead and accelerate by at most accel, decel, which stay SUMO's"
+        "the law's curvature, and speed as a function of the gap alone: Krauss' drivers also react "
+        "to the speed ahead, and their accelerations are limited by SUMO's default accel and decel"
     )
     counterpart.missing += effects_without(system, 1, counted)
     counterpart.values = values
