@@ -87,7 +87,7 @@ class CheckConfig:
 class EvaluateConfig:
     """``nnode evaluate``: errors of a checkpoint and of baselines."""
 
-    checkpoint: str = MISSING  # RUN/checkpoints/best.pt
+    checkpoint: str = MISSING  # folder of a run, or a checkpoint such as RUN/checkpoints/best.pt
     data: Any = MISSING
     solver: Any = MISSING
     device: Device = Device.auto
@@ -159,7 +159,7 @@ class PredictConfig:
 class PlotForcesConfig:
     """``nnode plot_forces``: forces and speed curves of calibrated models."""
 
-    checkpoint: Any = MISSING  # one path or a list of paths
+    checkpoint: Any = MISSING  # folder of a run or a checkpoint, or a list of these
     data: Any = MISSING
     # half width of the contour plots, m; null: a width that suits the model
     extent: float | None = None
