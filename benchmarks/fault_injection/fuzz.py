@@ -107,8 +107,6 @@ def fuzz(folder: Path, inputs: int, seed: int, names: list[str] | None = None) -
         seed: the same seed makes the same files.
         names: of the targets; None takes all.
     """
-    import pedpy  # noqa: F401  the children share it: loading takes longer than a thousand inputs
-
     scratch, outside = folder / "fuzz", folder / "outside"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)

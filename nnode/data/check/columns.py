@@ -215,7 +215,7 @@ def in_seconds(raw: Raw) -> Raw:
     Raises:
         DataError: a cell of them that is none; names the row.
     """
-    if raw.table is None or not raw.named:
+    if raw.table is None or not raw.layout.named:
         return raw
     held = {}
     for column, cells in raw.frame.items():
@@ -237,8 +237,10 @@ def numbers(frame: pd.DataFrame, column: str) -> np.ndarray:
 def meanings(raw: Raw) -> dict[str, Meaning]:
     """What the columns mean, as far as that can be told."""
     frame = raw.frame
-    if not raw.named:
-        return {m: Meaning(c, raw.unit or "", "holds") for m, c in _by_content(frame).items()}
+    if not raw.layout.named:
+        return {
+            m: Meaning(c, raw.layout.unit or "", "holds") for m, c in _by_content(frame).items()
+        }
     recognised: dict[str, Meaning] = {}
     # a name as a whole, and without the unit that it ends in
     parsed = {name: (_letters(name), *plain(name)) for name in map(str, frame.columns)}

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pandas as pd
 
-from nnode.data.readers.columns import Table, beginning, is_parquet, layout
+from nnode.data.readers.columns import Layout, Table, beginning, is_parquet, layout
 from nnode.data.readers.jupedsim import MAGIC
 from nnode.data.readers.openacc import HEAD
 from nnode.errors import ConfigError, DataError
@@ -21,8 +20,6 @@ _MAGICS = {
     b"PAR1": "parquet",
     b"\x1f\x8b": "sumo",
 }
-_RATE = re.compile(r"(?:frame\s*rate|fps)\D{0,12}([\d.]+)", re.IGNORECASE)
-_UNIT = re.compile(r"\bx\s*[/\[(]\s*(cm|m)\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -33,20 +30,14 @@ class Raw:
         path: of the file.
         native: the data source with a reader for exactly this format; empty: a table.
         table: the cells, None for a native format.
-        named: whether the file names its columns.
-        separator: ``,``, ``;``, tab, or a space for any white space; empty for Parquet.
-        rate: frames per second that a comment states.
-        unit: of positions that a comment states, ``cm`` or ``m``.
+        layout: of a text.
         dated: columns of dates, clock times or durations; in ``table`` these are seconds.
     """
 
     path: Path
     native: str = ""
     table: Table | None = None
-    named: bool = True
-    separator: str = ","
-    rate: float | None = None
-    unit: str | None = None
+    layout: Layout = field(default_factory=Layout)
     dated: tuple[str, ...] = ()
 
     @property
@@ -59,6 +50,12 @@ class Raw:
     def frame(self) -> pd.DataFrame:
         """Its cells."""
         return self.cells.frame
+
+    @property
+    def rate(self) -> float | None:
+        """Frames per second that the file states, where a recording can have so many."""
+        rate = self.layout.rate
+        return rate if rate is not None and 0 < rate < float("inf") else None
 
 
 def read_raw(path: Path) -> Raw:
@@ -77,7 +74,7 @@ def read_raw(path: Path) -> Raw:
         raise DataError(f"{path} is empty; expected rows of trajectories")
     native = next((name for magic, name in _MAGICS.items() if start.startswith(magic)), "")
     if is_parquet(path):
-        return Raw(path, table=Table(path), separator="")
+        return Raw(path, table=Table(path))
     if native == "parquet":
         raise DataError(f"{path} is a Parquet table; give it a name that ends in .parquet")
     if native:
@@ -106,20 +103,4 @@ def _text(path: Path, start: bytes) -> Raw:
             f"{number} cell{'s' * (number > 1)}; expected at least an agent, a time and "
             "a position, separated by commas, semicolons, tabs or spaces"
         )
-    rate, unit = _RATE.search(form.comments), _UNIT.search(form.comments)
-    return Raw(
-        path,
-        table=Table(path, encoding_errors="replace"),
-        named=form.named,
-        separator=form.separator,
-        rate=_positive(rate[1]) if rate else None,
-        unit=unit[1].lower() if unit else None,
-    )
-
-
-def _positive(text: str) -> float | None:
-    try:
-        value = float(text.rstrip("."))
-    except ValueError:
-        return None
-    return value if 0 < value < float("inf") else None
+    return Raw(path, table=Table(path, encoding_errors="replace"), layout=form)

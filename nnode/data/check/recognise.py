@@ -122,7 +122,7 @@ def recognised(
 
 def _raw(source: pd.DataFrame | str | Path) -> Raw:
     if isinstance(source, pd.DataFrame):
-        return Raw(Path("table"), table=Table(source), separator="")
+        return Raw(Path("table"), table=Table(source))
     return read_raw(Path(source).expanduser())
 
 
@@ -378,11 +378,12 @@ def _people(raw: Raw, scaled_table: Scaled) -> Recognised:
     ordered = list(columns) == ["agent", "frame", "x", "y"]
     ordered &= list(columns.values()) == list(map(str, raw.frame.columns[:4]))
     every = scale.rate is not None and abs(dt * scale.rate - 1) < 1e-6  # frame by frame
-    text = not raw.named and raw.separator == " " and ordered and scale.position in ("cm", "m")
+    plain_text = not raw.layout.named and raw.layout.separator == " "
+    text = plain_text and ordered and scale.position in ("cm", "m")
     if text and every:
         if raw.rate is None:
             options["frame_rate"] = scale.rate
-        if raw.unit is None:
+        if raw.layout.unit is None:
             options["unit"] = scale.position
         return Recognised("pedpy", WalkwayOptions(path=str(raw.path.absolute()), **options))
     return _recognised_table("pedpy", raw, replace(scaled_table, scales=[scale]), **options)

@@ -114,7 +114,7 @@ def scaled(
     units = {"time": "s" if meanings[clock].column in raw.dated else meanings[clock].unit}
     for what, tellers in _TELL.items():
         units[what] = next((u for m in tellers if m in meanings and (u := meanings[m].unit)), "")
-    units |= {"position": raw.unit} if raw.unit else {}
+    units |= {"position": raw.layout.unit} if raw.layout.unit else {}
     units |= told_units or {}
     if clock == "frame":
         units["time"] = "frame"

@@ -34,6 +34,11 @@ LOOKED_AT, _LINES = 1 << 16, 20
 PARQUET = (".parquet", ".pq")
 #: A cell of a text that is a number.
 NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|nan|inf", re.IGNORECASE)
+#: Frames per second, and the unit of positions, as comments state them.
+_RATE = re.compile(
+    r"(?:frame\s*rate|fps)\D{0,12}?([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)", re.IGNORECASE
+)
+_UNIT = re.compile(r"\b(?:x\s*[/\[(]|in)\s*(cm|m)\b", re.IGNORECASE)
 
 
 @dataclass
@@ -57,21 +62,24 @@ class Layout:
     Attributes:
         first: its first row.
         cells: of that row.
-        separator: ``,``, ``;``, tab, or a space for any white space.
+        separator: ``,``, ``;``, tab, or a space for any white space; empty for tables that are no
+            text.
         names: of the columns, where the first row holds none: those of the last comment, else
             ``column 1``, ...; None: the first row holds them.
         named: whether the names are the file's own.
-        comments: lines that begin with ``#``.
+        rate: frames per second that a comment states.
+        unit: of positions that a comment states, ``cm`` or ``m``.
         options: of :func:`pandas.read_csv`.
     """
 
-    first: str
-    cells: list[str]
-    separator: str
-    names: list[str] | None
-    named: bool
-    comments: str
-    options: dict[str, Any]
+    first: str = ""
+    cells: list[str] = field(default_factory=list)
+    separator: str = ""
+    names: list[str] | None = None
+    named: bool = True
+    rate: float | None = None
+    unit: str | None = None
+    options: dict[str, Any] = field(default_factory=dict)
 
 
 def is_parquet(path: Path) -> bool:
@@ -122,7 +130,17 @@ def layout(start: bytes) -> Layout | None:
     }
     if comments:  # the rows' own lines are counted from the comments above them on
         options |= {"comment": "#", "skiprows": lines.index(rows[0])}
-    return Layout(rows[0], cells, separator, names, named, "\n".join(comments), options)
+    rate, unit = _RATE.search("\n".join(comments)), _UNIT.search("\n".join(comments))
+    return Layout(
+        first=rows[0],
+        cells=cells,
+        separator=separator,
+        names=names,
+        named=named,
+        rate=float(rate[1]) if rate else None,
+        unit=unit[1].lower() if unit else None,
+        options=options,
+    )
 
 
 def _separator(rows: list[str]) -> str:

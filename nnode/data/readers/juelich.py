@@ -6,7 +6,6 @@ stay as they are in the file.
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 from collections.abc import Mapping
@@ -14,22 +13,24 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from fnmatch import fnmatch
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-import pandas as pd
 
 from nnode.data.cut import Reading, by_presence, sequence_of, uneven_text
 from nnode.data.exits import goals_of, read_exits
 from nnode.data.options import DataOptions, one_of, positive
+from nnode.data.readers.columns import EXACT, Table, beginning, floats, layout
 from nnode.data.readers.recordings import natural, raw_files
 from nnode.data.sequence import Sequence
 from nnode.data.trajectories import Grid, Record, Trajectories, grouped_rows, records
 from nnode.errors import ConfigError, DataError
 
-#: Units of the coordinates, with their size in m.
-UNITS = {"cm": 0.01, "m": 1.0}
+#: Units of the coordinates, and how many of them are a metre.
+UNITS = {"cm": 100.0, "m": 1.0}
+
+#: Columns of a recording of people.
+COLUMNS = ("id", "frame", "x", "y")
 
 #: From the first frame to the last there may be so many, or ten times those with somebody in them.
 _PAUSES = 10**5
@@ -206,100 +207,90 @@ def load_people(path: Path, options: JuelichOptions) -> People:
         ConfigError: a frame rate or unit that is unknown or contradicts the file.
         DataError: no such file, or lines that are no trajectory (names the line).
     """
-    rate = options.frame_rate
-    if rate is not None:
-        positive("frame_rate", rate)
+    if options.frame_rate is not None:
+        positive("frame_rate", options.frame_rate)
     if options.unit is not None:
         one_of("unit", options.unit, UNITS)
     if not path.is_file():
         raise DataError(f"there is no file {path}")
-    pedpy = _pedpy()
-    words = {"cm": pedpy.TrajectoryUnit.CENTIMETER, "m": pedpy.TrajectoryUnit.METER}
-    try:
-        trajectory = pedpy.load_trajectory(
-            trajectory_file=path,
-            default_frame_rate=rate,
-            default_unit=None if options.unit is None else words[options.unit],
-        )
-    except (pedpy.errors.PedPyError, ValueError, OverflowError) as error:
-        _check_lines(path)
-        raise ConfigError(
-            f"{path}: the header and data.frame_rate={rate}, data.unit={options.unit} do not "
-            f"settle the frame rate and the unit: {error} Set data.frame_rate (1/s) and "
-            "data.unit (cm, m) where the header lacks them, and to null where it has them"
-        ) from error
-    table = trajectory.data[["id", "frame", "x", "y"]].reset_index(drop=True)
-    if not np.isfinite(table[["x", "y"]].to_numpy()).all():
-        _check_lines(path)
-    return people_of(path, table, float(trajectory.frame_rate))
+    form = layout(beginning(path))
+    if form is None:
+        raise DataError(f"{path} is empty; expected lines of 'id frame x y z'")
+    rate = _settled(path, "frame_rate", "1/s", options.frame_rate, form.rate)
+    unit = _settled(path, "unit", "cm, m", options.unit, form.unit)
+    further = [f"column {i + 1}" for i in range(len(COLUMNS), len(form.cells))]
+    csv = form.options | {"sep": r"\s+", "comment": "#", "encoding_errors": "replace"}
+    return people_of(Table(path, [*COLUMNS, *further], **csv), rate, UNITS[unit])
 
 
-def people_of(path: Path, table: pd.DataFrame, rate: float) -> People:
-    """Rows id, frame, x, y (m) of a recording with so many frames per second.
+_Stated = TypeVar("_Stated", float, str)
+
+
+def _settled(
+    path: Path, option: str, values: str, given: _Stated | None, stated: _Stated | None
+) -> _Stated:
+    """What an option or a file's header states.
+
+    Args:
+        values: that the option may have, for messages.
 
     Raises:
-        DataError: a rate that no recording has, or frames far away from the others.
+        ConfigError: neither states it, or each something else.
     """
+    value = given if stated is None else stated
+    if value is None:
+        raise ConfigError(
+            f"{path} states no {option.replace('_', ' ')}: set data.{option} ({values})"
+        )
+    if given not in (None, value):
+        raise ConfigError(
+            f"data.{option}={given}, but the header of {path} states {stated}; set data.{option} "
+            "to null, or correct the header"
+        )
+    return value
+
+
+def people_of(table: Table, rate: float, per_metre: float = 1.0) -> People:
+    """Rows of a table with :data:`COLUMNS` and so many frames per second.
+
+    Args:
+        per_metre: how many units of the coordinates are a metre.
+
+    Raises:
+        DataError: cells that are no trajectory (names the row), a rate that no recording has, or
+            frames far away from the others.
+    """
+    path = table.path
+    values = np.stack([floats(table.frame[name]) for name in COLUMNS], axis=1)
+    whole = values[:, :2]
+    good = np.isfinite(values).all(axis=1)
+    good &= ((whole == np.round(whole)) & (np.abs(whole) < EXACT)).all(axis=1)
+
+    def expected(i: int) -> str:
+        cells = " ".join(map(str, table.frame[list(COLUMNS)].iloc[i]))
+        return f"expected 'id frame x y', whole numbers and then coordinates, found {cells[:80]!r}"
+
+    table.refuse(~good, expected)
     if not 0 < rate <= FASTEST:
         raise DataError(
             f"{path}: a frame rate of {rate:g} frames/s; expected a positive number of at most "
             f"{FASTEST:g}: correct it in the file"
         )
-    frame = table["frame"].to_numpy()
-    if int(frame.max()) - int(frame.min()) >= max(_PAUSES, 10 * table["frame"].nunique()):
+    frame = values[:, 1]
+    if np.ptp(frame) >= max(_PAUSES, 10 * len(np.unique(frame))):
         raise DataError(
-            f"{path}: {len(table)} rows stand in frames {frame.min()} to {frame.max()}; expected "
-            "consecutive frame numbers: look for one that is wrong, or cut the file"
+            f"{path}: {len(table)} rows stand in frames {frame.min():.0f} to {frame.max():.0f}; "
+            "expected consecutive frame numbers: look for one that is wrong, or cut the file"
         )
-    return (
-        Trajectories(
-            path=path,
-            name=path.stem,
-            where=lambda i: f"frame {frame[i]}",
-            agent=table["id"].astype(str).to_numpy(dtype=object),
-            time=frame / rate,
-            x=table[["x", "y"]].to_numpy(dtype=np.float64),
-        ),
-        1 / rate,
+    rows = Trajectories(
+        path=path,
+        name=path.stem,
+        where=lambda i: f"frame {frame[i]:.0f}",
+        agent=table.names("id"),
+        time=frame / rate,
+        x=values[:, 2:] / per_metre,
     )
-
-
-def _pedpy() -> ModuleType:
-    """PedPy, which is slow to load and would set up the logging of the whole program."""
-    root = logging.getLogger()
-    handlers, level = list(root.handlers), root.level
-    import pedpy
-
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    return pedpy
-
-
-def _check_lines(path: Path) -> None:
-    """Find the line that is no trajectory.
-
-    Raises:
-        DataError: always, unless every line holds id, frame, x, y.
-    """
-    rows = 0
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        for number, line in enumerate(file, start=1):
-            words = line.split("#")[0].split()
-            if not words:
-                continue
-            rows += 1
-            try:
-                good = len(words) >= 4 and all(math.isfinite(float(w)) for w in words[:4])
-                good = good and all(float(w).is_integer() for w in words[:2])
-            except ValueError:
-                good = False
-            if not good:
-                raise DataError(
-                    f"{path}, line {number}: expected 'id frame x y z', whole numbers and then "
-                    f"coordinates, found {line.strip()[:80]!r}"
-                )
-    if rows == 0:
-        raise DataError(f"{path} is empty; expected lines of 'id frame x y z'")
+    return rows, 1 / rate
 
 
 def _before(

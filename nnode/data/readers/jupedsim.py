@@ -21,7 +21,6 @@ from shapely.geometry.polygon import orient
 
 from nnode.data.cut import Reading
 from nnode.data.readers.columns import (
-    EXACT,
     PARQUET,
     ColumnOptions,
     Table,
@@ -49,8 +48,6 @@ _AT_ONCE = 100_000
 
 #: Columns of a table.
 REQUIRED, OPTIONAL = ("agent", "time", "x", "y"), ("recording", "sequence")
-
-_COLUMNS = ("id", "frame", "pos_x", "pos_y")
 
 
 @dataclass
@@ -101,7 +98,7 @@ def read_walkway(
                 f"{path} is in m at {rate:g} frames/s, but data.frame_rate={options.frame_rate}, "
                 f"data.unit={options.unit}; leave both out for a database"
             )
-        people = people_of(path, table, rate)
+        people = people_of(table, rate)
     elif isinstance(path, Table) or options.columns or path.suffix.lower() in TABLES:
         people = _of_table(opened(path), options)
     else:
@@ -175,8 +172,8 @@ def _polygons(shape: object, where: str) -> Iterator[shapely.Polygon]:
         )
 
 
-def _read_database(path: Path) -> tuple[pd.DataFrame, float, str | None]:
-    """Rows id, frame, x, y (m), frames per second, and the walkable area as WKT."""
+def _read_database(path: Path) -> tuple[Table, float, str | None]:
+    """A table id, frame, x, y (m), frames per second, and the walkable area as WKT."""
     # immutable: neither a lock nor a journal is written beside the file, and none is played back
     address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
     try:
@@ -194,7 +191,7 @@ def _read_database(path: Path) -> tuple[pd.DataFrame, float, str | None]:
             rate = _rate(path, base)
             people = _people(path, base)
             area = _area(path, base) if kinds.get("geometry") == "table" else None
-    except (sqlite3.Error, UnicodeDecodeError) as error:
+    except (sqlite3.Error, pd.errors.DatabaseError, UnicodeDecodeError) as error:
         raise DataError(
             f"{path} cannot be read as a JuPedSim database: {error}; it is damaged or was written "
             "by another program"
@@ -217,35 +214,17 @@ def _rate(path: Path, base: sqlite3.Connection) -> float:
     return rate
 
 
-def _people(path: Path, base: sqlite3.Connection) -> pd.DataFrame:
-    rows = base.execute(f"SELECT {', '.join(_COLUMNS)} FROM trajectory_data ORDER BY id, frame")
-    parts = []
-    while part := rows.fetchmany(_AT_ONCE):
-        parts.append(_numbers(path, part))
-    if not parts:
+def _people(path: Path, base: sqlite3.Connection) -> Table:
+    query = "SELECT id, frame, pos_x AS x, pos_y AS y FROM trajectory_data ORDER BY id, frame"
+    frame = pd.concat(pd.read_sql_query(query, base, chunksize=_AT_ONCE))
+    if frame.empty:
         raise DataError(
             f"{path}: the table trajectory_data is empty; a simulation's trajectories are in its "
             "file only after the writer was closed"
         )
-    table = pd.DataFrame(np.concatenate(parts), columns=["id", "frame", "x", "y"])
-    return table.astype({"id": np.int64, "frame": np.int64})
-
-
-def _numbers(path: Path, rows: list[tuple[object, ...]]) -> np.ndarray:
-    """``(rows, 4)``; SQLite lets any cell hold anything."""
-    table = pd.DataFrame(rows, dtype=object).apply(pd.to_numeric, errors="coerce")
-    values = table.to_numpy(dtype=np.float64)
-    whole = values[:, :2]
-    good = np.isfinite(values).all(axis=1)
-    with np.errstate(invalid="ignore"):
-        good &= ((whole % 1 == 0) & (np.abs(whole) < EXACT)).all(axis=1)
-    if not good.all():
-        i = int(np.flatnonzero(~good)[0])
-        raise DataError(
-            f"{path}, table trajectory_data: a row holds (id, frame, pos_x, pos_y) = {rows[i]}; "
-            "expected whole numbers and then coordinates in m"
-        )
-    return values
+    table = Table(frame)
+    table.path = path
+    return table
 
 
 def _area(path: Path, base: sqlite3.Connection) -> str | None:

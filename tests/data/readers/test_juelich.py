@@ -148,8 +148,8 @@ def test_published_headerless_runs(real_data: Path) -> None:
         ({"t_seq": 0.001}, r"t_seq=0.001 s is 0.025 frames"),
         ({"t_seq": -1.0}, r"t_seq=-1.0: expected a positive number"),
         ({"frame_rate": -25.0}, r"frame_rate=-25.0: expected a positive number"),
-        ({"frame_rate": 16.0}, r"do not settle the frame rate"),
-        ({"unit": "m"}, r"do not settle the frame rate and the unit"),
+        ({"frame_rate": 16.0}, r"frame_rate=16.0, but the header of .*corridor.txt states 25.0"),
+        ({"unit": "m"}, r"unit=m, but the header of .*corridor.txt states cm"),
         ({"unit": "ft"}, r"unit=ft: expected one of cm, m"),
         ({"walking_axis": "z"}, r"walking_axis=z: expected one of x, y"),
         ({"view": [3.0, -3.0]}, r"view=\[3.0, -3.0\]: expected \[low, high\]"),
@@ -163,9 +163,10 @@ def test_bad_options(corridor: Path, options: dict, message: str) -> None:
 
 def test_headerless_files_need_rate_and_unit(tmp_path: Path) -> None:
     path = write(tmp_path / "run.txt", lines(0, 30, 1))
-    for options in (JuelichOptions(unit="cm"), JuelichOptions(frame_rate=25)):
-        with pytest.raises(ConfigError, match=r"Set data.frame_rate \(1/s\) and data.unit"):
-            read_juelich(path, options)
+    with pytest.raises(ConfigError, match=r"no frame rate: set data.frame_rate \(1/s\)"):
+        read_juelich(path, JuelichOptions(unit="cm"))
+    with pytest.raises(ConfigError, match=r"no unit: set data.unit \(cm, m\)"):
+        read_juelich(path, JuelichOptions(frame_rate=25))
 
 
 @pytest.mark.parametrize(
@@ -173,7 +174,7 @@ def test_headerless_files_need_rate_and_unit(tmp_path: Path) -> None:
     [
         ("", "is empty"),
         (HEADER, "is empty"),
-        (HEADER + lines(0, 30, 1) + "1 31 abc 5 0\n", r"line 34: expected 'id frame x y z'"),
+        (HEADER + lines(0, 30, 1) + "1 31 abc 5 0\n", r"line 34: expected 'id frame x y'"),
         (HEADER + "1 0 5\n" * 30, r"line 3: expected"),
         (HEADER + lines(0, 30, 1) + "1 31 nan 5 0\n", r"line 34: expected"),
         (HEADER + lines(0, 30, 1) + "1.5 31 5 5 0\n", r"line 34: expected"),

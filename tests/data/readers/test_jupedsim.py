@@ -168,7 +168,7 @@ def test_several_polygons() -> None:
         ({"fps": None}, ["metadata", "fps", "nothing"]),
         ({"fps": "fast"}, ["metadata", "'fast'"]),
         ({"fps": "0"}, ["metadata", "positive"]),
-        ({"rows": [*ROWS, (21, 1, "far", 0, 0, 0)]}, ["trajectory_data", "(1, 21, 'far', 0)"]),
+        ({"rows": [*ROWS, (21, 1, "far", 0, 0, 0)]}, ["row 22", "1 21 far 0"]),
         ({"rows": [*ROWS, (21.5, 1, 0, 0, 0, 0)]}, ["21.5", "whole numbers"]),
         ({"rows": [*ROWS, (10**12, 1, 0, 0, 0, 0)]}, ["1000000000000", "consecutive"]),
         ({"rows": [*ROWS, (1e300, 1, 0, 0, 0, 0)]}, ["1e+300", "whole numbers"]),
