@@ -8,7 +8,6 @@ at the start of the sequence; with a heading in place of a line it is far ahead.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from collections.abc import Sequence as ListLike
 from dataclasses import dataclass
 from typing import Any
 
@@ -117,68 +116,39 @@ def _unit(what: str, value: Any) -> np.ndarray | None:
 
 
 def exits_of(
-    exits: list[Exit],
-    first: np.ndarray,
-    last: np.ndarray,
-    names: Iterable[str],
-    groups: ListLike[str] | np.ndarray | None = None,
-) -> list[Exit]:
-    """Everybody's exit.
-
-    Args:
-        exits: at least one.
-        first, last: ``(N, 2)`` m, where people were first and last seen.
-        names: N, for messages.
-        groups: N names, or None.
-
-    Raises:
-        DataError: somebody whom no exit is for.
-    """
-    chosen = []
-    for i, name in enumerate(names):
-        way = last[i] - first[i]
-        fits = [
-            exit_
-            for exit_ in exits
-            if (exit_.group is None or (groups is not None and groups[i] == exit_.group))
-            and (exit_.direction is None or way @ exit_.direction > 0)
-        ]
-        if not fits:
-            of = f" of group {groups[i]!r}" if groups is not None and groups[i] else ""
-            raise DataError(
-                f"no exit (data.exits) is for person {name}{of}, who goes from "
-                f"({first[i][0]:.1f}, {first[i][1]:.1f}) m to ({last[i][0]:.1f}, "
-                f"{last[i][1]:.1f}) m; add one without direction and group"
-            )
-        # what is for a group goes before what is for all
-        candidates = [exit_ for exit_ in fits if exit_.group is not None] or fits
-        chosen.append(min(candidates, key=lambda exit_: _distance(exit_, last[i], way)))
-    return chosen
-
-
-def goals_of(
     exits: list[Exit], rows: Trajectories, people: Iterable[np.ndarray]
 ) -> Iterator[tuple[int, Exit]]:
     """Everybody's first row with a position, and his exit by his first and last one.
 
     Args:
+        exits: at least one.
         rows: of people.
         people: rows of everyone, in order of time.
 
     Raises:
         DataError: somebody whom no exit is for.
     """
-    ends = []
     for of_person in people:
         located = of_person[np.isfinite(rows.x[of_person]).all(axis=1)]
-        ends.append((located if located.size else of_person)[[0, -1]])
-    first, last = np.array(ends).T
-    groups = None if rows.group is None else rows.group[first]
-    try:
-        chosen = exits_of(exits, rows.x[first], rows.x[last], rows.agent[first], groups)
-    except DataError as error:
-        raise DataError(f"{rows.path}: {error}") from error
-    return zip(first.tolist(), chosen, strict=True)
+        start, end = (located if located.size else of_person)[[0, -1]]
+        first, last = rows.x[start], rows.x[end]
+        way, group = last - first, None if rows.group is None else rows.group[start]
+        fits = [
+            exit_
+            for exit_ in exits
+            if exit_.group in (None, group)
+            and (exit_.direction is None or way @ exit_.direction > 0)
+        ]
+        if not fits:
+            whose = f" of group {group!r}" if group else ""
+            raise DataError(
+                f"{rows.path}: no exit (data.exits) is for person {rows.agent[start]}{whose}, who "
+                f"goes from ({first[0]:.1f}, {first[1]:.1f}) m to ({last[0]:.1f}, {last[1]:.1f}) "
+                "m; add one without direction and group"
+            )
+        # what is for a group goes before what is for all
+        candidates = [exit_ for exit_ in fits if exit_.group is not None] or fits
+        yield int(start), min(candidates, key=lambda exit_: _distance(exit_, last, way))
 
 
 def _distance(exit_: Exit, last: np.ndarray, way: np.ndarray) -> float:

@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.data.exits import FAR, exits_of, read_exits
+from nnode.data.exits import FAR, Exit, exits_of, read_exits
 from nnode.data.prepare import prepare
 from nnode.data.readers.juelich import JuelichOptions, read_juelich
 from nnode.data.readers.table import TableOptions, read_table
 from nnode.data.sequence import collate
+from nnode.data.trajectories import Trajectories
 from nnode.errors import ConfigError, DataError
 
 ENDS = {
@@ -40,19 +41,30 @@ def test_whose_exit() -> None:
         "ahead": {"heading": [3, 4], "group": "crew"},
     }
     exits = read_exits(told)
-    first = np.zeros((4, 2))
-    last = np.array([[3.0, 1.0], [-0.1, 3.0], [1.0, 8.0], [-2.0, 0.0]])
-    own = exits_of(exits, first, last, "abcd", ["", "", "band", "crew"])
-    assert [one.name for one in own] == ["right", "left", "up", "ahead"]
-    (band,) = exits_of(exits[3:], first[:1], last[:1], "a", ["crew"])
-    np.testing.assert_allclose(band.point(np.array([1.0, 1.0])), [1 + 0.6 * FAR, 1 + 0.8 * FAR])
+    people = Trajectories(
+        path=Path("t.csv"),
+        name="t",
+        where=str,
+        agent=np.repeat(np.array(list("abcd"), dtype=object), 2),
+        time=np.tile([0.0, 1.0], 4),
+        x=np.array([[0, 0], [3, 1], [0, 0], [-0.1, 3], [0, 0], [1, 8], [0, 0], [-2.0, 0]]),
+        group=np.repeat(np.array(["", "", "band", "crew"], dtype=object), 2),
+    )
+    rows = [np.array([2 * i, 2 * i + 1]) for i in range(4)]
+
+    def names(exits: list[Exit]) -> list[str]:
+        return [own.name for _, own in exits_of(exits, people, rows)]
+
+    assert names(exits) == ["right", "left", "up", "ahead"]
+    heading = exits[3].point(np.array([1.0, 1.0]))
+    np.testing.assert_allclose(heading, [1 + 0.6 * FAR, 1 + 0.8 * FAR])
     with pytest.raises(
-        DataError, match=r"is for person d of group 'x', who goes from \(0\.0, 0\.0\) m to"
+        DataError,
+        match=r"t\.csv: no exit .* is for person d of group 'crew', who goes from \(0\.0, 0\.0\) m",
     ):
-        exits_of(exits[:1], first[:1], last[3:], "d", ["x"])
+        list(exits_of(exits[:1], people, rows[3:]))
     # without direction the nearest to where people are last seen
-    lines = read_exits({name: {"line": one["line"]} for name, one in ENDS.items()})
-    assert [one.name for one in exits_of(lines, first, last, "abcd")] == [
+    assert names(read_exits({name: {"line": end["line"]} for name, end in ENDS.items()})) == [
         "right",
         "left",
         "right",

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from nnode.data.cut import Reading, by_presence, sequence_of, uneven_text
-from nnode.data.exits import goals_of, read_exits
+from nnode.data.exits import exits_of, read_exits
 from nnode.data.options import DataOptions, one_of, positive
 from nnode.data.readers.columns import EXACT, Table, beginning, floats, layout
 from nnode.data.readers.recordings import natural, raw_files
@@ -146,7 +146,7 @@ def cut_people(people: People, options: JuelichOptions, walls: np.ndarray | None
         notes += uneven_text(every, dt)
         of_people = grouped_rows(of_recording.agent, time=of_recording.time)
         exits = read_exits(options.exits)
-        goals_by_row = goals_of(exits, of_recording, of_people) if exits else ()
+        goals_by_row = exits_of(exits, of_recording, of_people) if exits else ()
         goals = {of_recording.agent[row]: goal for row, goal in goals_by_row}
         before = round(options.history / dt)
         for number, (present, first, last) in enumerate(

@@ -10,7 +10,7 @@ import numpy as np
 from omegaconf import MISSING
 
 from nnode.data.cut import Reading, by_sequence
-from nnode.data.exits import goals_of, read_exits
+from nnode.data.exits import exits_of, read_exits
 from nnode.data.options import DataOptions, chosen
 from nnode.data.readers.columns import ColumnOptions, Table, opened, table_rows
 from nnode.data.readers.recordings import natural, table_path
@@ -128,7 +128,7 @@ def _rows(table: Table, options: TableOptions) -> Trajectories:
                 "data.exits are for crowds without the columns dest_x and dest_y; leave it out"
             )
         destination, people = np.empty_like(rows.x), grouped_rows(*whose, time=rows.time)
-        exits = goals_of(read_exits(options.exits), rows, people)
+        exits = exits_of(read_exits(options.exits), rows, people)
         for of_person, (start, exit_) in zip(people, exits, strict=True):
             destination[of_person] = exit_.point(rows.x[start])
         rows = replace(rows, destination=destination)
