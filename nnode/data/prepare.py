@@ -15,8 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue
+from omegaconf import OmegaConf
 
 from nnode.data.cut import Reading
 from nnode.data.download import sha256
@@ -136,6 +135,18 @@ FORMATS: dict[type[DataOptions], Format] = {
 }
 
 
+def format_of(options: DataOptions) -> Format:
+    """The format that options stand for.
+
+    Raises:
+        ConfigError: none.
+    """
+    if type(options) not in FORMATS:
+        kinds = ", ".join(kind.__name__ for kind in FORMATS)
+        raise ConfigError(f"no reader for {type(options).__name__}; expected one of {kinds}")
+    return FORMATS[type(options)]
+
+
 def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = None) -> Store:
     """Read raw files, sort out faults, and write the sequences and a manifest.
 
@@ -159,9 +170,7 @@ def prepare(options: DataOptions, folder: Path | str, *, draw: Draw | None = Non
         DataError: raw files that cannot be read, or nothing left after dropping.
         FaultError: faults, with ``faults=error``.
     """
-    options = _as_dataclass(options)
-    folder = Path(folder)
-    layout = FORMATS[type(options)]
+    folder, layout = Path(folder), format_of(options)
     downloads = options.download or str(folder / "raw")
     with Stages("preparing", {"reading": 2.0, "looking for faults": 1.0}) as stages:
         stages.begin("reading")
@@ -276,7 +285,6 @@ def open_data(options: DataOptions, folder: Path | str) -> Store:
             that are not left at their defaults; names them.
         DataError, FaultError: see :func:`prepare`; or ``prepared`` holds no sound store.
     """
-    options = _as_dataclass(options)
     if options.prepared is None:
         return prepare(options, folder)
     store = Store(Path(options.prepared).expanduser())
@@ -337,18 +345,6 @@ def plain(options: DataOptions) -> dict[str, Any]:
     """Options as a dict that JSON can hold, as the manifest remembers them."""
     container = OmegaConf.to_container(OmegaConf.structured(options), enum_to_str=True)
     return cast(dict[str, Any], json.loads(json.dumps(container)))
-
-
-def _as_dataclass(options: DataOptions | DictConfig) -> DataOptions:
-    if isinstance(options, DictConfig):
-        try:
-            options = cast(DataOptions, OmegaConf.to_object(options))
-        except MissingMandatoryValue as error:
-            raise ConfigError(f"{error.full_key} is not set; give it a value") from error
-    if type(options) not in FORMATS:
-        kinds = ", ".join(kind.__name__ for kind in FORMATS)
-        raise ConfigError(f"no reader for {type(options).__name__}; expected one of {kinds}")
-    return options
 
 
 def _told(options: Mapping[str, Any]) -> dict[str, Any]:

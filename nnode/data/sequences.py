@@ -20,7 +20,7 @@ from nnode.data.check.recognise import Recognised, recognised
 from nnode.data.clusters import clusters, index_of
 from nnode.data.cut import LaneOptions
 from nnode.data.options import DataOptions
-from nnode.data.prepare import FORMATS, judge
+from nnode.data.prepare import format_of, judge
 from nnode.data.readers.columns import Table
 from nnode.data.readers.recordings import reading
 from nnode.data.sequence import Domain, Sequence, check_interval
@@ -117,7 +117,7 @@ class Sequences:
         memory = isinstance(source, pd.DataFrame | Table)
         with reading("the table" if memory or source is None else source):
             files = _files(options, source if memory else None)
-            judged = judge(options, files, FORMATS[type(options)].sequences(files, options))
+            judged = judge(options, files, format_of(options).sequences(files, options))
         return cls(judged.kept, judged.manifest)
 
     @property
@@ -252,12 +252,12 @@ def say_recognised(source: Recognised) -> None:
 
 def _files(options: DataOptions, frame: pd.DataFrame | Table | None) -> dict[str, Any]:
     """What a format reads: files, or a table in memory."""
+    layout = format_of(options)
     if frame is None:
         cache = str(user_cache_path("nnode") / "raw")
-        return FORMATS[type(options)].files(replace(options, download=options.download or cache))
-    kind = FORMATS[type(options)]
-    if kind.tables:
-        return kind.files(options, frame if isinstance(frame, Table) else Table(frame))
+        return layout.files(replace(options, download=options.download or cache))
+    if layout.tables:
+        return layout.files(options, frame if isinstance(frame, Table) else Table(frame))
     lanes = "lanes of another program" if isinstance(options, LaneOptions) else "files"
     raise ConfigError(
         f"data={options.name} are {lanes} and no data frame; give their path, or rename the "

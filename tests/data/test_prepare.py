@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 from scipy.io import savemat
 
 import nnode.data.prepare as module
 from nnode.data.options import DataOptions, Faults, SplitOptions
-from nnode.data.prepare import open_data, plain, prepare
+from nnode.data.prepare import open_data, prepare
 from nnode.data.quality import LISTED
 from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.readers.juelich import JuelichOptions
@@ -297,19 +296,13 @@ def test_wrong_options(tmp_path: Path, options: EsimasOptions) -> None:
     with pytest.raises(ConfigError, match="no reader for DataOptions"):
         prepare(DataOptions(), tmp_path / "out")
     with pytest.raises(ConfigError, match=r"path is not set"):
-        prepare(OmegaConf.structured(VehicleTableOptions()), tmp_path / "out")
+        prepare(VehicleTableOptions(), tmp_path / "out")
 
 
 def test_unwritable_folder(tmp_path: Path, options: EsimasOptions) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="cannot be written"):
         prepare(options, tmp_path / "file" / "out")
-
-
-def test_options_may_come_from_the_configuration(tmp_path: Path, options: EsimasOptions) -> None:
-    config = OmegaConf.structured(options)
-    assert plain(OmegaConf.to_object(config)) == plain(options)  # type: ignore[arg-type]
-    assert len(prepare(config, tmp_path / "out")) == 2
 
 
 @pytest.mark.real

@@ -22,7 +22,7 @@ from nnode.data.check.raw import Raw, read_raw
 from nnode.data.check.recognise import Recognised, native_source, source_of, source_of_native
 from nnode.data.check.rows import Scaled, scaled
 from nnode.data.cut import Reading
-from nnode.data.prepare import FORMATS
+from nnode.data.prepare import format_of
 from nnode.data.quality import (
     Fault,
     Finding,
@@ -151,8 +151,8 @@ def _table(
 
 
 def _read(source: Recognised) -> Reading:
-    kind = FORMATS[type(source.options)]
-    return kind.sequences(kind.files(source.options), source.options)
+    layout = format_of(source.options)
+    return layout.sequences(layout.files(source.options), source.options)
 
 
 def _tried(source: Recognised, findings: list[Finding]) -> list[Sequence]:
