@@ -225,7 +225,8 @@ def judge(
         if stages is not None:
             stages.within(number / len(sequences))
     kept, dropped = apply_policy(options.faults, sequences, faults)
-    for text in [*read.notes, *left_out_texts(len(read), dropped, read.left_out)]:
+    dropped_faults = [faults[entry["sequence"]] for entry in dropped]
+    for text in [*read.notes, *left_out_texts(len(read), dropped_faults, read.left_out)]:
         log.warning("%s", text)
     # faults are told with the source's own identifiers, and of faulty sequences they are looked
     # at as well: through them one of those agents may go on

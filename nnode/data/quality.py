@@ -133,11 +133,7 @@ def by_kind(faults: Iterable[Iterable[Fault]]) -> dict[str, int]:
     Args:
         faults: of every sequence.
     """
-    return _counted({fault.kind for fault in of_sequence} for of_sequence in faults)
-
-
-def _counted(kinds: Iterable[Iterable[str]]) -> dict[str, int]:
-    counts = Counter(kind for of_sequence in kinds for kind in of_sequence)
+    counts = Counter(kind for of_sequence in faults for kind in {f.kind for f in of_sequence})
     return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
 
@@ -828,13 +824,13 @@ def apply_policy(
 
 
 def left_out_texts(
-    sequences: int, dropped: list[dict[str, Any]], left_out: list[dict[str, str]]
+    sequences: int, dropped: list[list[Fault]], left_out: list[dict[str, str]]
 ) -> list[str]:
     """Sentences that say how much is not used, and why.
 
     Args:
         sequences: number of all sequences.
-        dropped: see :func:`apply_policy`.
+        dropped: faults of the sequences that are left out for them.
         left_out: see :class:`nnode.data.cut.Reading`.
     """
     texts = []
@@ -846,10 +842,9 @@ def left_out_texts(
             f"({listed}; first {left_out[0]['name']})"
         )
     if dropped:
-        counts = _counted({r["kind"] for r in d["reasons"]} for d in dropped)
-        listed = ", ".join(f"{kind} in {n}" for kind, n in counts.items())
         texts.append(
-            f"{len(dropped)} of {sequences} sequences are left out for their faults: {listed}"
+            f"{len(dropped)} of {sequences} sequences are left out for their faults: "
+            f"{kinds_text(dropped)}"
         )
     return texts
 

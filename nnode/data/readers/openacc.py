@@ -41,9 +41,8 @@ MOST_VEHICLES = 1000
 #: Properties of a vehicle that models may be given.
 KNOWN = ("make", "setting", "acc", "order")
 
-#: Times of a run, with those that no row stands for.
-MOST_TIMES = 10**6
-#: Times and places of a run may be so many, or so many times the rows that stand there.
+#: Times and places of a run, with those that no row stands for, may be so many, or so many times
+#: the rows.
 _CELLS, _SPARSE = 10**7, 10
 
 _FLAT = ("run", "position", "t", "v", "gap")
@@ -360,10 +359,11 @@ def _equally_spaced(
         raise DataError(f"{rows.path}: all rows of {rows.name} stand at one time")
     step = round(float(np.median(np.diff(time))), 9)
     number = (time - time[0]) / step
-    if not number[-1] < MOST_TIMES:
+    if not (number[-1] + 1) * len(names) <= max(_CELLS, _SPARSE * len(rows)):
         raise DataError(
-            f"{rows.path}: times go from {time[0]:g} to {time[-1]:g} s in steps of {step:g} s; "
-            f"expected at most {MOST_TIMES:.0e} steps: look for a time that is wrong"
+            f"{rows.path}: {len(rows)} rows of {len(names)} vehicles stand at times from "
+            f"{time[0]:g} to {time[-1]:g} s in steps of {step:g} s; look for a time or a position "
+            "that is wrong, or cut the file"
         )
     k = np.round(number).astype(int)
     odd = np.flatnonzero(np.abs(number - k) > 0.1)
@@ -373,11 +373,6 @@ def _equally_spaced(
             f"from the first, {time[0]:g} s"
         )
     shape = (int(k[-1]) + 1, len(names))
-    if shape[0] * shape[1] > max(_CELLS, _SPARSE * len(rows)):
-        raise DataError(
-            f"{rows.path}: {len(rows)} rows stand at {shape[0]} equally spaced times of {shape[1]} "
-            "vehicles; look for a time or a position that is wrong, or cut the file"
-        )
     cell = k[at] * shape[1] + agent
     if len(np.unique(cell)) < len(cell):
         raise DataError(

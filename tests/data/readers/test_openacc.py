@@ -184,7 +184,7 @@ def test_files_of_another_layout_are_refused(tmp_path: Path) -> None:
     table.loc[2, "IVS1"] = "x"
     with pytest.raises(DataError, match="line 9: column 'IVS1' holds 'x'"):
         read(save(tmp_path / "e.csv", table))
-    with pytest.raises(DataError, match="times go from 100 to 1e"):
+    with pytest.raises(DataError, match="stand at times from 100 to 1e"):
         read(save(tmp_path / "f.csv", run().replace({"Time": {120.0: 1e9}})))
     with pytest.raises(DataError, match="no sequence; in 1 runs"):
         read(save(tmp_path / "d.csv", run(2.0)))
