@@ -45,7 +45,7 @@ def demo_data(folder: Path | str, seed: int = 0, platoons: int = 20) -> dict[str
     return {
         "table": table(folder / "platoons.csv"),
         "nothing_hidden": table(folder / "nothing_hidden.csv", truth=SlowZone(alpha=1.0)),
-        "esimas": traffic_recording(traffic, seed=seed, v0=25.0, L=6.0),
+        "esimas": traffic_recording(traffic, seed=seed),
         # several times longer than anyone stays, so that a block of it can be held out
         "juelich": crowd_recording(crowd, seed=seed, people=45, duration=36.0),
     }
