@@ -199,28 +199,26 @@ class Sequences:
         """
         from nnode.files import xarray
 
-        axes = "xy"[: self._items[0].x.shape[2]]
-        shape = (len(self), max(s.n_samples for s in self), max(s.n_agents for s in self))
-        values = {f"{kind}{axis}": np.full(shape, np.nan) for kind in ("", "v") for axis in axes}
-        time, agent = np.full(shape[:2], np.nan), np.full(shape[::2], "", dtype=object)
-        for number, s in enumerate(self._items):
-            part = (number, slice(s.n_samples), slice(s.n_agents))
-            for d, axis in enumerate(axes):
-                values[axis][part] = s.x[..., d]
-                if s.v is not None:
-                    values[f"v{axis}"][part] = s.v[..., d]
-            time[number, : s.n_samples] = s.time
-            agent[number, : s.n_agents] = s.agents or [str(i) for i in range(s.n_agents)]
-        finite = {key: value for key, value in values.items() if np.isfinite(value).any()}
-        dims = ("sequence", "sample", "place")
-        return xarray().Dataset(
-            {key: (dims, value, {"units": UNITS[key]}) for key, value in finite.items()},
-            coords={
-                "sequence": [s.name for s in self._items],
-                "time": (dims[:2], time, {"units": "s"}),
-                "agent": (dims[::2], agent),
-            },
-        )
+        xarray()  # says how to install it where it is missing
+        tables = [
+            to_table(s)
+            .to_pandas()
+            .assign(
+                sample=np.repeat(np.arange(s.n_samples), s.n_agents),
+                place=np.tile(np.arange(s.n_agents), s.n_samples),
+            )
+            for s in self._items
+        ]
+        table = pd.concat(tables).set_index(["sequence", "sample", "place"])
+        keys = [key for key in ("x", "y", "vx", "vy") if key in table and table[key].notna().any()]
+        data = table[[*keys, "time", "agent"]].to_xarray()
+        names = [s.name for s in self._items]
+        data = data.reindex(sequence=names).assign_coords(sequence=names)
+        data["time"] = data["time"].max("place")
+        data["agent"] = data["agent"].isel(sample=0).fillna("")
+        for key in (*keys, "time"):
+            data[key].attrs["units"] = UNITS[key]
+        return data.set_coords(["time", "agent"]).drop_vars(["sample", "place"])
 
     def _about(self) -> str:
         number = int(self.groups.max()) + 1

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from nnode.data._arrow import to_table
 from nnode.data.check.columns import (
     Meaning,
     are_pairs,
@@ -111,23 +111,27 @@ def _rows_of(raw: Raw, sequences: list[Sequence]) -> Trajectories:
     An agent without an identifier is one of its own, and so is everyone in sequences whose
     positions begin anew.
     """
-    parts: dict[str, list[np.ndarray]] = defaultdict(list)
+    tables = []
     for s in sequences:
-        n, k = s.n_agents, s.n_samples
         whose = s.name if raw.native in _CUT or not s.agents else s.recording
-        names = [f"{whose} {name}" for name in s.agents or range(n)]
-        v = np.full((k, n), np.nan) if s.v is None else np.linalg.norm(s.v, axis=2)
-        length = np.full(n, np.nan) if s.length is None else s.length
-        parts["agent"].append(np.tile(np.array(names, dtype=object), k))
-        parts["time"].append(np.repeat(s.time, n))
-        parts["x"].append(s.x.reshape(k * n, -1))
-        parts["v"].append(v.reshape(-1, 1))
-        parts["length"].append(np.tile(length, k))
-        parts["recording"].append(np.full(k * n, s.recording, dtype=object))
-    columns: dict[str, Any] = {name: np.concatenate(part) for name, part in parts.items()}
-    columns |= {name: None for name in ("v", "length") if np.isnan(columns[name]).all()}
-    rows = Trajectories(path=raw.path, name=raw.path.stem, where=str, **columns)
-    return replace(rows, lane=rows.recording).in_order()
+        table = to_table(s).to_pandas()
+        tables.append(table.assign(agent=f"{whose} " + table["agent"]))
+    table = pd.concat(tables)
+    axes = [axis for axis in ("x", "y") if axis in table]
+    speed = np.linalg.norm(table[[f"v{axis}" for axis in axes]], axis=1)
+    recording, length = table["recording"].to_numpy(dtype=object), table["length"].to_numpy()
+    return Trajectories(
+        path=raw.path,
+        name=raw.path.stem,
+        where=str,
+        agent=table["agent"].to_numpy(dtype=object),
+        time=table["time"].to_numpy(),
+        x=table[axes].to_numpy(),
+        v=None if np.isnan(speed).all() else speed[:, None],
+        recording=recording,
+        lane=recording,
+        length=None if np.isnan(length).all() else length,
+    ).in_order()
 
 
 def _table(
