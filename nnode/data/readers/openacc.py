@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.signal import find_peaks
 
 from nnode.data.cut import Reading, sequence_of, whole_steps, windows
 from nnode.data.options import DataOptions, chosen, one_of, positive
@@ -52,7 +53,7 @@ CLOSED = 0.01
 
 #: m within which a vehicle is back where it was: the breadth of a road.
 BACK = 10.0
-#: m that a vehicle must have been away by in between.
+#: m that a vehicle must be away by before and after.
 AWAY = 50.0
 
 
@@ -489,18 +490,9 @@ def find_laps(driven: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.nda
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
     start = int(np.argmax(driven - driven[0] > BACK))  # not while it stands before it starts
     apart = np.linalg.norm(place - place[start], axis=1)
-    passes, k = [start], start
-    while True:
-        away = np.flatnonzero(apart[k:] > AWAY)
-        near = np.flatnonzero(apart[k + away[0] :] < BACK) if len(away) else away
-        if not len(near):
-            break
-        first = k + int(away[0]) + int(near[0])
-        leaves = np.flatnonzero(apart[first:] >= BACK)
-        if not len(leaves):
-            break
-        k = first + int(np.argmin(apart[first : first + int(leaves[0])]))
-        passes.append(k)
+    # from the start on, so that the vehicle is away before each of them and after it
+    nearest, _ = find_peaks(-apart[start:], height=-BACK, prominence=AWAY - BACK)
+    passes = [start, *(start + nearest).tolist()]
     # within a step the pass is where the way there and the way on are closest to the point
     at = [_along(place, i, place[start]) for i in passes]
     samples = np.arange(len(driven))

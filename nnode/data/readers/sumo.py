@@ -64,12 +64,10 @@ def read_sumo(path: Path, options: SumoOptions) -> Reading:
     content = _Content(path)
     content.read()
     rows = content.rows(within=options.lane is not None)
-    times = np.unique(rows.time)
-    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    if step > options.dt * (1 + 1e-6):
+    if rows.dt > options.dt * (1 + 1e-6):
         raise ConfigError(
-            f"data.dt={options.dt:g} s is finer than the steps of {path}, {step:g} s; set "
-            f"data.dt={step:g}, or let SUMO write with --step-length {options.dt:g}"
+            f"data.dt={options.dt:g} s is finer than the steps of {path}, {rows.dt:g} s; set "
+            f"data.dt={rows.dt:g}, or let SUMO write with --step-length {options.dt:g}"
         )
     return by_lane(rows, options, lane_word="")
 
