@@ -518,15 +518,13 @@ def _starts(every: list[Record], steps: int) -> list[int]:
 def _windows(lane: list[Record], options: LaneOptions) -> Iterator[_Platoon]:
     assert options.window is not None
     steps = round(options.window / options.dt)
-    for first in _starts(lane, steps):
-        last = first + steps
-        in_view = [r for r in lane if r.first <= last and r.last >= first]
-        whole = _in_order([r for r in in_view if r.first <= first and r.last >= last], first)
+    for present, first, last in by_presence(lane, steps):
+        whole = _in_order(present, first)
         x = np.stack([r.x[first - r.first : last - r.first + 1, 0] for r in whole], axis=1)
         broken: set[int] = set()
-        for r in in_view:
-            if r.first > first or r.last < last:
-                a, b = max(first, r.first), min(last, r.last)
+        for r in lane:
+            a, b = max(first, r.first), min(last, r.last)
+            if a <= b and (a, b) != (first, last):  # in view for a part of the window
                 place = r.x[a - r.first : b - r.first + 1]
                 behind = (x[a - first : b - first + 1] < place).sum(axis=1)
                 broken.update(int(n) for n in behind)

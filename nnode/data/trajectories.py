@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.integrate import cumulative_trapezoid
 
 from nnode.data.identity import LATEST, given_anew, numbered
 from nnode.data.limits import HOLE, UNEVEN
@@ -204,7 +205,7 @@ def driven(time: np.ndarray, v: np.ndarray) -> np.ndarray:
     if not measured.any():
         return np.zeros(len(v))
     whole = np.interp(time, time[measured], v[measured])
-    return np.concatenate([[0.0], np.cumsum((whole[1:] + whole[:-1]) / 2 * np.diff(time))])
+    return np.asarray(cumulative_trapezoid(whole, time, initial=0.0))
 
 
 def measured_times(table: Trajectories, grid: Grid, first: int, last: int) -> np.ndarray:
