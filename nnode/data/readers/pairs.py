@@ -189,8 +189,8 @@ def read_pairs(files: Mapping[str, Path | Table], options: PairOptions) -> Readi
                 "pairs names of their own (data.columns.pair, data.pattern)"
             )
         taken[name] = rows.path
-        made, records = by_pair(rows, dt, options)
-        every += records
+        made, pair_records = by_pair(rows, run, number, dt, options)
+        every += pair_records
         reading.add(made)
     if not reading:
         raise DataError(
@@ -386,11 +386,14 @@ def _leader(table: Table, length: np.ndarray, rows: np.ndarray) -> float:
     return usual
 
 
-def by_pair(rows: Trajectories, dt: float, options: PairOptions) -> tuple[Reading, list[Record]]:
+def by_pair(
+    rows: Trajectories, run: str, number: str, dt: float, options: PairOptions
+) -> tuple[Reading, list[Record]]:
     """Cut a pair where either is not there, or into windows without such a gap.
 
     Args:
         rows: of one pair, the follower's and then as many of the leader's.
+        run, number: names of the recording and of the pair.
         dt: s, of the time grid; it begins at 0 where ``options.dt`` says it, otherwise with the
             pair.
 
@@ -402,7 +405,6 @@ def by_pair(rows: Trajectories, dt: float, options: PairOptions) -> tuple[Readin
         ConfigError: a ``dt`` finer than the rows, or a ``window`` that is no whole number of steps.
         DataError: a gap, where ``gaps=error``; or one agent twice at one time.
     """
-    ((run, number), _), *_ = rows.parts("recording", "sequence")
     name = f"{run}/{number}"
     if options.dt is not None and dt < rows.dt * (1 - UNEVEN):
         raise ConfigError(
