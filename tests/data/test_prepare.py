@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -115,7 +116,11 @@ def test_interrupted_preparation_starts_clean(
     tmp_path: Path, options: EsimasOptions, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
     out = tmp_path / "out"
-    prepare(options, out, draw=plot_faults)
+
+    def draw(*arguments: Any) -> None:
+        arguments[-1].write_bytes(b"a picture")
+
+    prepare(options, out, draw=draw)
     before = (out / "manifest.json").read_bytes()
 
     def interrupt(*_: object, **__: object) -> None:
@@ -126,12 +131,12 @@ def test_interrupted_preparation_starts_clean(
             patch.setattr(module, place, interrupt)
         options.recording = "demo"
         with pytest.raises(KeyboardInterrupt):
-            prepare(options, out, draw=interrupt if place == "plot" else plot_faults)
+            prepare(options, out, draw=interrupt if place == "plot" else draw)
     assert (out / "manifest.json").read_bytes() == before
     assert len(Store(out)) == 2
     (out / ".faults.123.partial").mkdir()
     (out / ".sequences.parquet.123.partial").write_text("half")
-    prepare(options, out, draw=plot_faults)
+    prepare(options, out, draw=draw)
     assert sorted(p.name for p in out.iterdir()) == [
         "faults",
         "manifest.json",

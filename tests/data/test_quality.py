@@ -19,7 +19,7 @@ from nnode.data.readers.juelich import JuelichOptions, juelich_files, read_jueli
 from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.smooth import measured_noise
-from nnode.plots.quality import MAX_PANELS, STYLES, plot_faults
+from nnode.plots.quality import STYLES, faults_figure, plot_faults
 from tests.builders import lane, straight
 from tests.builders import people as walkers
 
@@ -254,11 +254,15 @@ def test_every_kind_has_a_meaning_and_a_mark() -> None:
 
 
 @pytest.mark.parametrize("domain", ["traffic", "crowd"])
-def test_plot(tmp_path: Path, domain: str) -> None:
+def test_plot(tmp_path: Path, domain: Domain) -> None:
     s = platoon() if domain == "traffic" else people()
-    many = [replace(s, name=f"r/{i}") for i in range(MAX_PANELS + 3)]
+    many = [replace(s, name=f"r/{i}") for i in range(5)]
     fault = Fault("jump", "", (1,), float(s.time[3]), "")
-    plot_faults(many, {m.name: [fault] for m in many[1:]}, domain, tmp_path / "f.png")  # type: ignore[arg-type]
+    faults = {m.name: [fault] for m in many[1:]}
+    figure = faults_figure(many, faults, domain, most=2)
+    assert len(figure.axes) == 3  # the bars, and two of four sequences
+    assert "the first 2 are shown" in figure.axes[0].get_title()
+    plot_faults(many[:2], faults, domain, tmp_path / "f.png")
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
 
 

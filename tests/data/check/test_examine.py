@@ -303,8 +303,10 @@ DATES = {
 }
 
 
-@pytest.mark.parametrize("kind", DATES)
-@pytest.mark.parametrize("group", ["vehicles", "table", "pairs"])
+@pytest.mark.parametrize(
+    ("group", "kind"),
+    [*(("vehicles", kind) for kind in DATES), ("table", "dates"), ("table", "us"), ("pairs", "ns")],
+)
 def test_dates_and_epochs_are_recognised(tmp_path: Path, group: str, kind: str) -> None:
     table = cars()
     if group == "table":
