@@ -7,7 +7,6 @@ is ever opened.
 
 from __future__ import annotations
 
-import difflib
 import logging
 import os
 from collections.abc import Mapping
@@ -18,7 +17,7 @@ from urllib.parse import quote
 
 import pooch
 
-from nnode.errors import DataError, DownloadError
+from nnode.errors import DataError, DownloadError, suggestion
 
 log = logging.getLogger(__name__)
 
@@ -255,7 +254,7 @@ def _fetch_published(dataset: str, name: str, folder: Path) -> Path:
         published = [n for o in ORIGINS.values() if dataset in o.folders for n in o.files]
         raise DataError(
             f"{name} is not among the published files of {dataset}"
-            f"{_nearest(name, published)}; published: {', '.join(published)}; for a file of your "
+            f"{suggestion(name, published)}; published: {', '.join(published)}; for a file of your "
             "own set data.source=FOLDER"
         )
     return _fetch(dataset, name, origin.url(name), folder)
@@ -333,11 +332,6 @@ def _find(dataset: str, name: str, source: Path) -> Path:
     listing = ", ".join([*files][:20]) + (f", ... ({len(files)} in all)" if len(files) > 20 else "")
     raise DataError(
         f"{name} is neither in {source} nor in its sub-folders of {dataset}"
-        f"{_nearest(name, [*files])}; it holds: {listing or 'nothing'}; name one of these files "
-        "or set data.source to another folder"
+        f"{suggestion(name, files.keys())}; it holds: {listing or 'nothing'}; name one of these "
+        "files or set data.source to another folder"
     )
-
-
-def _nearest(name: str, names: list[str]) -> str:
-    near = difflib.get_close_matches(name, names, n=1)
-    return f" (did you mean {near[0]}?)" if near else ""
