@@ -23,7 +23,7 @@ from nnode.data._arrow import open_writer, to_sequence, to_table
 from nnode.data.clusters import index_of
 from nnode.data.sequence import Sequence
 from nnode.errors import DataError
-from nnode.files import interpolation
+from nnode.files import interpolation, replacing
 
 TABLE = "sequences.parquet"
 #: A store that replaces another one has the name that the other has not.
@@ -154,22 +154,19 @@ def write_store(
             no agent; a manifest that JSON cannot hold; a folder that cannot be written.
     """
     folder = Path(folder)
-    partial = {name: folder / f".{name}.{os.getpid()}.partial" for name in (TABLE, MANIFEST)}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        content = _write_table(partial[TABLE], sequences)
         name, before = _free_name(folder)
-        content["table"]["file"] = name
-        _write_json(partial[MANIFEST], {**content, "manifest": dict(manifest)})
-        os.replace(partial[TABLE], folder / name)
-        os.replace(partial[MANIFEST], folder / MANIFEST)
+        # the table, which is the inner one, takes its place first
+        with (
+            replacing(folder / MANIFEST) as manifest_file,
+            replacing(folder / name) as table_file,
+        ):
+            content = _write_table(table_file, sequences)
+            content["table"]["file"] = name
+            _write_json(manifest_file, {**content, "manifest": dict(manifest)})
         (folder / before).unlink(missing_ok=True)
     except OSError as error:
         raise DataError(f"the store {folder} cannot be written: {error}") from error
-    finally:
-        for path in partial.values():
-            if path.exists():
-                path.unlink()
     return Store(folder)
 
 
