@@ -280,7 +280,7 @@ def _columns(examination: Examination) -> list[Block]:
 
 
 def _units_blocks(examination: Examination) -> list[Block]:
-    scale, measured = examination.scale, examination.known
+    scale, measured = examination.scale, examination.medians
     ranges = USUAL[scale.domain]
     values = [
         (

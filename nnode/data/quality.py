@@ -528,12 +528,12 @@ def _clock(medians: Medians, scale: Scale, stated: float | None) -> Iterator[Fin
     usual = USUAL[scale.domain]["speed"]
     who = "people walk" if scale.domain == "crowd" else "vehicles drive"
     if stated is not None and scale.rate is not None and abs(scale.rate / stated - 1) > 0.01:
-        own = f"; its own velocities say {speed / ratio:.3g} m/s" if np.isfinite(ratio) else ""
+        speeds = f"; its own velocities say {speed / ratio:.3g} m/s" if np.isfinite(ratio) else ""
         yield Finding(
             "time_scale",
             "error",
             f"at the stated {stated:g} frames/s, {who} "
-            f"{medians.speed * scale.metres * stated:.3g} m/s (median of those who move){own}: "
+            f"{medians.speed * scale.metres * stated:.3g} m/s (median of those who move){speeds}: "
             f"{scale.rate:g} frames/s fit",
         )
     elif np.isfinite(ratio) and AGREE.score(ratio) < -4:
@@ -743,8 +743,8 @@ LISTED = 5
 
 
 def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
-    return ", ".join(names[:LISTED]) + more
+    others = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return ", ".join(names[:LISTED]) + others
 
 
 def drop_absent(sequences: list[Sequence]) -> tuple[list[Sequence], list[dict[str, Any]]]:
@@ -787,12 +787,12 @@ def apply_policy(
     if policy is Faults.error and faulty:
         every = [fault for s in faulty for fault in faults[s.name]]
         lines = [f"  {f.sequence}: {f.kind}: {f.detail}" for f in every[:LISTED]]
-        more = [f"  ... and {len(every) - LISTED} more"] if len(every) > LISTED else []
+        others = [f"  ... and {len(every) - LISTED} more"] if len(every) > LISTED else []
         raise FaultError(
             f"{len(faulty)} of {len(sequences)} sequences hold faults "
             f"({kinds_text(faults.values())}); "
             "data.faults=error refuses them, data.faults=drop leaves them out, data.faults=keep "
-            "keeps them:\n" + "\n".join(lines + more)
+            "keeps them:\n" + "\n".join(lines + others)
         )
     simulable = [s for s in sequences if s.n_agents > 0 and usable(s, faults[s.name])]
     names = {s.name for s in sequences if not faults[s.name]}

@@ -238,8 +238,8 @@ class Sequences:
         ]
         heads = ["sequence", "agents", "samples", "step (s)", "from (s)", "to (s)"]
         table = pd.DataFrame(rows, columns=heads).to_html(index=False, border=0)
-        more = f"<p>and {len(self) - _SHOWN} more</p>" if len(self) > _SHOWN else ""
-        return f"<p>{escape(self._about())}</p>{table}{more}"
+        others = f"<p>and {len(self) - _SHOWN} more</p>" if len(self) > _SHOWN else ""
+        return f"<p>{escape(self._about())}</p>{table}{others}"
 
 
 def say_recognised(source: Recognised) -> None:

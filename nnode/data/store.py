@@ -62,24 +62,24 @@ class Store:
             self._bytes = int(content["table"]["bytes"])
             self._path = self.folder / _TABLES[_TABLES.index(content["table"]["file"])]
             self._walls = [np.asarray(w, float).reshape(-1, 4) for w in content["walls"]]
-            found = interpolation(self.manifest.get("options"))
+            placeholder = interpolation(self.manifest.get("options"))
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise DataError(
                 f"{self.folder / MANIFEST} is damaged ({type(error).__name__}: {error}); "
                 "prepare the data again"
             ) from error
-        if found is not None:
+        if placeholder is not None:
             raise DataError(
-                f"{self.folder / MANIFEST} is refused: its options hold {found[:80]!r}, and "
+                f"{self.folder / MANIFEST} is refused: its options hold {placeholder[:80]!r}, and "
                 "${...} stands for values of this machine, such as its environment; prepare the "
                 "data again, from names without ${"
             )
         path = self._path
         size = path.stat().st_size if path.is_file() else None
         if size != self._bytes:
-            found = "no such file" if size is None else f"{size} bytes"
+            held = "no such file" if size is None else f"{size} bytes"
             raise DataError(
-                f"{path}: the manifest promises {self._bytes} bytes, found {found}; the store is "
+                f"{path}: the manifest promises {self._bytes} bytes, found {held}; the store is "
                 "half-written or damaged: prepare the data again"
             )
         self._file: pq.ParquetFile | None = None

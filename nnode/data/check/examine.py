@@ -176,7 +176,7 @@ def _judged(examined: Examination, sequences: list[Sequence], rate: float | None
     """With everything that rows and sequences show."""
     rows, domain = examined.rows, examined.scale.domain
     whole = examined.raw.native not in _CUT and not are_pairs(examined.meanings)
-    examined.findings += row_findings(rows, examined.known, examined.scale, rate, whole)
+    examined.findings += row_findings(rows, examined.medians, examined.scale, rate, whole)
     examined.sequences = sequences[:: max(1, -(-len(sequences) // MOST))]
     noise = measured_noise(examined.sequences)
     position_noise = 0.0 if examined.source.options.published else noise.position

@@ -27,7 +27,7 @@ class Scaled:
     Attributes:
         meanings: column by meaning; that of pairs' columns is found beside a leader's.
         scales: combinations of units, the most probable first.
-        known: medians in the file's own units.
+        medians: medians in the file's own units.
         table: rows as they stand, in the file's own units; of pairs the followers' and then the
             leaders'.
         rows: those that can be used, in order and in SI units.
@@ -35,7 +35,7 @@ class Scaled:
 
     meanings: dict[str, Meaning]
     scales: list[Scale]
-    known: Medians
+    medians: Medians
     table: Trajectories
     rows: Trajectories
 
@@ -270,8 +270,8 @@ def _integrated(columns: _Columns, time: np.ndarray, pairs: np.ndarray) -> list[
         measured.append(spacing[rows][LAG:] - spacing[rows][:-LAG])
         expected.append(relative[LAG:] - relative[:-LAG])
     change, of_speeds = np.concatenate(measured), np.concatenate(expected)
-    known = np.isfinite(change)
-    squares = max(float((of_speeds[known] ** 2).sum()), 1e-300)
-    unit = float(np.sqrt((change[known] ** 2).sum() / squares))
-    x *= unit if known.any() and 0 < unit < 1e6 else 1.0
+    sampled = np.isfinite(change)
+    squares = max(float((of_speeds[sampled] ** 2).sum()), 1e-300)
+    unit = float(np.sqrt((change[sampled] ** 2).sum() / squares))
+    x *= unit if sampled.any() and 0 < unit < 1e6 else 1.0
     return [x - spacing, x]

@@ -206,10 +206,10 @@ def _rate(path: Path, base: sqlite3.Connection) -> float:
     except (TypeError, ValueError):
         rate = math.nan
     if not 0 < rate < math.inf:
-        found = "nothing" if row is None else repr(row[0])
+        shown = "nothing" if row is None else repr(row[0])
         raise DataError(
             f"{path}, table metadata: expected key 'fps' with a positive number of frames per "
-            f"second, found {found}"
+            f"second, found {shown}"
         )
     return rate
 

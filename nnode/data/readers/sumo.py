@@ -189,11 +189,11 @@ class _Content:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            found = "no such attribute" if text is None else repr(text[:40])
+            shown = "no such attribute" if text is None else repr(text[:40])
             hint = (
                 "; write times in seconds, without --human-readable-time" if key == "time" else ""
             )
-            raise self._error(f"<{name} {key}=...>: expected a number, found {found}{hint}")
+            raise self._error(f"<{name} {key}=...>: expected a number, found {shown}{hint}")
         return value
 
     def _error(self, text: str) -> DataError:

@@ -120,9 +120,9 @@ def crowd_recording(
             goal[i] = heading[i] * (end + _AHEAD), y
             newcomer = [-heading[i] * end, y, heading[i] * pace[i], 0.0]
             state, present = np.vstack([state, newcomer]), np.append(present, i)
-        seen = np.abs(state[:, 0]) <= length / 2
-        at = np.full(seen.sum(), frame)
-        rows.append(np.column_stack([present[seen] + 1, at, state[seen, :2]]))
+        inside_view = np.abs(state[:, 0]) <= length / 2
+        at = np.full(inside_view.sum(), frame)
+        rows.append(np.column_stack([present[inside_view] + 1, at, state[inside_view, :2]]))
         if len(present):
             state = _advance(state, goal[present], wall, 1 / frame_rate, forces)
     table = np.concatenate(rows)
@@ -145,8 +145,8 @@ def _advance(
         pair = np.zeros((n, n, 2))
         offset, slip = x[:, None] - x, v - v[:, None]
         pair[apart] = social_force(offset[apart], slip[apart], 2 * forces.r, forces)
-        own = np.broadcast_to(v[:, None], (n, len(wall), 2))
-        from_wall = social_force(x[:, None] - wall, own, forces.r, forces)
+        walker = np.broadcast_to(v[:, None], (n, len(wall), 2))
+        from_wall = social_force(x[:, None] - wall, walker, forces.r, forces)
         push = (pair.sum(1) / n + from_wall.mean(1)) / forces.mass
         return np.column_stack([v, pull + push]).ravel()
 

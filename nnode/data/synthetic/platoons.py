@@ -69,7 +69,7 @@ def platoon_table(
     """
     truth = truth or SlowZone()
     rng = np.random.default_rng(seed)
-    own = truth.v0 * (1 + truth.drivers * rng.standard_normal((platoons, cars - 1)))
+    desired = truth.v0 * (1 + truth.drivers * rng.standard_normal((platoons, cars - 1)))
     height = rng.uniform(0.8, 2.0, (4, platoons))
     period, phase = rng.uniform(8, 30, (4, platoons)), rng.uniform(0, 2 * np.pi, (4, platoons))
 
@@ -77,14 +77,14 @@ def platoon_table(
         return np.where((truth.a <= x) & (x <= truth.b), truth.alpha, 1.0)
 
     def leader(t: float) -> np.ndarray:
-        found: np.ndarray = 17 + (height * np.sin(2 * np.pi * t / period + phase)).sum(0)
-        return found
+        speeds: np.ndarray = 17 + (height * np.sin(2 * np.pi * t / period + phase)).sum(0)
+        return speeds
 
     def rates(t: float, x: np.ndarray) -> np.ndarray:
-        speeds = np.column_stack([own * (1 - truth.L / np.diff(x)), leader(t)])
+        speeds = np.column_stack([desired * (1 - truth.L / np.diff(x)), leader(t)])
         return slowed(x) * speeds
 
-    gap = truth.L * own / (own - leader(0.0)[:, None])
+    gap = truth.L * desired / (desired - leader(0.0)[:, None])
     behind = np.cumsum(gap[:, ::-1], 1)[:, ::-1]
     front = rng.uniform(-150, 150, platoons)[:, None]
     x = np.column_stack([front - behind, front])
