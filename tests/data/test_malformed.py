@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import struct
 import zlib
 from pathlib import Path
@@ -146,14 +145,6 @@ def test_huge_whole_numbers_are_names(tmp_path: Path) -> None:
     path = cars(tmp_path / "c.csv", 0.0, 0.2, 0.4)
     path.write_text(path.read_text() + "".join(f"1e300,{t},{90 + t}\n" for t in (0, 0.2, 0.4)))
     assert "1e+300" in read_vehicles(path, VehicleTableOptions())[0].agents
-
-
-def test_seeds_are_sound(tmp_path: Path) -> None:
-    buffer = io.BytesIO()
-    savemat(buffer, {"sequences": cells()})
-    path = tmp_path / "sequence_datax.mat"
-    path.write_bytes(buffer.getvalue())
-    assert [s.x.shape for s in read_esimas(path)] == [(3, 2, 1), (3, 2, 1)]
 
 
 def test_damaged_notes_of_pandas_in_parquet_are_refused(tmp_path: Path) -> None:

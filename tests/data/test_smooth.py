@@ -10,17 +10,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.io import savemat
 
 from nnode.data.limits import BEARABLE
 from nnode.data.options import DataOptions
 from nnode.data.prepare import prepare
-from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.readers.jupedsim import WalkwayOptions
 from nnode.data.readers.ngsim import NgsimOptions, read_ngsim
 from nnode.data.readers.openacc import OpenAccOptions
 from nnode.data.readers.pairs import PairOptions
-from nnode.data.readers.sumo import SumoOptions
 from nnode.data.readers.table import TableOptions
 from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
 from nnode.data.sequence import Sequence
@@ -213,13 +210,6 @@ def rows_of() -> pd.DataFrame:
     return table.assign(x=CARS.ravel())
 
 
-def as_esimas(path: Path) -> DataOptions:
-    cells = np.empty((1, 1), dtype=object)
-    cells[0, 0] = {"Xarr": CARS, "Tarr": 0.1 * np.arange(120)}
-    savemat(path / "sequence_dataown.mat", {"sequences": cells})
-    return EsimasOptions(source=str(path), recording="own")
-
-
 def as_vehicles(path: Path) -> DataOptions:
     return VehicleTableOptions(path=str(saved(path / "t.csv", rows_of())), dt=0.1)
 
@@ -242,28 +232,18 @@ def as_openacc(path: Path) -> DataOptions:
     return OpenAccOptions(path=str(path / "t.csv"), max_error=None)
 
 
-def as_sumo(path: Path) -> DataOptions:
-    moments = [
-        f'<timestep time="{time:.1f}">'
-        + "".join(f'<vehicle id="{i}" lane="e_0" pos="{CARS[i, k]}"/>' for i in range(3))
-        + "</timestep>"
-        for k, time in enumerate(0.1 * np.arange(120))
-    ]
-    (path / "t.xml").write_text(f"<fcd-export>{''.join(moments)}</fcd-export>")
-    return SumoOptions(path=str(path / "t.xml"), dt=0.1)
-
-
 def as_people(path: Path) -> DataOptions:
     rows = [f"{i} {k} {CARS[i, k] / 8:.6f} {i} 0" for i in range(3) for k in range(120)]
     (path / "t.txt").write_text("# framerate: 10\n# id frame x/m y/m z/m\n" + "\n".join(rows))
     return WalkwayOptions(path=str(path / "t.txt"), t_seq=5.0)
 
 
-SOURCES = [as_esimas, as_vehicles, as_table, as_pairs, as_openacc, as_sumo, as_people]
+#: One of each way of cutting records.
+SOURCES = [as_vehicles, as_table, as_pairs, as_openacc, as_people]
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.__name__)
-def test_every_source_is_smoothed(tmp_path: Path, source: Callable[[Path], DataOptions]) -> None:
+def test_every_cutting_smooths(tmp_path: Path, source: Callable[[Path], DataOptions]) -> None:
     options = source(tmp_path)
     raw = prepare(options, tmp_path / "raw")
     smooth = prepare(replace(options, smooth=1.0), tmp_path / "smooth")
