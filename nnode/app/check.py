@@ -20,7 +20,7 @@ from nnode.data.quality import Finding
 from nnode.data.readers.columns import floats, quoted
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.split import split
-from nnode.data.units import certainty, share
+from nnode.data.units import certainty
 from nnode.discover.inputs import LEAST
 from nnode.errors import ConfigError, NNodeError, printable
 from nnode.machine import how_made
@@ -52,7 +52,7 @@ class Check:
     @property
     def probability(self) -> float:
         """Probability of the units, summed over frame rates."""
-        return share(self.examination.scales)
+        return self.examination.share
 
     def __repr__(self) -> str:
         return summary(self.examination, self.options)
@@ -136,7 +136,7 @@ def summary(examination: Examination, lines: list[str]) -> str:
             f"{m} = {finding.column}" for m, finding in examination.meanings.items()
         )
         text.append(f"columns: {columns}")
-        text.append(f"units: {_units(examination)} ({certainty(share(examination.scales))})")
+        text.append(f"units: {_units(examination)} ({certainty(examination.share)})")
     else:
         text.append(f"format: {examination.raw.native}, whose reader knows its units")
     text += [
@@ -313,7 +313,7 @@ def _units_blocks(examination: Examination) -> list[Block]:
     }
     blocks: list[Block] = [
         Heading("Units and time scale"),
-        Text(f"Assumed: {_units(examination)} ({certainty(share(examination.scales))})."),
+        Text(f"Assumed: {_units(examination)} ({certainty(examination.share)})."),
         TableBlock(
             "medians",
             pd.DataFrame(rows).T,

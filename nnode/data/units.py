@@ -310,11 +310,6 @@ def scales(
     return [replace(scored[i][1], probability=float(weights[i])) for i in order]
 
 
-def share(every: list[Scale]) -> float:
-    """Probability of the first one's units, whatever the rate of frames."""
-    return sum(scale.probability for scale in every if scale.units == every[0].units)
-
-
 def certainty(probability: float) -> str:
     """A probability in words."""
     if probability >= SURE:

@@ -12,7 +12,7 @@ from nnode.data.check.raw import Raw
 from nnode.data.readers.columns import joined
 from nnode.data.sequence import Domain
 from nnode.data.trajectories import Trajectories, driven, grouped_rows
-from nnode.data.units import FAIR, LAG, LIKELY, Medians, Scale, medians, scales, share
+from nnode.data.units import FAIR, LAG, LIKELY, Medians, Scale, medians, scales
 from nnode.errors import DataError
 
 _WHO = ("follower", "leader")
@@ -52,7 +52,7 @@ class Scaled:
     @property
     def share(self) -> float:
         """Probability of the units, whatever the rate of frames."""
-        return share(self.scales)
+        return sum(s.probability for s in self.scales if s.units == self.scale.units)
 
     def rates(self, stated: float | None) -> list[float]:
         """Frames per second that fit, where times are frames and nothing states their rate."""
