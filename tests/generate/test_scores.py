@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from nnode.errors import ConfigError
-from nnode.generate.scores import Scores, band, crps, mean_of
+from nnode.generate.scores import Scores, band, crps, mean_of, nearest
 
 
 @pytest.mark.parametrize("value", [-1.3, 0.4, 2.5])
@@ -90,3 +90,9 @@ def test_scores_of_people() -> None:
     assert means["crps_nearest_m"].mean == pytest.approx((5 - np.hypot(2, 4)) / 3)
     assert means["coverage_position_95"].mean == pytest.approx(5 / 6)
     assert "crps_gap_m" not in means
+
+
+def test_the_nearest_other() -> None:
+    x = np.array([[[0.0, 0.0], [3.0, 4.0], [0.0, 1.0]]])
+    np.testing.assert_allclose(nearest(x), [[1.0, np.hypot(3, 3), 1.0]])
+    assert nearest(x[:, :1]).shape == (1, 0)
