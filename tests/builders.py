@@ -1,4 +1,4 @@
-"""Sequences that tests make up: vehicles in lanes, people who walk straight on, linear platoons."""
+"""What tests make up: vehicles in lanes, people who walk straight on, linear platoons, and fits."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from nnode.data.sequence import Sequence
-from nnode.model import Law, make_law
+from nnode.discover.residuals.fit import Fit
+from nnode.model import Law, System, make_law
 
 
 def lane(
@@ -66,6 +67,18 @@ def linear(
             path.append(path[-1] + step * np.append(v0 * (1 - length / np.diff(path[-1])), v0))
         found.append(lane(path[::every], start=100.0 * i, name=f"r/{i:03d}"))
     return found
+
+
+def regression(columns: np.ndarray, residual: np.ndarray) -> Fit:
+    """The least squares of a linear model.
+
+    Args:
+        columns: ``(n, P)`` derivatives of the residuals.
+        residual: ``(n,)`` with all parameters zero.
+    """
+    row = -np.linalg.lstsq(columns, residual, rcond=None)[0]
+    names, free = [f"p{i}" for i in range(len(row))], np.ones(len(row), dtype=bool)
+    return Fit(System([]), names, row, residual + columns @ row, columns, free)
 
 
 def social_forces(**options: Any) -> list[Law]:

@@ -116,7 +116,7 @@ Copy = Callable[..., CompletedProcess[str]]
 def speeds(x: np.ndarray) -> np.ndarray:
     """Of followers, m/s, by law and effect; ``x`` with the leader's place behind."""
     law: np.ndarray = V0 * (1 - np.exp(-np.diff(x) / REACH))
-    return law + W * np.sin(x[:-1] / 60)
+    return law + W * np.sin(x[..., :-1] / 60)
 
 
 def waves(x: np.ndarray) -> np.ndarray:

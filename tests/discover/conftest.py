@@ -7,37 +7,42 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from nnode.app.python.inputs import model_options
 from nnode.data.readers.table import TableOptions
+from nnode.data.sequence import Sequence
+from nnode.discover.diagnose import diagnose
 from nnode.discover.inputs import Inputs, read_inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.outcome import DiagnosisOutcome
 from nnode.model import build_model
 from tests.discover import stand_in
+from tests.discover.platoons import lin, platoons, relative_speed
 from tests.discover.recorded import corridor, lane
+
+#: Sixteen clusters: five of them are sealed, as many as it takes to confirm something.
+MANY: dict[str, Any] = {"number": 16, "seconds": 12.0, "driver": 0.1}
+#: What the followers of :func:`hidden_reaction` do besides their law.
+KAPPA = 0.4
 
 
 @dataclass
 class Case:
     """A diagnosis by hand of made-up data."""
 
-    table: Path
-    walls: Path | None
     model: dict[str, Any]
     inputs: Inputs
     options: DiscoverOptions
     found: DiagnosisOutcome
 
 
-def _case(folder: Path, domain: str, table: Path, walls: Path | None, model: Any) -> Case:
+def _case(folder: Path, model: dict[str, Any], **data: Any) -> Case:
     options = DiscoverOptions(sealed=0.4)
-    data = TableOptions(domain=domain, path=str(table), walls=None if walls is None else str(walls))
-    inputs = read_inputs(data, folder / "data")
-    full = model_options(model, "measured")
-    system = build_model(full)
-    found = stand_in.diagnose(system, inputs.sequences, options)
-    return Case(table, walls, full, inputs, options, found)
+    inputs = read_inputs(TableOptions(**data), folder / "data")
+    model = model_options(model, "measured")
+    found = stand_in.diagnose(build_model(model), inputs.sequences, options)
+    return Case(model, inputs, options, found)
 
 
 @pytest.fixture(scope="session")
@@ -45,7 +50,7 @@ def traffic(tmp_path_factory: pytest.TempPathFactory) -> Case:
     """Platoons that pass a slow zone."""
     folder = tmp_path_factory.mktemp("traffic")
     table = lane(folder / "lane.csv", sequences=5, seconds=8.0, cars=4)
-    return _case(folder, "traffic", table, None, {"term": "lin"})
+    return _case(folder, {"term": "lin"}, domain="traffic", path=str(table))
 
 
 @pytest.fixture(scope="session")
@@ -54,4 +59,17 @@ def crowd(tmp_path_factory: pytest.TempPathFactory) -> Case:
     folder = tmp_path_factory.mktemp("crowd")
     table, walls = corridor(folder / "walk.csv", sequences=5, seconds=3.0, people=6)
     model = {"term": "social_force", "B": 0.3, "walls": False}
-    return _case(folder, "crowd", table, walls, model)
+    return _case(folder, model, domain="crowd", path=str(table), walls=str(walls))
+
+
+@pytest.fixture(scope="session")
+def hidden_reaction() -> tuple[list[Sequence], DiscoverOptions, DiagnosisOutcome]:
+    """Platoons whose followers react to speeds ahead, and the diagnosis of a law without that."""
+    sequences = platoons(relative_speed(KAPPA), **MANY)
+    options = DiscoverOptions(effects=["relative_speed", "speed_zone"])
+    given = lin(v0=25.0, length=7.0)
+    before = {name: value.clone() for name, value in given.state_dict().items()}
+    outcome = diagnose(given, sequences, options)
+    # the model that was given is left alone
+    assert all(torch.equal(before[name], value) for name, value in given.state_dict().items())
+    return sequences, options, outcome

@@ -1,18 +1,36 @@
 """Small platoons with known effects, by Runge and Kutta's method at a fifth of the sampling
-interval, written without the package's models."""
+interval, written without the package's models; and the package's model of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from nnode.data.sequence import Sequence
+from nnode.model import System
+from nnode.model.build import add_effects, build_model
+from tests import builders
 
 V0, LENGTH, DT, SUBSTEPS = 28.0, 6.0, 0.2, 5
 
-#: Of positions with the leader's, the law's speeds and the leader's speed: m/s of the followers.
-Effect = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+#: Of positions ``(S, N)`` with the leaders', the law's speeds ``(S, N - 1)`` and the leaders'
+#: speeds ``(S,)``: m/s of the followers.
+Effect = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+def lin(*effects: dict[str, Any], v0: float = V0, length: float = LENGTH) -> System:
+    """The law that the followers drive by, with effects."""
+    options = {"leader": "measured", "v0": v0, "L": length, "L_min": 1.0}
+    system = build_model({"term": "lin", "name": "lin", **options})
+    add_effects(system, list(effects))
+    return system
+
+
+def law(gap: np.ndarray) -> np.ndarray:
+    return np.asarray(V0 * (1 - LENGTH / gap))
 
 
 def _leader(
@@ -27,6 +45,21 @@ def _leader(
     return place, speed
 
 
+def _start(lead: np.ndarray, speed: np.ndarray, followers: int) -> np.ndarray:
+    """``(S, N - 1)`` places of followers who drive as fast as their leaders."""
+    gap = LENGTH * V0 / (V0 - speed)
+    return np.asarray(lead[:, None] - gap[:, None] * np.arange(followers, 0, -1.0))
+
+
+def _sequences(places: np.ndarray) -> list[Sequence]:
+    """Of places ``(K, S, N)``: one every 100 s, each with vehicles of its own."""
+    found = []
+    for s, x in enumerate(places.swapaxes(0, 1)):
+        agents = tuple(f"{s}-{i}" for i in range(x.shape[1]))
+        found.append(builders.lane(x, DT, start=100.0 * s, name=f"r/{s}", agents=agents))
+    return found
+
+
 def platoons(
     effect: Effect | None = None,
     *,
@@ -35,123 +68,80 @@ def platoons(
     seconds: float = 20.0,
     noise: float = 0.02,
     driver: float = 0.0,
+    lasts: float = 3.0,
     calm: float = 1.0,
     seed: int = 0,
 ) -> list[Sequence]:
     """Platoons behind a leader whose speed varies, ``calm`` times as much; ``driver`` is the
-    standard deviation (m/s) of an Ornstein-Uhlenbeck disturbance of every follower's speed with
-    3 s correlation."""
+    standard deviation (m/s) of an Ornstein-Uhlenbeck disturbance of every follower's speed whose
+    correlation lasts for ``lasts`` s. A larger ``number`` adds platoons and changes none."""
     rng = np.random.default_rng(seed)
     half = DT / SUBSTEPS / 2  # the leader is known at half steps
     samples, warm = round(seconds / DT) + 1, round(15 / DT)
-    found = []
-    for s in range(number):
-        time = half * np.arange(2 * SUBSTEPS * (samples + warm) + 2)
-        lead, speed = _leader(rng, time, calm)
-        gap = LENGTH * V0 / (V0 - speed[0])
-        x = lead[0] - gap * np.arange(vehicles - 1, 0, -1.0)
-        push = driver * rng.normal(size=vehicles - 1)
-        rows = []
+    steps = SUBSTEPS * (samples + warm)
+    time = half * np.arange(2 * steps + 2)
+    leaders, shocks, errors = [], [], []
+    for _ in range(number):
+        leaders.append(_leader(rng, time, calm))
+        shocks.append(driver * rng.normal(size=(steps + 1, vehicles - 1)))
+        errors.append(noise * rng.normal(size=(samples, vehicles)))
+    lead, speed = np.array(leaders).transpose(1, 2, 0)
+    shock = np.stack(shocks, 1)
+    keep = np.exp(-2 * half / lasts)
 
-        def rate(
-            x: np.ndarray,
-            i: int,
-            push: np.ndarray,
-            lead: np.ndarray = lead,
-            speed: np.ndarray = speed,
-        ) -> np.ndarray:
-            every = np.append(x, lead[i])
-            law = V0 * (1 - LENGTH / np.diff(every))
-            return push + (law if effect is None else effect(every, law, speed[i]))
+    def rate(x: np.ndarray, i: int, push: np.ndarray) -> np.ndarray:
+        every = np.column_stack([x, lead[i]])
+        wanted = law(np.diff(every))
+        return push + (wanted if effect is None else effect(every, wanted, speed[i]))
 
-        for k in range(samples + warm):
-            if k >= warm:
-                rows.append(np.append(x, lead[2 * SUBSTEPS * k]))
-            for sub in range(SUBSTEPS):
-                i = 2 * (SUBSTEPS * k + sub)
-                k1 = rate(x, i, push)
-                k2 = rate(x + half * k1, i + 1, push)
-                k3 = rate(x + half * k2, i + 1, push)
-                k4 = rate(x + 2 * half * k3, i + 2, push)
-                x = x + 2 * half / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-                keep = np.exp(-2 * half / 3)
-                push = keep * push + driver * np.sqrt(1 - keep**2) * rng.normal(size=len(push))
-        place = np.array(rows)
-        place += noise * rng.normal(size=place.shape)
-        clock = 100.0 * s + DT * np.arange(samples)
-        found.append(Sequence(name=f"r/{s}", recording="r", time=clock, x=place[..., None]))
-    return found
+    x, push, rows = _start(lead[0], speed[0], vehicles - 1), shock[0], []
+    for step in range(steps):
+        i = 2 * step
+        if step % SUBSTEPS == 0:
+            rows.append(np.column_stack([x, lead[i]]))
+        k1 = rate(x, i, push)
+        k2 = rate(x + half * k1, i + 1, push)
+        k3 = rate(x + half * k2, i + 1, push)
+        k4 = rate(x + 2 * half * k3, i + 2, push)
+        x = x + 2 * half / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        push = keep * push + np.sqrt(1 - keep**2) * shock[step + 1]
+    return _sequences(np.array(rows[warm:]) + np.stack(errors, 1))
 
 
 def streams(
-    *,
-    number: int = 8,
-    vehicles: int = 5,
-    seconds: float = 40.0,
-    window: float = 10.0,
-    noise: float = 0.02,
-    mood: float = 0.0,
-    lasts: float = 6.0,
-    pace: float = 0.0,
-    seed: int = 0,
+    *, number: int = 8, vehicles: int = 5, window: float = 10.0, pace: float = 0.0, **given: Any
 ) -> list[Sequence]:
-    """Platoons that drive for long, cut into windows that keep names and clock.
+    """Platoons that drive for long, cut into windows of ``window`` s that keep names and clock.
 
     Args:
-        mood: standard deviation, m/s, of an Ornstein-Uhlenbeck disturbance of every follower's
-            speed, of ``lasts`` s correlation.
-        pace: of the drivers' own paces, relative to the law.
+        pace: standard deviation of the drivers' own paces, relative to the law.
+        given: as for :func:`platoons`.
     """
-    rng = np.random.default_rng(seed)
-    half = DT / SUBSTEPS / 2
-    samples, warm = round(seconds / DT) + 1, round(15 / DT)
-    time = half * np.arange(2 * SUBSTEPS * (samples + warm) + 2)
-    each = [_leader(rng, time) for _ in range(number)]
-    lead, speed = (np.stack(parts) for parts in zip(*each, strict=True))
-    gap = LENGTH * V0 / (V0 - speed[:, :1])
-    x = lead[:, :1] - gap * np.arange(vehicles - 1, 0, -1.0)
-    push, own = mood * rng.normal(size=x.shape), 1 + pace * rng.normal(size=x.shape)
-    keep = np.exp(-2 * half / lasts)
-    rows = []
-
-    def rate(x: np.ndarray, i: int) -> np.ndarray:
-        return push + own * V0 * (1 - LENGTH / np.diff(np.append(x, lead[:, [i]], 1), axis=1))
-
-    for k in range(samples + warm):
-        if k >= warm:
-            rows.append(np.append(x, lead[:, [2 * SUBSTEPS * k]], 1))
-        for sub in range(SUBSTEPS):
-            i = 2 * (SUBSTEPS * k + sub)
-            k1 = rate(x, i)
-            k2 = rate(x + half * k1, i + 1)
-            k3 = rate(x + half * k2, i + 1)
-            k4 = rate(x + 2 * half * k3, i + 2)
-            x = x + 2 * half / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            push = keep * push + mood * np.sqrt(1 - keep**2) * rng.normal(size=x.shape)
-    place = np.array(rows) + noise * rng.normal(size=(samples, number, vehicles))
+    draw = np.random.default_rng((given.get("seed", 0), 1))
+    own = 1 + pace * draw.normal(size=(number, vehicles - 1))
+    whole = platoons(lambda x, law, lead: own * law, number=number, vehicles=vehicles, **given)
     size = round(window / DT)
     return [
-        Sequence(
-            name=f"r/{s}-{first // size}",
-            recording="r",
-            time=(seconds + 50) * s + DT * np.arange(first, first + size + 1),
-            x=place[first : first + size + 1, s, :, None],
-            agents=tuple(f"{s}-{n}" for n in range(vehicles)),
+        replace(
+            one,
+            name=f"{one.name}-{first // size}",
+            time=one.time[first : first + size + 1],
+            x=one.x[first : first + size + 1],
             kind=("car", "truck", *["car"] * (vehicles - 2)),
         )
-        for s in range(number)
-        for first in range(0, samples - size, size)
+        for one in whole
+        for first in range(0, one.n_samples - size, size)
     ]
 
 
 def relative_speed(kappa: float) -> Effect:
     """W + kappa (speed ahead - W), from the leader backwards."""
 
-    def effect(x: np.ndarray, law: np.ndarray, lead: float) -> np.ndarray:
-        speed, found = lead, np.empty_like(law)
-        for i in range(len(law) - 1, -1, -1):
-            speed = found[i] = law[i] + kappa * (speed - law[i])
-        return found
+    def effect(x: np.ndarray, law: np.ndarray, lead: np.ndarray) -> np.ndarray:
+        ahead, speeds = lead, np.empty_like(law)
+        for i in range(law.shape[-1] - 1, -1, -1):
+            ahead = speeds[:, i] = law[:, i] + kappa * (ahead - law[:, i])
+        return speeds
 
     return effect
 
@@ -159,20 +149,14 @@ def relative_speed(kappa: float) -> Effect:
 def delayed(delay: float, number: int = 4, seconds: float = 20.0) -> list[Sequence]:
     """Platoons of three that see their gap as it was ``delay`` s ago; small Euler steps."""
     rng = np.random.default_rng(3)
-    step = DT / 200
-    late, every = round(delay / step), 200
-    samples, warm = round(seconds / DT) + 1, round(20 / DT)
-    found = []
-    for s in range(number):
-        lead, speed = _leader(rng, step * np.arange((samples + warm) * every))
-        gap = LENGTH * V0 / (V0 - speed[0])
-        x = np.empty((len(lead), 3))
-        x[:, 2] = lead
-        x[: late + 1] = lead[: late + 1, None] - gap * np.array([2.0, 1.0, 0.0])
-        for k in range(late, len(lead) - 1):
-            seen = np.diff(x[k - late])
-            x[k + 1, :2] = x[k, :2] + step * V0 * (1 - LENGTH / seen)
-        place = x[warm * every :: every]
-        clock = 100.0 * s + DT * np.arange(len(place))
-        found.append(Sequence(name=f"r/{s}", recording="r", time=clock, x=place[..., None]))
-    return found
+    every = 200
+    step = DT / every
+    late, warm = round(delay / step), round(20 / DT)
+    time = step * np.arange((round(seconds / DT) + 1 + warm) * every)
+    lead, speed = np.array([_leader(rng, time) for _ in range(number)]).transpose(1, 2, 0)
+    x = np.empty((len(time), number, 3))
+    x[:, :, 2] = lead
+    x[: late + 1, :, :2] = _start(lead[0], speed[0], 2) + (lead - lead[0])[: late + 1, :, None]
+    for k in range(late, len(time) - 1):
+        x[k + 1, :, :2] = x[k, :, :2] + step * law(np.diff(x[k - late]))
+    return _sequences(x[warm * every :: every])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 
+import numpy as np
 import pytest
 import torch
 
-from nnode.data.sequence import Sequence, collate
+from nnode.data.sequence import collate
 from nnode.discover.catalogue import MARKS, catalogue, main, written
 from nnode.discover.report.deviation import simulate
 from nnode.errors import ConfigError
@@ -16,6 +18,7 @@ from nnode.model.build import add_effects
 from nnode.model.effects import CATALOGUE, own
 from nnode.model.extend import effects_of
 from tests.app.conftest import ROOT
+from tests.builders import lane
 from tests.discover import stand_in
 
 LAW = {"name": "lin", "term": "lin", "leader": "measured", "v0": 20.0, "L": 8.0, "L_min": 2.0}
@@ -72,25 +75,22 @@ def documented(tmp_path, monkeypatch):
 def test_the_docs_example_is_an_effect_like_any_other(documented) -> None:
     model = build_model({**LAW, "effects": [{"name": "rear_pressure", "c": 2.0}]})
     own.load_own()  # a second time: it is known already
-    assert [effect.name for effect in effects_of(model)] == ["rear_pressure"]
-    start = torch.tensor([[0.0], [20.0], [60.0]]).numpy()
-    x = torch.stack([torch.tensor(start) + 16.0 * 0.2 * k for k in range(3)]).numpy()
-    time = 0.2 * torch.arange(3).numpy()
-    batch = collate([Sequence(name="r/1", recording="r", time=time, x=x)])
+    (effect,) = effects_of(model)
+    assert effect.name == "rear_pressure"
+    sequence = lane(np.array([0.0, 20.0, 60.0]) + 3.2 * np.arange(3)[:, None])
+    batch = collate([sequence])
     state = torch.tensor(0.0), model.initial(batch), model.scene(batch)
     rate = model(*state)[0, :, 0]
     # the hindmost has nobody behind; the middle one is pushed from 20 m behind
-    assert rate[0].item() == pytest.approx(20 * (1 - 8 / 20))
-    assert rate[1].item() == pytest.approx(20 * (1 - 8 / 40) + 2 * torch.tensor(-2.0).exp())
-    assert rate[2].item() == 0.0
-    (effect,) = effects_of(model)
+    push = math.exp(-2.0)
+    assert rate.tolist() == pytest.approx([20 * (1 - 8 / 20), 20 * (1 - 8 / 40) + 2 * push, 0.0])
     rate[1].backward()
-    assert float(effect.c.grad) == pytest.approx(float(torch.tensor(-2.0).exp()))
+    assert float(effect.c.grad) == pytest.approx(push)
     rows = torch.func.vmap(lambda c: torch.func.functional_call(model, {"terms.1.c": c}, state))(
         torch.tensor([0.0, 2.0], dtype=torch.float64)
     )
     assert rows[1, 0, 1, 0] == rate[1]
-    assert simulate(model, [Sequence(name="r/1", recording="r", time=time, x=x)])[0] is not None
+    assert simulate(model, [sequence])[0] is not None
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 import numpy as np
 import pytest
 
@@ -9,27 +11,33 @@ from nnode.data.sequence import Sequence
 from nnode.discover.division import Division, divide
 from nnode.discover.options import DiscoverOptions
 from nnode.errors import DataError
+from tests.builders import lane
 
 
-def recorded(*agents: str, every: float = 20.0) -> list[Sequence]:
-    """Short sequences of a recording, each with the agents whose letters are given."""
+def recorded(
+    agents: Iterable[str], start: Callable[[int], float] = lambda number: 20.0 * number
+) -> list[Sequence]:
+    """Sequences of two seconds of a recording.
+
+    Args:
+        agents: of each sequence the letters that name its agents; empty: two without names.
+        start: of the number of a sequence, s.
+    """
     found = []
     for number, names in enumerate(agents):
-        x = np.zeros((3, len(names), 1)) + np.arange(len(names))[:, None]
-        found.append(
-            Sequence(
-                name=f"r/{number}",
-                recording="r",
-                time=every * number + np.arange(3),
-                x=x,
-                agents=tuple(names),
-            )
-        )
+        x = np.zeros((3, len(names) or 2)) + np.arange(len(names) or 2)
+        name = f"r/{number}"
+        found.append(lane(x, 1.0, start=start(number), name=name, agents=tuple(names)))
     return found
 
 
+def pairs(number: int) -> list[str]:
+    """The letters of two agents for each of some sequences."""
+    return [chr(200 + 2 * i) + chr(201 + 2 * i) for i in range(number)]
+
+
 def alone(number: int) -> list[Sequence]:
-    return recorded(*[chr(200 + 2 * i) + chr(201 + 2 * i) for i in range(number)])
+    return recorded(pairs(number))
 
 
 def assert_sound(found: Division, sequences: list[Sequence]) -> None:
@@ -44,11 +52,8 @@ def test_five_of_sixteen_clusters_are_sealed_as_it_takes_to_confirm(seed: int) -
     sequences = alone(16)
     found = divide(sequences, DiscoverOptions(seed=seed))
     assert_sound(found, sequences)
-    assert (found.number(found.exploration), found.number(found.confirmation), found.note) == (
-        11,
-        5,
-        "",
-    )
+    assert (found.number(found.exploration), found.number(found.confirmation)) == (11, 5)
+    assert found.note == ""
     again = divide(sequences, DiscoverOptions(seed=seed))
     assert (again.exploration, again.confirmation) == (found.exploration, found.confirmation)
 
@@ -64,7 +69,7 @@ def test_whole_clusters_are_sealed_but_never_more_than_half_of_the_sequences(see
     sizes = [1, 4, 2, 6, 1, 3, 5, 2, 24]
     names = [chr(200 + cluster) for cluster, size in enumerate(sizes) for _ in range(size)]
     order = np.random.default_rng(seed).permutation(len(names))
-    sequences = recorded(*[names[i] + chr(400 + int(i)) for i in order])
+    sequences = recorded(names[i] + chr(400 + int(i)) for i in order)
     for share in (0.1, 0.3, 0.6, 0.9):
         found = divide(sequences, DiscoverOptions(seed=seed, sealed=share))
         assert_sound(found, sequences)
@@ -75,7 +80,7 @@ def test_whole_clusters_are_sealed_but_never_more_than_half_of_the_sequences(see
 
 def test_one_cluster_alone_gives_a_block_of_time_and_says_so() -> None:
     # everybody is in two sequences: all of them hang together
-    sequences = recorded(*[chr(200 + i) + chr(201 + i) for i in range(20)])
+    sequences = recorded(chr(200 + i) + chr(201 + i) for i in range(20))
     found = divide(sequences, DiscoverOptions())
     assert found.number(found.exploration) == found.number(found.confirmation) == 1
     assert "are not independent of the exploration sequences" in found.note
@@ -87,17 +92,7 @@ def test_one_cluster_alone_gives_a_block_of_time_and_says_so() -> None:
 
 def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
     # two lanes side by side, whose sequences begin a second after each other
-    sequences = [
-        Sequence(
-            name=f"r/{i}{lane}",
-            recording="r",
-            time=20.0 * i + lane + np.arange(3),
-            x=np.zeros((3, 2, 1)) + np.arange(2)[:, None],
-            agents=(f"{i}{lane}a", f"{i}{lane}b"),
-        )
-        for i in range(16)
-        for lane in range(2)
-    ]
+    sequences = recorded(pairs(32), lambda number: 20.0 * (number // 2) + number % 2)
     for together, number in ((False, 32), (True, 16)):
         found = divide(sequences, DiscoverOptions(), together=together)
         assert_sound(found, sequences)
@@ -107,15 +102,7 @@ def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
 
 
 def test_the_gap_between_sequences_without_names_is_an_option() -> None:
-    sequences = [
-        Sequence(
-            name=f"r/{i}",
-            recording="r",
-            time=6.0 * i + np.arange(3),
-            x=np.zeros((3, 2, 1)) + np.arange(2)[:, None],
-        )
-        for i in range(16)
-    ]
+    sequences = recorded([""] * 16, lambda number: 6.0 * number)
     found = divide(sequences, DiscoverOptions(gap=3.0))
     assert found.number(found.exploration) == 11
     assert "are closer than 3 s in time" in found.why

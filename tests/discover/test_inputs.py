@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -12,7 +13,7 @@ from nnode.data.prepare import prepare
 from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.readers.table import TableOptions
 from nnode.discover.inputs import read_inputs
-from nnode.errors import DataError, FaultError
+from nnode.errors import DataError, FaultError, NNodeError
 from tests.discover.recorded import lane
 
 
@@ -22,19 +23,24 @@ def table(tmp_path: Path, **more: object) -> tuple[pd.DataFrame, TableOptions]:
     return pd.read_csv(path), options
 
 
-def spoil(frame: pd.DataFrame, path: str) -> None:
+def exchanged(frame: pd.DataFrame, sequence: int) -> pd.DataFrame:
+    """Two vehicles of a sequence exchange their paths after two seconds."""
+    first, second = f"v{sequence}-0", f"v{sequence}-1"
+    late = frame["time"] > 40.0 * sequence + 2.0
+    return frame.assign(
+        agent=frame["agent"].mask(late, frame["agent"].replace({first: second, second: first}))
+    )
+
+
+def spoilt(frame: pd.DataFrame) -> pd.DataFrame:
     """Two vehicles of sequence 1 exchange their paths after two seconds; one of 2 vanishes."""
-    own = frame["sequence"] == 1
-    late = own & (frame["time"] > 42.0)
-    names = {"v1-0": "v1-1", "v1-1": "v1-0"}
-    frame.loc[late, "agent"] = frame.loc[late, "agent"].replace(names)
     gone = (frame["agent"] == "v2-1") & (frame["time"] > 82.0)
-    frame[~gone].to_csv(path, index=False)
+    return exchanged(frame[~gone], 1)
 
 
 def test_faulty_sequences_are_named_and_left_out(tmp_path: Path) -> None:
     frame, options = table(tmp_path)
-    spoil(frame, options.path)
+    spoilt(frame).to_csv(options.path, index=False)
     inputs = read_inputs(options, tmp_path / "data")
     # of the other one the first seconds are left
     assert [s.name for s in inputs.sequences] == ["lane/0", "lane/2", "lane/3", "lane/4"]
@@ -48,7 +54,7 @@ def test_faulty_sequences_are_named_and_left_out(tmp_path: Path) -> None:
 
 def test_prepared_data_give_the_same(tmp_path: Path) -> None:
     frame, options = table(tmp_path)
-    spoil(frame, options.path)
+    spoilt(frame).to_csv(options.path, index=False)
     fresh = read_inputs(options, tmp_path / "data")
     prepare(options, tmp_path / "prepared")
     options.prepared = str(tmp_path / "prepared")
@@ -58,35 +64,40 @@ def test_prepared_data_give_the_same(tmp_path: Path) -> None:
     assert [s.name for s in again.sequences] == [s.name for s in fresh.sequences]
 
 
-def test_faults_can_be_refused(tmp_path: Path) -> None:
-    frame, options = table(tmp_path, faults=Faults.error)
-    spoil(frame, options.path)
-    with pytest.raises(FaultError, match="identity_swap"):
-        read_inputs(options, tmp_path / "data")
-
-
-def test_a_single_sequence_is_too_little(tmp_path: Path) -> None:
-    frame, options = table(tmp_path)
-    frame[frame["sequence"] == 0].to_csv(options.path, index=False)
-    with pytest.raises(DataError, match="1 of 1 sequences are without a fault; a diagnosis needs"):
-        read_inputs(options, tmp_path / "data")
-
-
-def test_too_many_faults_are_counted(tmp_path: Path) -> None:
-    frame, options = table(tmp_path)
-    frame = frame[frame["sequence"] < 3]
-    late = (frame["sequence"] == 0) & (frame["time"] > 2.0)
-    names = {"v0-0": "v0-1", "v0-1": "v0-0"}
-    frame.loc[late, "agent"] = frame.loc[late, "agent"].replace(names)
-    spoil(frame, options.path)
-    with pytest.raises(DataError, match=r"1 of 3 .*identity_swap in 2"):
-        read_inputs(options, tmp_path / "data")
-
-
-def test_without_followers_there_is_nothing_to_diagnose(tmp_path: Path) -> None:
-    frame, options = table(tmp_path, faults=Faults.keep)
-    frame[frame["agent"].str.endswith("-2")].to_csv(options.path, index=False)
-    with pytest.raises(DataError, match="no vehicle follows another in any of the 5 sequences"):
+@pytest.mark.parametrize(
+    ("faults", "change", "error", "message"),
+    [
+        (Faults.error, spoilt, FaultError, "identity_swap"),
+        (
+            Faults.drop,
+            lambda frame: frame[frame["sequence"] == 0],
+            DataError,
+            "1 of 1 sequences are without a fault; a diagnosis needs",
+        ),
+        (
+            Faults.drop,
+            lambda frame: exchanged(spoilt(frame[frame["sequence"] < 3]), 0),
+            DataError,
+            r"1 of 3 .*identity_swap in 2",
+        ),
+        (
+            Faults.keep,
+            lambda frame: frame[frame["agent"].str.endswith("-2")],
+            DataError,
+            "no vehicle follows another in any of the 5 sequences",
+        ),
+    ],
+)
+def test_unusable_data_are_refused(
+    tmp_path: Path,
+    faults: Faults,
+    change: Callable[[pd.DataFrame], pd.DataFrame],
+    error: type[NNodeError],
+    message: str,
+) -> None:
+    frame, options = table(tmp_path, faults=faults)
+    change(frame).to_csv(options.path, index=False)
+    with pytest.raises(error, match=message):
         read_inputs(options, tmp_path / "data")
 
 

@@ -1,13 +1,17 @@
 """Small crowds with known accelerations, by Runge and Kutta's method at a fifth of the sampling
-interval, written without the package's models."""
+interval, written without the package's models; and the package's model of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from nnode.data.sequence import Sequence
+from nnode.model import Crowd, make_law
+from nnode.model.laws import InteractionForce
+from nnode.model.term import Term
 
 A, R, B, TAU = 3.0, 0.25, 0.3, 0.5
 WIDTH, HALF = 4.5, 8.0
@@ -16,6 +20,17 @@ DT, SUBSTEPS = 0.1, 5
 
 #: Of positions and velocities ``(S, N, 2)`` and the time since the start: m/s².
 Extra = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+
+
+def model(*effects: Term, force: type[InteractionForce] = InteractionForce, **given: Any) -> Crowd:
+    """The law that they walk by, with effects.
+
+    Args:
+        force: the class of the force. given: its options.
+    """
+    options = {"A": A, "k": 0.0, "kappa": 0.0, "B": B, **given}
+    law = force(entry="social_force", **options)
+    return Crowd([make_law("relaxation", tau=TAU), law, *effects])
 
 
 def length(a: np.ndarray) -> np.ndarray:
@@ -84,3 +99,8 @@ def crowd(
         )
         for s in range(sequences)
     ]
+
+
+def wind(a_x: float, a_y: float) -> Extra:
+    """Everybody is accelerated the same way, m/s²."""
+    return lambda x, v, t: np.broadcast_to([a_x, a_y], x.shape)

@@ -15,7 +15,6 @@ from nnode.discover.crowds.engine import CrowdEngine
 from nnode.discover.crowds.indirect_inference import bias_corrected
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.errors import SimulationError
-from nnode.model import Crowd, make_law
 from nnode.model.effects.crowd import PreferredSpeed
 from tests.discover import walkers
 
@@ -41,10 +40,7 @@ def calibrated(
 ) -> tuple[Fit, list[Sequence], CrowdEngine]:
     extra = hurried(seed, sequences)
     data = walkers.crowd(extra, seed=seed, sequences=sequences, noise=noise)
-    law = make_law("social_force", A=walkers.A, k=0.0, kappa=0.0, B=walkers.B)
-    system = Crowd(
-        [make_law("relaxation", tau=walkers.TAU), law, PreferredSpeed(c=C, v_pref=SPEED)]
-    )
+    system = walkers.model(PreferredSpeed(c=C, v_pref=SPEED))
     engine = CrowdEngine(data)
     engine.fit_whitening(system, ParameterVector(system).row)
     return refine(engine, system), data, engine

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -9,10 +11,11 @@ from nnode.data.sequence import Sequence
 from nnode.discover.crowds.paths import Smoother
 from nnode.discover.crowds.windows import Windows
 from nnode.errors import DataError
+from tests.builders import people
 
 
 def track(x: np.ndarray, name: str = "r/0", dt: float = 0.1) -> Sequence:
-    return Sequence(name=name, recording="r", time=dt * np.arange(len(x)), x=x)
+    return people(x, dt, name=name)
 
 
 def test_the_noise_is_recognised_and_smoothed_away() -> None:
@@ -39,13 +42,23 @@ def test_a_parabola_is_kept_as_it_is() -> None:
     np.testing.assert_allclose(path.v[:-1, 0, 0], (1 - 0.02 * late)[:-1], atol=1e-6)
 
 
-def test_sequences_that_cannot_be_smoothed() -> None:
-    with pytest.raises(DataError, match="at least 4"):
-        Smoother([track(np.zeros((3, 1, 2)))])
-    hole = np.zeros((9, 1, 2))
-    hole[4] = np.nan
-    with pytest.raises(DataError, match="no numbers"):
-        Smoother([track(hole)])
+HOLE = np.zeros((9, 1, 2))
+HOLE[4] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("prepare", "x", "message"),
+    [
+        (Smoother, np.zeros((3, 1, 2)), "at least 4"),
+        (Smoother, HOLE, "no numbers"),
+        (Windows, np.zeros((4, 2, 2)), "longer sequences"),
+    ],
+)
+def test_unusable_sequences_are_refused(
+    prepare: Callable[[list[Sequence]], object], x: np.ndarray, message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        prepare([track(x)])
 
 
 def test_windows_share_the_sequence_and_leave_no_two_samples_in_common() -> None:
@@ -65,8 +78,6 @@ def test_fast_cameras_are_thinned_out_and_slow_ones_simulated_in_steps() -> None
     assert (fast.length, fast.sub, fast.step) == (19, 1, 0.08)
     slow = Windows([track(np.zeros((30, 2, 2)), dt=0.25)])
     assert (slow.length, slow.sub, slow.step) == (6, 2, 0.125)
-    with pytest.raises(DataError, match="longer sequences"):
-        Windows([track(np.zeros((4, 2, 2)))])
 
 
 def test_one_long_sequence_leaves_no_short_ones_out() -> None:

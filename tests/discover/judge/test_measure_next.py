@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from nnode.discover.judge import measure_next
 from nnode.discover.judge.measure_next import (
     COMFORTABLE,
     POWER,
@@ -17,18 +19,9 @@ from nnode.discover.judge.measure_next import (
 )
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import converged_fit
-from nnode.model import System
-from nnode.model.build import add_effects, build_model
-from tests.discover.platoons import LENGTH, V0, platoons
+from tests.discover.platoons import V0, lin, platoons
 
 MEAN, PERIOD = 15.0, 8.0
-
-
-def model(v0: float = V0, **effect: object) -> System:
-    options = {"leader": "measured", "v0": v0, "L": LENGTH, "L_min": 1.0}
-    found = build_model({"term": "lin", "name": "lin", **options})
-    add_effects(found, [effect] if effect else [])
-    return found.double()
 
 
 DELAY = {"name": "reaction_delay", "T": 0.3}
@@ -38,28 +31,28 @@ INERTIA = {"name": "inertia", "tau_v": 0.3}
 @pytest.fixture(scope="module")
 def engine() -> TrafficEngine:
     found = TrafficEngine(platoons(driver=0.8))
-    converged_fit(found, model())
+    converged_fit(found, lin())
     return found
 
 
 def test_what_own_parameters_mend_is_no_distance(engine: TrafficEngine) -> None:
-    other = distance(engine, model(**DELAY), model(), MEAN, 2.0, PERIOD)
-    assert distance(engine, model(), model(), MEAN, 2.0, PERIOD) < 1e-4 * other
-    assert distance(engine, model(), model(1.001 * V0), MEAN, 2.0, PERIOD) < 1e-2 * other
+    other = distance(engine, lin(DELAY), lin(), MEAN, 2.0, PERIOD)
+    assert distance(engine, lin(), lin(), MEAN, 2.0, PERIOD) < 1e-4 * other
+    assert distance(engine, lin(), lin(v0=1.001 * V0), MEAN, 2.0, PERIOD) < 1e-2 * other
 
 
 def test_livelier_leaders_tell_more(engine: TrafficEngine) -> None:
     calm, lively = (
-        distance(engine, model(**DELAY), model(**INERTIA), MEAN, swing, PERIOD)
-        for swing in (0.2, 2.0)
+        distance(engine, lin(DELAY), lin(INERTIA), MEAN, swing, PERIOD) for swing in (0.2, 2.0)
     )
     assert lively > 50 * calm > 0
 
 
 def test_the_number_of_platoons_tells_with_the_probability_that_is_asked_for(
-    engine: TrafficEngine,
+    engine: TrafficEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, second = model(**DELAY), model(**INERTIA)
+    monkeypatch.setattr(measure_next, "distance", cache(distance))  # whatever the level
+    first, second = lin(DELAY), lin(INERTIA)
     found = list(evaluated_profiles(engine, first, second, 0.05))
     best = best_profile(engine, first, second, 0.05)
     surer = best_profile(engine, first, second, 0.01)

@@ -14,19 +14,12 @@ from nnode.discover.lanes.engine import FORGET, LARGE, TrafficEngine, huber_resi
 from nnode.discover.locate.curves import curves, significant_curves
 from nnode.discover.name.search import converged_fit, search
 from nnode.discover.residuals.fit import Fit, refine
-from nnode.discover.statistics.paired import compare, heldout
-from nnode.discover.statistics.score import traces
+from nnode.discover.statistics.paired import heldout
 from nnode.model import System
-from nnode.model.build import add_effects, build_model
 from nnode.model.effects import CATALOGUE
-from tests.discover.platoons import LENGTH, V0, delayed, platoons, relative_speed
+from tests.discover.platoons import LENGTH, V0, delayed, lin, platoons, relative_speed
 
-
-def model(*effects: dict[str, object]) -> System:
-    options = {"leader": "measured", "v0": V0, "L": LENGTH, "L_min": 1.0}
-    found = build_model({"term": "lin", "name": "lin", **options})
-    add_effects(found, list(effects))
-    return found
+ROW = ParameterVector(lin()).row
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +30,6 @@ def plain() -> list[Sequence]:
 @pytest.fixture(scope="module")
 def reacting() -> list[Sequence]:
     return platoons(relative_speed(0.4), driver=0.2)
-
-
-# -- paths -----------------------------------------------------------------------------------
 
 
 def test_noise_is_recognised_and_smoothed_away() -> None:
@@ -54,7 +44,7 @@ def test_noise_is_recognised_and_smoothed_away() -> None:
 
 def test_a_right_model_leaves_only_noise(plain: list[Sequence]) -> None:
     engine = TrafficEngine(platoons(noise=0.0))
-    errors = engine.squares(model(), ParameterVector(model()).row)
+    errors = engine.squares(lin(), ROW)
     assert np.sqrt(errors.means().max()) < 2e-3
     # nothing that a vehicle did before it forgot its start is compared
     assert len(errors.value) == len(engine.sequence) < sum(s.x[1:, 1:].size for s in plain)
@@ -83,100 +73,56 @@ def test_large_residuals_are_drawn_in() -> None:
     assert float(found[2] ** 2) == pytest.approx(2 * LARGE * 10 * LARGE - LARGE**2)
 
 
-@pytest.mark.parametrize(
-    "effects",
-    [
-        [],
-        [{"name": "relative_speed", "kappa": 0.3}],
-        [{"name": "inertia", "tau_v": 0.6}],
-        [{"name": "reaction_delay", "T": 0.5}],
-        [{"name": "time_gap", "h": 0.1}],
-        [{"name": "multi_anticipation", "c": 0.2}],
-    ],
-)
-def test_linear_response_agrees_with_differences(
-    plain: list[Sequence], effects: list[dict[str, object]]
-) -> None:
-    engine, system = TrafficEngine(plain[:4]), model(*effects)
-    row = ParameterVector(system).row
-    found = engine.tangents(system, row)
-    step = 1e-4 * row.abs().clamp(min=0.1)
-    rows = torch.cat([row[None], row + torch.diag(step)])
-    values = engine.residuals(system, rows)
-    expected = (values[1:] - values[0]) / step[:, None]
-    apart = (found - expected).norm(dim=1) / expected.norm(dim=1)
-    assert apart.max() < 0.06
-
-
-def test_traces_agree_with_simulated_effects(plain: list[Sequence]) -> None:
-    engine = TrafficEngine(plain[:4])
-    fit = converged_fit(engine, model())
-    (trace,) = traces(engine, fit, CATALOGUE.effects["relative_speed"])
-    other = model({"name": "relative_speed", "kappa": 0.01})
-    row = torch.cat([torch.from_numpy(fit.row), torch.tensor([0.01]).double()])
-    changed = engine.residuals(other, row[None])[0].numpy() - fit.residual
-    expected = changed / 0.01
-    apart = np.linalg.norm(trace.columns[:, 0] - expected) / np.linalg.norm(expected)
-    assert apart < 0.05
-
-
 def test_a_delay_is_simulated_precisely() -> None:
     """Data with a true delay, whose history was kept, against the filter that stands for it."""
     sequences = delayed(0.6)
     engine = TrafficEngine(sequences)
-    right = model({"name": "reaction_delay", "T": 0.6})
+    right = lin({"name": "reaction_delay", "T": 0.6})
     error = engine.squares(right, ParameterVector(right).row).means().mean()
     assert np.sqrt(error) < 0.03
-    assert error < 0.05 * engine.squares(model(), ParameterVector(model()).row).means().mean()
+    assert error < 0.05 * engine.squares(lin(), ROW).means().mean()
 
 
-# -- naming ----------------------------------------------------------------------------------
-
-
-def test_a_hidden_effect_is_named_and_measured(reacting: list[Sequence]) -> None:
-    engine = TrafficEngine(reacting)
-    base = converged_fit(engine, model())
-    found = search(engine, base, CATALOGUE.of("traffic"))
-    assert [step.chosen.name for step in found.steps] == ["relative_speed"]
-    i = found.fit.names.index("terms.1.kappa")
-    low, high = found.fit.intervals(engine.cluster)[i]
-    assert found.fit.row[i] == pytest.approx(0.4, abs=0.05)
+@pytest.mark.parametrize("data", ["reacting", "plain"])
+def test_an_effect_is_named_and_measured_where_it_is_hidden(
+    data: str, request: pytest.FixtureRequest
+) -> None:
+    engine = TrafficEngine(request.getfixturevalue(data))
+    base = converged_fit(engine, lin())
+    result = search(engine, base, CATALOGUE.of("traffic"))
+    if data == "plain":
+        assert not result.steps
+        assert not significant_curves(engine, base, curves(engine, base, engine.variables()), 0.01)
+        assert base.row == pytest.approx([V0, LENGTH], rel=0.05)
+        return
+    assert [step.chosen.name for step in result.steps] == ["relative_speed"]
+    i = result.fit.names.index("terms.1.kappa")
+    low, high = result.fit.intervals(engine.cluster)[i]
+    assert result.fit.row[i] == pytest.approx(0.4, abs=0.05)
     assert low < 0.4 < high
 
 
-def test_nothing_is_named_where_nothing_is_hidden(plain: list[Sequence]) -> None:
-    engine = TrafficEngine(plain)
-    base = converged_fit(engine, model())
-    found = search(engine, base, CATALOGUE.of("traffic"))
-    assert not found.steps
-    assert not significant_curves(engine, base, curves(engine, base, engine.variables()), 0.01)
-    assert base.row == pytest.approx([V0, LENGTH], rel=0.05)
-
-
 def test_curves_find_the_variable_of_an_effect() -> None:
-    def slow(x: np.ndarray, law: np.ndarray, lead: float) -> np.ndarray:
-        return law * np.where((x[:-1] > 250) & (x[:-1] < 330), 0.9, 1.0)
+    def slow(x: np.ndarray, law: np.ndarray, lead: np.ndarray) -> np.ndarray:
+        return law * np.where((x[:, :-1] > 250) & (x[:, :-1] < 330), 0.9, 1.0)
 
     engine = TrafficEngine(platoons(slow, driver=0.1))
-    fit = converged_fit(engine, model())
+    fit = converged_fit(engine, lin())
     best = curves(engine, fit, engine.variables())[0]
     assert best.variable.name == "position"
     assert best.gain.low > 0
 
 
-# -- statistics ------------------------------------------------------------------------------
-
-
 def test_heldout_cost_is_that_of_a_refit(reacting: list[Sequence]) -> None:
     engine = TrafficEngine(reacting)
-    fit = converged_fit(engine, model())
+    fit = converged_fit(engine, lin())
     losses = heldout(fit, engine.cluster)
     rest = TrafficEngine(reacting[1:])
     rest.filter = engine.filter
-    again = refine(rest, model(), tolerance=1e-8)
+    again = refine(rest, lin(), tolerance=1e-8)
     one = TrafficEngine(reacting[:1])
     one.filter = engine.filter
-    value = one.residuals(model(), torch.from_numpy(again.row)[None])[0]
+    value = one.residuals(lin(), torch.from_numpy(again.row)[None])[0]
     assert losses[0] == pytest.approx(float(value @ value), rel=0.02)
 
 
@@ -194,11 +140,3 @@ def test_what_one_sequence_knows_alone_is_not_judged_by_the_others() -> None:
     fit.jacobian = jacobian[:, :1]
     fit.free = np.ones(1, dtype=bool)
     np.testing.assert_allclose(losses, heldout(fit, sequence), rtol=1e-3)
-
-
-def test_comparison_is_bounded_by_every_sequence() -> None:
-    first, second = np.array([2.0, 2.0, 2.0, 1e9]), np.array([1.0, 1.0, 1.0, 1.0])
-    found = compare(first, second)
-    assert found.gain == pytest.approx((3 * 0.5 + 1) / 4)
-    assert compare(second, first).gain == pytest.approx(-found.gain)
-    assert found.p_value < 0.05 < compare(second, first).p_value

@@ -62,12 +62,11 @@ CASES = [
 def sequences() -> list[Sequence]:
     """Platoons of 5, 3 and 2 vehicles: padding and missing second vehicles are a case."""
     found, rng = [], np.random.default_rng(0)
-    for i, one in enumerate(platoons(relative_speed(0.2), number=3, driver=0.2)):
-        x = one.x[:, : (5, 3, 2)[i]]
-        n = x.shape[1]
-        found.append(
-            replace(one, x=x, length=rng.uniform(4, 9, n), kind=("truck", *["car"] * (n - 1)))
-        )
+    made = platoons(relative_speed(0.2), number=3, driver=0.2, seconds=8.0)
+    for one, n in zip(made, (5, 3, 2), strict=True):
+        kind = ("truck", *["car"] * 4)
+        given = replace(one, length=rng.uniform(4, 9, 5), kind=kind)
+        found.append(given.select(np.arange(5) < n))
     return found
 
 

@@ -16,21 +16,20 @@ from nnode.discover.residuals.engine import square_of
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.variables import Variable, hats, lengths_of
 from nnode.model.effects import CATALOGUE
-from tests.discover.lanes.test_engine import model
-from tests.discover.platoons import platoons
+from tests.discover.platoons import lin, platoons
 
 WAVE = 70.0
 
 
-def _wavy(x: np.ndarray, law: np.ndarray, lead: float) -> np.ndarray:
-    return law * (1 + 0.08 * np.sin(2 * np.pi * x[:-1] / WAVE + 1.0))
+def _wavy(x: np.ndarray, law: np.ndarray, lead: np.ndarray) -> np.ndarray:
+    return law * (1 + 0.08 * np.sin(2 * np.pi * x[:, :-1] / WAVE + 1.0))
 
 
 @pytest.fixture(scope="module")
 def wavy() -> tuple[TrafficEngine, Fit]:
     # as many clusters as it takes to be sure of one curve among many
     engine = TrafficEngine(platoons(_wavy, number=16, driver=0.1))
-    return engine, converged_fit(engine, model())
+    return engine, converged_fit(engine, lin())
 
 
 def test_a_wave_along_the_road_is_found(wavy: tuple[TrafficEngine, Fit]) -> None:

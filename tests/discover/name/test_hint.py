@@ -38,16 +38,18 @@ def test_a_hint_has_the_model_s_effects_and_one_more() -> None:
     assert names(hint) == [{"speed_zone", "reaction_delay"}]
 
 
-def score() -> Any:
-    return SimpleNamespace(effect=CATALOGUE.effects["reaction_delay"], options={})
-
-
 @pytest.mark.parametrize(
     ("own", "hinted", "best"),
-    [(9.0, 4.0, 4.0), (3.0, 4.0, 3.0), (None, 4.0, 4.0), (3.0, None, 3.0)],
+    [
+        (9.0, 4.0, 4.0),
+        (3.0, 4.0, 3.0),
+        (None, 4.0, 4.0),
+        (3.0, None, 3.0),
+        (None, None, None),  # None: the calibration from this start blows up
+    ],
 )
 def test_the_better_of_two_starts_counts(
-    monkeypatch: pytest.MonkeyPatch, own: float | None, hinted: float | None, best: float
+    monkeypatch: pytest.MonkeyPatch, own: float | None, hinted: float | None, best: float | None
 ) -> None:
     hint = lin(LATE)
 
@@ -57,18 +59,15 @@ def test_the_better_of_two_starts_counts(
             raise SimulationError("it blows up")
         return SimpleNamespace(cost=cost)
 
-    monkeypatch.setattr(candidate, "refine", refine)
-    engine: Any = None
-    before: Any = SimpleNamespace(system=lin())
-    assert candidate.calibrated(engine, before, score(), 0.0, [hint]).cost == best
-
-
-def test_two_starts_that_blow_up_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refine(*given: Any, **how: Any) -> Any:
-        raise SimulationError("it blows up")
+    def calibrated() -> Any:
+        score: Any = SimpleNamespace(effect=CATALOGUE.effects["reaction_delay"], options={})
+        before: Any = SimpleNamespace(system=lin())
+        engine: Any = None
+        return candidate.calibrated(engine, before, score, 0.0, [hint])
 
     monkeypatch.setattr(candidate, "refine", refine)
-    engine: Any = None
-    before: Any = SimpleNamespace(system=lin())
-    with pytest.raises(SimulationError, match="reaction_delay blows up on these data"):
-        candidate.calibrated(engine, before, score(), 0.0)
+    if best is None:
+        with pytest.raises(SimulationError, match="reaction_delay blows up on these data"):
+            calibrated()
+    else:
+        assert calibrated().cost == best

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,20 +13,19 @@ from nnode.discover import thresholds
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name import search as searching
 from nnode.discover.name.search import converged_fit, search
+from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.score import Score, Screen, Trace
-from nnode.model import build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.extend import effects_of
-from tests.discover.platoons import LENGTH, V0, platoons, relative_speed
+from tests.discover.platoons import lin, platoons, relative_speed
 
-LIN = {
-    "term": "lin",
-    "name": "lin",
-    "leader": "measured",
-    "v0": V0,
-    "L": LENGTH,
-    "L_min": 1.0,
-}
+EFFECTS = [CATALOGUE.effects[name] for name in ("relative_speed", "inertia")]
+
+
+@cache
+def fitted(strength: float) -> tuple[TrafficEngine, Fit]:
+    engine = TrafficEngine(platoons(relative_speed(strength), number=16))
+    return engine, converged_fit(engine, lin())
 
 
 @pytest.mark.parametrize(("strength", "names"), [(0.5, ["relative_speed"]), (0.0, [])])
@@ -38,19 +38,17 @@ def test_held_out_clusters_may_be_sure_of_what_no_score_shows(
         return [replace(score, p_value=1.0) for score in scored(screen, look)]
 
     monkeypatch.setattr(Screen, "scores", blind)
-    engine = TrafficEngine(platoons(effect=relative_speed(strength), number=16))
-    fit = converged_fit(engine, build_model(LIN))
-    found = search(engine, fit, [CATALOGUE.effects[n] for n in ("relative_speed", "inertia")])
+    engine, fit = fitted(strength)
+    found = search(engine, fit, EFFECTS)
     assert [step.chosen.name for step in found.steps] == names
     assert all(step.chosen.score.p_value <= thresholds.STRICT for step in found.steps)
 
 
 def test_what_a_curve_outdoes_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = TrafficEngine(platoons(effect=relative_speed(0.5), number=16))
-    fit = converged_fit(engine, build_model(LIN))
+    engine, fit = fitted(0.5)
     asked: list[bool] = []
     monkeypatch.setattr(searching, "_curve_predicts_better", lambda *_: asked.append(True) or True)
-    found = search(engine, fit, [CATALOGUE.effects[n] for n in ("relative_speed", "inertia")])
+    found = search(engine, fit, EFFECTS)
     assert asked  # an effect passed, and was doubted
     assert not found.steps
     assert not effects_of(found.fit.system)

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from nnode.discover.residuals.fit import Fit
-from nnode.model import System
+from tests.builders import regression
 
 
 def test_intervals_are_those_of_clusters() -> None:
@@ -16,10 +15,9 @@ def test_intervals_are_those_of_clusters() -> None:
     cluster = np.repeat(np.arange(6), 40)
     jacobian, residual = rng.normal(size=(240, 2)), rng.normal(size=240)
     jacobian[cluster == 0] *= 4  # one sequence tells most
-    residual -= jacobian @ np.linalg.lstsq(jacobian, residual, rcond=None)[0]
     free = np.array([True, False, True])
-    wide = np.insert(jacobian, 1, 0.0, axis=1)
-    fit = Fit(System([]), ["a", "b", "c"], np.array([2.0, 7.0, -1.0]), residual, wide, free)
+    fit = replace(regression(np.insert(jacobian, 1, 0.0, axis=1), residual), free=free)
+    residual = fit.residual
     half = fit.influence(cluster).half_widths()
     low, high = fit.intervals(cluster).T
     np.testing.assert_allclose((high - low)[free] / 2, half)
@@ -47,9 +45,8 @@ def test_what_one_sequence_alone_tells_of_has_no_interval() -> None:
     jacobian = rng.normal(size=(150, 3))
     jacobian[sequence != 2, 1] = 0.0
     residual = rng.normal(size=150)
-    residual -= jacobian @ np.linalg.lstsq(jacobian, residual, rcond=None)[0]
-    fit = Fit(System([]), ["a", "b", "c"], np.ones(3), residual, jacobian, np.ones(3, dtype=bool))
+    fit = regression(jacobian, residual)
     low, high = fit.intervals(sequence).T
     assert np.isnan([low[1], high[1]]).all()
-    assert (low[[0, 2]] < 1).all()
-    assert (high[[0, 2]] > 1).all()
+    assert (low < fit.row)[[0, 2]].all()
+    assert (fit.row < high)[[0, 2]].all()

@@ -12,13 +12,11 @@ from scipy import stats
 from nnode.data.clusters import clusters, index_of
 from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import converged_fit
-from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.score import Screen, Trace, traces
-from nnode.model import System
 from nnode.model.effects import Probe
 from nnode.model.effects.lane import RelativeSpeed, TimeGap, VehicleClass
-from tests.discover.lanes.test_engine import model
-from tests.discover.platoons import streams
+from tests.builders import regression
+from tests.discover.platoons import lin, streams
 
 CASES, ALPHA = 20, 0.05
 
@@ -33,11 +31,13 @@ def test_clusters_keep_the_level_where_windows_do_not() -> None:
     """Nothing is hidden; every driver is in a mood that outlasts his ten windows of 5 s."""
     alarms = {"clusters": 0, "windows": 0}
     for seed in range(CASES):
-        sequences = streams(vehicles=3, seconds=50.0, window=5.0, mood=0.5, lasts=120.0, seed=seed)
+        sequences = streams(
+            vehicles=3, seconds=50.0, window=5.0, driver=0.5, lasts=120.0, seed=seed
+        )
         label = clusters(index_of(sequences))
         assert (len(sequences), label.max() + 1) == (80, 8)
         engine = TrafficEngine(sequences, clusters=label)
-        fit = converged_fit(engine, model(), rounds=1)
+        fit = converged_fit(engine, lin(), rounds=1)
         looked = traces(engine, fit, Truck)
         for name, own in (("clusters", engine.cluster), ("windows", engine.sequence)):
             (score,) = Screen(fit, own, seed).scores(looked)
@@ -53,8 +53,7 @@ def test_no_adjusted_p_is_below_its_floor_however_strong_an_effect_is(number: in
     label = np.repeat(np.arange(number), 30)
     column = rng.normal(size=(3, len(label)))
     residual = 1e-3 * rng.normal(size=len(label)) - 0.3 * column[0]
-    jacobian = np.zeros((len(label), 0))
-    fit = Fit(System([]), [], np.zeros(0), residual, jacobian, np.ones(0, dtype=bool))
+    fit = regression(np.zeros((len(label), 0)), residual)
     effects = (RelativeSpeed, VehicleClass, TimeGap)
     looked = [
         Trace(effect, [Probe({}, dict.fromkeys(effect.strengths, 0.1))], own[:, None])

@@ -9,7 +9,7 @@ from scipy import stats
 from nnode.discover.residuals.comparison import Comparison
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.statistics.paired import clusters_to_tell, compare, heldout, j_test
-from nnode.model.system import System
+from tests.builders import regression
 
 
 def seen(mean: float, spread: float, clusters: int) -> Comparison:
@@ -34,15 +34,20 @@ def test_so_many_clusters_tell_with_nine_in_ten(mean: float, spread: float, leve
     assert found(round(0.8 * number)) < 0.88
 
 
-def test_no_number_of_clusters_tells_what_is_no_better() -> None:
-    assert clusters_to_tell(seen(-0.01, 0.1, 10), 0.05) is None
-    assert clusters_to_tell(compare(np.ones(1), np.zeros(1)), 0.05) is None
-    same = np.ones(6)
-    assert clusters_to_tell(compare(same, same), 0.05) is None
+ALIKE = np.ones(6)
 
 
-def test_never_fewer_than_did_not_tell() -> None:
-    assert clusters_to_tell(seen(1.0, 0.1, 30), 0.05) == 30
+@pytest.mark.parametrize(
+    ("comparison", "number"),
+    [
+        (seen(-0.01, 0.1, 10), None),
+        (compare(np.ones(1), np.zeros(1)), None),
+        (compare(ALIKE, ALIKE), None),
+        (seen(1.0, 0.1, 30), 30),  # never fewer than did not tell
+    ],
+)
+def test_the_number_of_clusters_that_tell(comparison: Comparison, number: int | None) -> None:
+    assert clusters_to_tell(comparison, 0.05) == number
 
 
 def test_a_comparison_knows_its_clusters() -> None:
@@ -51,19 +56,21 @@ def test_a_comparison_knows_its_clusters() -> None:
     assert found.gain == pytest.approx((0.5 + 0 + 0.5) / 3)
 
 
+def test_one_cluster_cannot_decide_a_comparison() -> None:
+    first, second = np.array([2.0, 2.0, 2.0, 1e9]), np.ones(4)
+    found = compare(first, second)
+    assert found.gain == pytest.approx((3 * 0.5 + 1) / 4)
+    assert compare(second, first).gain == pytest.approx(-found.gain)
+    assert found.p_value < 0.05 < compare(second, first).p_value
+
+
 def rivals(rng: np.random.Generator, true: int, clusters: int = 24) -> list[Fit]:
     """Two regressions, neither of which extends the other, on data that one of them made."""
     cluster = np.repeat(np.arange(clusters), 20)
     first = rng.normal(size=len(cluster))
     columns = [first, 0.8 * first + 0.6 * rng.normal(size=len(cluster))]
     made = 0.25 * columns[true] + rng.normal(size=len(cluster))
-    found = []
-    for one in columns:
-        column = one[:, None]
-        row = np.linalg.lstsq(column, made, rcond=None)[0]
-        rest = made - column @ row
-        found.append(Fit(System([]), ["c"], row, rest, -column, np.ones(1, dtype=bool)))
-    return found
+    return [regression(-one[:, None], made) for one in columns]
 
 
 def test_a_wrong_rival_is_outdone_and_a_true_one_is_not() -> None:

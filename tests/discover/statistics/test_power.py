@@ -12,9 +12,9 @@ from nnode.discover.statistics.combination import combined
 from nnode.discover.statistics.paired import gains, heldout, presence_pvalue, score_toward
 from nnode.discover.statistics.power import RUNS, PowerSimulation
 from nnode.discover.statistics.score import Score, Screen, Trace
-from nnode.model import System
 from nnode.model.effects import Probe
 from nnode.model.effects.lane import RelativeSpeed
+from tests.builders import regression
 
 OPEN, EACH, ALPHA, LEVEL = 30, 12, 0.05, thresholds.LEVEL
 
@@ -32,17 +32,9 @@ def drawn(rng: np.random.Generator, label: np.ndarray) -> np.ndarray:
     return np.asarray(rng.normal(size=len(label)) + 0.4 * size[label])
 
 
-def fitted(columns: np.ndarray, residual: np.ndarray) -> Fit:
-    """The least squares of a linear model whose residuals at zero are given."""
-    row = -np.linalg.lstsq(columns, residual, rcond=None)[0]
-    names = [f"p{i}" for i in range(len(row))]
-    free = np.ones(len(row), dtype=bool)
-    return Fit(System([]), names, row, residual + columns @ row, columns, free)
-
-
 def scored(residual: np.ndarray, seed: int = 0) -> tuple[Fit, Screen, Score]:
     """The score of the effect in open clusters."""
-    fit = fitted((PARAMETER * KNOWN)[:, None], residual)
+    fit = regression((PARAMETER * KNOWN)[:, None], residual)
     screen = Screen(fit, LABEL, seed, flips=499)
     probe = Probe({}, {"kappa": 0.05})
     (score,) = screen.scores([Trace(RelativeSpeed, [probe], (EFFECT * KNOWN)[:, None])])
@@ -53,7 +45,7 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
     """One search on fresh clusters in which the effect has a size."""
     fit, _, score = scored(drawn(rng, LABEL) - size * EFFECT * KNOWN)
     columns = np.stack([PARAMETER, EFFECT], 1) * KNOWN[:, None]
-    wider = fitted(columns, fit.residual - fit.jacobian @ fit.row)
+    wider = regression(columns, fit.residual - fit.jacobian @ fit.row)
     nearer = heldout(fit, LABEL).sum() > heldout(wider, LABEL).sum()
     low, high = wider.intervals(LABEL)[1]
     if (

@@ -11,8 +11,7 @@ from nnode.discover.lanes.engine import TrafficEngine
 from nnode.discover.name.search import converged_fit
 from nnode.discover.residuals.fit import Fit, refine
 from nnode.discover.statistics.profile import Profile, intervals, profiles, refined_edges
-from nnode.model.build import add_effects, build_model
-from tests.discover.platoons import LENGTH, V0, platoons
+from tests.discover.platoons import lin, platoons
 
 #: Sequences start every 100 s of the clock and last 20 s; those from 300 s and 400 s are slow.
 SLOW = 0.9
@@ -26,9 +25,7 @@ def engine() -> TrafficEngine:
 
 
 def fitted(engine: TrafficEngine, a: float, b: float) -> Fit:
-    options = {"leader": "measured", "v0": V0, "L": LENGTH, "L_min": 1.0}
-    system = build_model({"term": "lin", "name": "lin", **options})
-    add_effects(system, [{"name": "speed_period", "alpha": 0.95, "a": a, "b": b}])
+    system = lin({"name": "speed_period", "alpha": 0.95, "a": a, "b": b})
     return converged_fit(engine, system)
 
 
