@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 from nnode.app.python.inputs import model_options
 from nnode.data.sequence import Sequence
@@ -24,7 +24,6 @@ from nnode.discover.report.files import amount, plain_report, verdict, write_rep
 from nnode.discover.report.page import draw
 from nnode.model import build_model
 from tests.discover import walkers
-from tests.discover.platoons import platoons, relative_speed
 from tests.discover.report.test_page import CONFIG
 from tests.pages.test_replay import unpacked
 
@@ -47,29 +46,20 @@ class Run:
         return found
 
 
-def wind(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
-    return np.broadcast_to([0.0, 0.35], x.shape)
-
-
-def _made(case: str) -> tuple[list[Sequence], Any, DiscoverOptions]:
-    if case == "lane":
-        made = platoons(relative_speed(0.4), number=16, seconds=12.0, driver=0.1)
-        return made, "lin", DiscoverOptions(effects=["relative_speed"], structure=False)
-    made = walkers.crowd(wind, sequences=17, samples=40)
-    model = {"term": "social_force", "A": walkers.A, "B": walkers.B}
-    return made, model, DiscoverOptions(effects=["side_preference"], structure=False)
-
-
-@pytest.fixture(scope="module", params=["lane", "crowd"])
+@pytest.fixture(scope="module", params=["traffic", "crowd"])
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = tmp_path_factory.mktemp(request.param)
-    sequences, model, options = _made(request.param)
-    domain = "crowd" if request.param == "crowd" else "traffic"
-    torch.manual_seed(0)
-    found = diagnose(build_model(model_options(model, "measured")), sequences, options)
+    if request.param == "traffic":
+        sequences, options, found = request.getfixturevalue("hidden_reaction")
+        found = deepcopy(found)
+    else:
+        sequences = walkers.crowd(walkers.wind(0.0, 0.35), sequences=17, samples=40)
+        options = DiscoverOptions(effects=["side_preference"], structure=False)
+        model = {"term": "social_force", "A": walkers.A, "B": walkers.B}
+        found = diagnose(build_model(model_options(model, "measured")), sequences, options)
     found.diagnosis.model = "base"
     inputs = Inputs(
-        domain=domain, sequences=sequences, faulty=[], faults={}, data_faults=[], manifest={}
+        domain=request.param, sequences=sequences, faulty=[], faults={}, data_faults=[], manifest={}
     )
     draw(inputs, found, options, CONFIG, [], folder)()
     write_report(plain_report(found.diagnosis), folder / "report.json")

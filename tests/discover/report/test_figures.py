@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from nnode.data.sequence import Sequence
 from nnode.discover.report.deviation import Deviation
 from nnode.discover.report.figures.maps import neighbour_maps, plane_maps, time_space_maps
 from nnode.discover.report.figures.marks import AFTER, BEFORE, confirmation_costs
 from nnode.discover.report.figures.paths import as_drawn, trajectories
 from nnode.pages.replay import Scene
+from tests.builders import lane
 
 
 def lane_map(scale: float) -> Deviation:
@@ -58,18 +58,11 @@ def test_sealed_costs_are_paired_in_the_order_of_before() -> None:
     assert [label.get_text() for label in ax.get_xticklabels()] == ["b", "c", "a"]
 
 
-def platoon() -> Sequence:
+def test_trajectories_show_what_is_simulated_minus_what_was_measured() -> None:
     time = 0.2 * np.arange(21)
-    x = 15 * time[:, None] + np.array([0.0, 20.0, 45.0])
-    return Sequence(name="lane/1", recording="lane", time=time, x=x[..., None])
-
-
-def test_trajectories_of_a_platoon() -> None:
-    s = platoon()
-    late = s.x - 0.5 * s.time[:, None, None]
-    late[:, -1] = np.nan  # the leader is given
-    both = as_drawn(Scene(s, {"without": late, "with": s.x}, notes={"without": "error 1.3 m²"}))
-    figure = trajectories(s, both)
-    assert [ax.get_title() for ax in figure.axes[:2]] == ["without: error 1.3 m²", "with"]
-    assert len(figure.axes) == 4
-    assert len(trajectories(s, both[:1]).axes) == 2
+    s = lane(15 * time[:, None] + np.array([0.0, 20.0, 45.0]))
+    late = s.x - 0.5 * time[:, None, None]
+    figure = trajectories(s, as_drawn(Scene(s, {"without": late, "with": s.x})))
+    for ax, wanted in zip(figure.axes[2:], (-0.5 * time, 0 * time), strict=True):
+        shown = [np.asarray(line.get_ydata()) for line in ax.lines[1:]]
+        np.testing.assert_allclose(shown, np.tile(wanted, (3, 1)), atol=1e-12)
