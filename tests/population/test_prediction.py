@@ -8,28 +8,24 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from nnode.model import Traffic, make_law
 from nnode.population.drivers import initial_variances
 from nnode.population.estimate import fit_deviations
 from nnode.population.followers import Followers, paths_of
 from nnode.population.likelihood import PushNoise, marginal
 from nnode.population.prediction import predict
+from tests.discover.platoons import lin
 from tests.population.test_drivers import ERROR, platoons
 
 NOISE = {"push": 0.2, "push_time": 4.0, "measurement": ERROR}
 VARIANCES = NOISE | {"v0": 0.15}
 
 
-def law() -> Traffic:
-    return Traffic([make_law("lin", v0=29.0, L=6.0)], leader="measured").double()
-
-
 @pytest.mark.parametrize("seconds", [2.0, 10.0])
 def test_drivers_are_predicted_better_than_the_typical_one_and_bands_cover(seconds: float) -> None:
     paths = paths_of(platoons(0.15, 11)[0], 0.2)
     late = paths.dt * np.arange(paths.x.shape[1]) > 10.0
-    prediction = predict(law(), paths, VARIANCES, seconds)
-    typical = predict(law(), paths, NOISE, seconds).mean
+    prediction = predict(lin().double(), paths, VARIANCES, seconds)
+    typical = predict(lin().double(), paths, NOISE, seconds).mean
     error = (prediction.mean - paths.x)[:, late]
     assert (error**2).mean() < 0.25 * ((typical - paths.x)[:, late] ** 2).mean()
     deviation = np.sqrt(prediction.deviation**2 + ERROR**2)[:, late]
@@ -41,14 +37,14 @@ def test_drivers_are_predicted_better_than_the_typical_one_and_bands_cover(secon
 def test_the_next_sample_has_the_density_of_the_marginal_likelihood(seconds: float) -> None:
     paths = paths_of(platoons(0.15, 12)[0], 0.2)
     paths = replace(paths, agent=np.arange(len(paths.agent)))
-    prediction = predict(law(), paths, VARIANCES, seconds)
+    prediction = predict(lin().double(), paths, VARIANCES, seconds)
     following = int(prediction.given.sum())
     deviation = np.sqrt(prediction.deviation[:, following] ** 2 + ERROR**2)
     density = norm.logpdf(paths.x[:, following], prediction.mean[:, following], deviation)
     known = replace(
         paths.starting_from(prediction.given), observed=paths.observed & prediction.given
     )
-    model, noise = Followers(law(), known, ["lin.v0"]), PushNoise()
+    model, noise = Followers(lin().double(), known, ["lin.v0"]), PushNoise()
     variances = replace(
         initial_variances(model),
         noise=np.array(list(NOISE.values())),
