@@ -52,7 +52,7 @@ class BenchmarkConfig:
 class DiscoveryBenchmarkOptions:
     """The cases of ``scripts/benchmark_discovery.py``, see :mod:`benchmarks.discovery.run`."""
 
-    # synthetic | rules (synthetic cases under changed rules) | advice | laws | sumo | jupedsim
+    # synthetic | rules (the same with other thresholds) | advice | laws | sumo | jupedsim
     # | recovery (parameters that are typed into programs, one case each)
     kinds: list[str] = field(default_factory=lambda: ["synthetic"])
     seeds: int = 10  # per effect, pair or fault, per law or scene
@@ -71,8 +71,6 @@ class DiscoveryBenchmarkOptions:
     strengths: list[str] = field(default_factory=lambda: ["medium"])  # weak medium strong full
     noises: list[float] | None = None  # m; null: 0.05 in traffic, 0.01 in crowds
     sizes: list[int] = field(default_factory=lambda: [20])  # numbers of platoons or crowds
-    structure: bool = True  # search for structure without a name too; else nothing is unknown
-    fresh: int = 0  # further sequences of the same truth, on which the named effects are tested
     baseline_seeds: int = 3  # per effect, pair, ...: regressions on the same columns
     workers: int | None = None  # processes; null: one per core
     # address of a Dask scheduler, such as tcp://host:8786, whose workers do the work instead

@@ -6,7 +6,8 @@ parameters are log-normal (``lin``: v0; ``idm``: T and v0; ``fvdm``: s_c and v0)
 deviation of ``--spread`` %, pushes last 4 s, and positions are measured with errors of ``--error``
 m. ``--nature`` departs from this. Paths are integrated here by Euler's method; everything else is
 the package's public interface. The cases of a run are fixed by its seed. The table has a row per
-case; what is printed last counts them. ``--compare`` only compares laws.
+case; the last lines count right and false answers, with exact intervals of 95 %. ``--compare`` only
+compares laws.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ import pandas as pd
 
 import nnode
 from benchmarks.discovery.run import sources
+from benchmarks.discovery.verdicts import verdicts
+from benchmarks.synthetic_cases.score import covers, judged
 from nnode.app.nearest_law import candidates
 from nnode.app.python.inputs import model_options
 from nnode.discover import thresholds
@@ -258,49 +261,27 @@ def cases(
 
 
 def diagnosed(**case: Any) -> dict[str, Any]:
-    """The case with its diagnosis."""
+    """The case with its diagnosis, and intervals of sizes and of differences between drivers."""
     begun, table = time.monotonic(), platoons(**case)
-    found = nnode.diagnose(
+    report = nnode.diagnose(
         table,
         "traffic",
         model=case["law"],
         options=DiscoverOptions(page=False, replay=False, compare=[]),
     ).plain()
-    names = [one["name"] for one in found["effects"]]
-    others = {other["name"] for one in found["effects"] for other in one["alternatives"]}
     sizes = _sizes(case["law"], case["effect"])
-    hidden = set(sizes)
     intervals = {
-        one["name"]: next(iter(one["coefficients"].values()))
-        for one in found["effects"]
-        if one["name"] in hidden
+        effect["name"]: next(iter(effect["coefficients"].values())) for effect in report["effects"]
+    } | {
+        each["name"]: {"value": each["estimate"], "low": each["lower"], "high": each["upper"]}
+        for each in report["drivers"]
     }
-    drivers = {one["name"]: one for one in found["drivers"]}
-    return {
-        **case,
-        "verdict": found["verdict"],
-        "names": " ".join(names),
-        "others": " ".join(sorted(others)),
-        "exact": set(names) == hidden
-        and not others
-        and found["verdict"] == ("named" if hidden else "none"),
-        "among": hidden <= set(names) | others,
-        "false": bool(set(names) - hidden),
-        "size": " ".join(f"{size:g}" for size in sizes.values()),
-        "estimate": " ".join(
-            f"{intervals[name]['value']:.3g}" if name in intervals else "-" for name in sizes
-        ),
-        "covered": " ".join(_covers(intervals.get(name), size) for name, size in sizes.items()),
-        **{
-            f"{name} (%)": round(drivers[name]["estimate"], 1) if name in drivers else 0.0
-            for name in ("v0", "T")
-        },
-        **{
-            f"{name} covered": _covers(drivers.get(name), value, "lower", "upper")
-            for name, value in _variations(case).items()
-        },
-        "seconds": round(time.monotonic() - begun, 1),
-    }
+    row = {**case, "hidden": bool(sizes), **judged(report, list(sizes))}
+    for name, true in {**sizes, **_variations(case)}.items():
+        interval = intervals.get(name, {"value": None, "low": None, "high": None})
+        row[name], row[f"{name}, true"] = interval["value"], true
+        row[f"{name} covered"] = covers(interval["low"], interval["high"], true)
+    return {**row, "seconds": round(time.monotonic() - begun, 1)}
 
 
 def compared(**case: Any) -> dict[str, Any]:
@@ -313,13 +294,13 @@ def compared(**case: Any) -> dict[str, Any]:
     rejected = p_values[case["law"]] <= thresholds.STRICT
     return {
         **case,
+        "hidden": case["effect"] != "none",
         "first": first,
         "second": second,
         "p second": p_values[second],
         "p true": p_values[case["law"]],
-        "exact": first == case["law"],
-        "among": not rejected,
-        "false": rejected,
+        "true law first": first == case["law"],
+        "true law rejected": rejected,
         "seconds": round(time.monotonic() - begun, 1),
     }
 
@@ -331,15 +312,6 @@ def _variations(case: dict[str, Any]) -> dict[str, float]:
         "push": PUSH[case["law"]],
         "push_time": LASTS,
     }
-
-
-def _covers(
-    interval: dict[str, Any] | None, value: float, low: str = "low", high: str = "high"
-) -> str:
-    """Whether an interval of 95 % contains the true value; ``-`` where there is no interval."""
-    if interval is None or not all(np.isfinite(interval[end] or np.nan) for end in (low, high)):
-        return "-"
-    return "yes" if interval[low] <= value <= interval[high] else "no"
 
 
 def main() -> None:
@@ -377,8 +349,7 @@ def main() -> None:
     table = pd.DataFrame(list(results.values()))
     print(table.to_string(index=False))
     write_text(given.table, str(table.to_csv(index=False)))
-    counts = table.groupby(["law", table.effect != "none"])[["exact", "among", "false"]]
-    print(counts.agg(["sum", "count"]).to_string())
+    print(verdicts(table, ["law", "hidden"]).to_string(index=False))
     print(f"table: {given.table}")
 
 

@@ -93,7 +93,11 @@ def baselines_on_table(
         reports[name] = {
             "verdict": "named" if names else "none",
             "effects": [{"name": n, "coefficients": {}, "alternatives": []} for n in names],
-            "gap": {"before": before, "after": after, "noise_floor": floor},
+            "gap": {
+                "before": before,
+                "after": after,
+                "closed": (before - after) / (before - floor),
+            },
             "split": {"sealed": [sequences[i].name for i in confirmation]},
         }
     return reports

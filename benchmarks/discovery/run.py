@@ -1,8 +1,7 @@
 """Cases with a known truth, diagnosed or calibrated: ``scripts/benchmark_discovery.py``.
 
-A kind of cases is a module with ``cases``, the arguments of the cases that the options ask for,
-with ``evaluate``, which computes one case, and with ``blocks``, the part of the page about
-finished cases. All kinds share the runner, the seeds and the page.
+A kind of cases is a module with ``cases``, the arguments of the cases that the options ask for, and
+``evaluate``, the rows of one case. Rows go to a CSV file, and one table counts their answers.
 """
 
 from __future__ import annotations
@@ -13,25 +12,44 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, cast
 
+import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 import nnode
 from benchmarks.config import DiscoveryBenchmarkOptions
+from benchmarks.discovery.verdicts import verdicts
 from benchmarks.synthetic_cases.arms import first_seed
 from nnode.errors import ConfigError
 from nnode.machine import cores, how_made
-from nnode.pages.page import Block, Provenance, write_page
+from nnode.pages.page import Block, Heading, Provenance, TableBlock, write_page
 from studies.runner import Task, kept_results, run_tasks
 
 #: Modules of this folder by the kinds of cases.
 KINDS = {
     "synthetic": "synthetic",
-    "rules": "rules",
+    "rules": "synthetic",
     "advice": "advice",
     "laws": "worlds",
     "sumo": "worlds",
     "jupedsim": "worlds",
     "recovery": "recovery",
+}
+#: Tables of rows, and the columns by which their answers are counted.
+TABLES = {
+    "synthetic": (
+        "domain",
+        "arm",
+        "variant",
+        "strength",
+        "noise",
+        "n_sequences",
+        "method",
+        "thresholds",
+    ),
+    "coefficients": ("domain", "effect", "coefficient"),
+    "worlds": ("program", "diagnosed"),
+    "advice": ("data",),
+    "recovery": ("simulated by", "law here"),
 }
 #: Folders on which a result depends: it is computed again when they have changed.
 _FOLDERS = (
@@ -53,13 +71,8 @@ class Kind(Protocol):
         ...
 
     @staticmethod
-    def evaluate(**arguments: Any) -> dict[str, Any]:
-        """The row of one case, plain JSON."""
-        ...
-
-    @staticmethod
-    def blocks(rows: list[dict[str, Any]]) -> list[Block]:
-        """The part of the page about some rows."""
+    def evaluate(**arguments: Any) -> dict[str, list[dict[str, Any]]]:
+        """Rows of one case by table of :data:`TABLES`, plain JSON."""
         ...
 
 
@@ -105,22 +118,26 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
         cluster=options.cluster,
         title="cases",
     )
-    rows = [
-        row
-        for row in kept_results(folder, evaluate, code).values()
-        if row["seeds_of"] == options.seeds_of
-    ]
+    kept = {
+        key: case["tables"]
+        for key, case in kept_results(folder, evaluate, code).items()
+        if case["seeds_of"] == options.seeds_of
+    }
     blocks: list[Block] = []
-    for name in dict.fromkeys(KINDS.values()):
-        part = [row for row in rows if KINDS[row["kind"]] == name]
-        if part:
-            blocks += module_of(part[0]["kind"]).blocks(part)
+    for name, by in TABLES.items():
+        rows = pd.DataFrame(
+            [{"key": key, **row} for key, tables in kept.items() for row in tables.get(name, ())]
+        )
+        if len(rows):
+            counted = verdicts(rows, by)
+            caption = "Shares with exact intervals of 95 %. The file holds one line per row."
+            blocks += [Heading(name), TableBlock(name, counted, caption, full=rows)]
     origin = "development: rules may have changed after these cases were seen"
     if options.seeds_of is not None:
         origin = f"from the hash of the commit that froze the rules, {options.seeds_of}"
     seconds = time.monotonic() - start
     facts = {
-        "Cases": f"{len(rows)}, {origin}",
+        "Cases": f"{len(kept)}, {origin}",
         "Code": f"digest {code}",
         "Time": f"{seconds:.0f} s in this run with {workers} worker process(es)",
         **how_made(_PACKAGES),
@@ -136,8 +153,8 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
 
 
 def evaluate(kind: str, seeds_of: str | None, arguments: dict[str, Any]) -> dict[str, Any]:
-    """The row of one case of a kind."""
-    return {"kind": kind, "seeds_of": seeds_of, **module_of(kind).evaluate(**arguments)}
+    """The rows of one case of a kind, by table."""
+    return {"seeds_of": seeds_of, "tables": module_of(kind).evaluate(**arguments)}
 
 
 def sources() -> str:

@@ -104,12 +104,10 @@ SCENES: dict[str, Scene] = {
     "idm_late": IDM(_SOON, more={"actionStepLength": (0.8, 1.5)}),
     "krauss_late": KRAUSS(_SOON, more={"actionStepLength": (0.8, 1.5)}),
     "idm_trucks": IDM(_says("idm", "vehicle_class"), trucks=0.4),
-    "idm_drivers": IDM(_says("idm", "driver_heterogeneity"), each={"tau": (0.7, 2.2)}),
+    # drivers who differ are part of the model, and no effect
+    "idm_drivers": IDM(_says("idm"), each={"tau": (0.7, 2.2)}),
     "krauss_dawdling": KRAUSS(more={"sigma": (0.3, 0.7)}),
-    # who is held up by a leader hardly shows how fast he would like to drive: silence is right
-    "krauss_factors": KRAUSS(
-        Answer(allowed=("driver_heterogeneity",)), limit=(17.0, 20.0), deviation=0.15
-    ),
+    "krauss_factors": KRAUSS(limit=(17.0, 20.0), deviation=0.15),
     # a stop at one place and time, and cars that nobody measured, are in no catalogue
     "idm_light": IDM(_ELSEWHERE, red=True),
     "krauss_light": KRAUSS(_ELSEWHERE, red=True),

@@ -22,7 +22,6 @@ _COMMIT = re.compile(r"[0-9a-f]{40}([0-9a-f]{24})?")
 #: Effects that act in different places, times or variables, so that both can be told.
 TRAFFIC_PAIRS = (
     ("relative_speed", "speed_zone"),
-    ("relative_speed", "driver_heterogeneity"),
     ("relative_speed", "multi_anticipation"),
     ("multi_anticipation", "speed_period"),
     ("multi_anticipation", "vehicle_class"),

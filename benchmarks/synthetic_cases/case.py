@@ -21,7 +21,7 @@ STRENGTHS: dict[str, float] = {"weak": 0.15, "medium": 0.40, "strong": 0.70, "fu
 ARMS: dict[str, str] = {
     "single": "one effect of the catalogue: name it",
     "pair": "two effects of the catalogue: name both",
-    "nothing": "nothing hidden: name nothing, except heterogeneity where agents do differ",
+    "nothing": "nothing hidden: name nothing, except heterogeneity where people do differ",
     "outside": "an effect that the catalogue lacks: say unknown",
     "near_miss": "an effect of the catalogue in another shape: name it",
     "no_excitation": "an effect that these data cannot show: say that it is not testable",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
-#: Verdicts; under every other one the effects of a report are names. ``error``: the diagnosis
-#: failed.
-NAMED, EQUALS, UNKNOWN, ERROR = "named", "indistinguishable", "unknown", "error"
+import numpy as np
+
+#: Verdicts; ``error``: the diagnosis failed.
+NAMED, NONE, EQUALS, UNKNOWN, ERROR = "named", "none", "indistinguishable", "unknown", "error"
 #: Error probability of each test of a diagnosis.
 LEVEL = 0.05
 #: Edges of an interval on the road or in time; their error shows in the overlap.
@@ -22,123 +23,146 @@ NEAR = 1.0
 _LOWEST_SHARE = 0.05
 
 Content = dict[str, Any]
+#: What a report lacks that names nothing.
+EMPTY: Content = {
+    "effects": [],
+    "leads": [],
+    "gap": None,
+    "screen": {"p_value": None},
+    "clusters": {"open": None},
+    "split": {"sealed": []},
+    "data_faults": [],
+    "not_testable": [],
+}
+
+
+def judged(
+    report: Content,
+    hidden: Collection[str],
+    allowed: Collection[str] = (),
+    classes: Mapping[str, str] | None = None,
+) -> Content:
+    """The verdict of a report, and whether its names are right.
+
+    Args:
+        report: content of ``report.json``.
+        hidden: effects that should all be named.
+        allowed: effects that may be named as well.
+        classes: effect to its class of effects that data often cannot distinguish; empty: none.
+
+    Returns:
+        * ``verdict``, ``named``, ``hypotheses``, and ``hypothesis``: there is one;
+        * ``exact``: the names are the hidden effects, beside allowed ones, and the verdict is
+          ``named``, or ``none`` where nothing is hidden;
+        * ``among_equals``: the verdict is ``indistinguishable``, and the hidden effects are those
+          that are listed, or among their equals;
+        * ``class_right``: under these verdicts, names and hidden effects match one to one within
+          their classes, or as equals;
+        * ``false_names``: names that are neither hidden nor allowed, nor have such an effect among
+          their equals; ``false_name``: there is one;
+        * ``missing``: hidden effects that are neither named nor among the equals of a name;
+        * ``unknown``: the verdict is ``unknown``, and nothing is named.
+    """
+    classes = classes or {}
+    verdict, true = report["verdict"], {*hidden, *allowed}
+    equals = {item["name"]: {o["name"] for o in item["alternatives"]} for item in report["effects"]}
+    counted = [name for name in equals if name not in allowed or name in hidden]
+    false = [name for name in equals if name not in true and not true & equals[name]]
+    listed = set(equals).union(*equals.values())
+
+    def same_class(name: str, other: str) -> bool:
+        return other in equals[name] or classes.get(name, "") == classes.get(other) != ""
+
+    return {
+        "verdict": verdict,
+        "named": "+".join(equals),
+        "hypotheses": "+".join(item["name"] for item in report["leads"]),
+        "hypothesis": bool(report["leads"]),
+        "exact": verdict == (NAMED if hidden else NONE) and set(counted) == set(hidden),
+        "among_equals": verdict == EQUALS
+        and _matched(hidden, counted, lambda name, other: other in equals[name]),
+        "class_right": verdict in (NAMED, EQUALS) and _matched(hidden, counted, same_class),
+        "false_names": "+".join(false),
+        "false_name": bool(false),
+        "missing": "+".join(name for name in hidden if name not in listed),
+        "unknown": verdict == UNKNOWN and not equals,
+    }
+
+
+def _matched(
+    hidden: Collection[str], names: Collection[str], alike: Callable[[str, str], bool]
+) -> bool:
+    """Whether hidden and named effects match one to one, by name or as ``alike`` says."""
+    # exact names first: others must not use them up
+    missing = [name for name in hidden if name not in names]
+    for name in set(names) - set(hidden):
+        match = next((other for other in missing if alike(name, other)), None)
+        if match is None:
+            return False
+        missing.remove(match)
+    return not missing
 
 
 def score(truth: Content, report: Content, classes: Mapping[str, str]) -> Content:
-    """One row of the benchmark, in plain JSON.
+    """The row of a synthetic case, in plain JSON.
 
     Args:
         truth: content of ``truth.json``.
-        report: content of the diagnosis's ``report.json``.
-        classes: effect to its class of effects that data often cannot distinguish; empty, or left
-            out: it has none.
+        report: content of the diagnosis's ``report.json``; it may lack what :data:`EMPTY` has.
+        classes: as in :func:`judged`.
 
     Returns:
-        The case (``domain``, ``arm``, ``hidden``, ...), the report (``verdict``, ``named``, and
-        ``leads``, the hypotheses), and:
+        The case (``domain``, ``arm``, ``hidden``, ...), the columns of :func:`judged`, and:
 
-        * ``exact``: the verdict is ``named``, and the names are exactly the hidden effects, with or
-          without the nuisance of the arm; None where the catalogue does not have what is hidden, or
-          these data cannot show it;
-        * ``among_equals``: the verdict is ``indistinguishable``, and the hidden effects are those
-          that are listed, or among their equals; None as above;
-        * ``class_right``: under these two verdicts, names and hidden effects match one to one
-          within their classes, or as equals;
-        * ``false_names``: names that are neither hidden nor a nuisance of the arm; under
-          ``indistinguishable`` only those without a hidden effect among their equals;
-        * ``unknown``: the verdict is ``unknown``, and nothing is named;
-        * ``right``: the right answer of the arm was given;
-        * ``faults_hidden``, ``faults_located``, ``faults_false``;
-        * ``coefficients``: rows of effect, name, true and estimated value, interval, errors;
+        * ``right``: the right answer of the arm was given. ``exact``, ``among_equals`` and
+          ``class_right`` are None where the catalogue does not have what is hidden, or these data
+          cannot show it;
+        * ``located``: all faults of the data are located; ``blamed``: a sequence without a fault
+          is reported;
         * ``overlap``: of the estimated with the true interval of a zone or period;
-        * ``closure``: part of the cost on confirmation sequences that the diagnosis removes,
-          relative to the truth; ``worse``: whether this cost increased;
+        * ``before`` and ``after``: errors on confirmation sequences, m²; ``worse``: they
+          increased; ``closure``: see :func:`closure`;
         * ``screen_p``; ``screen_false``: an effect that is neither hidden nor a nuisance is
           significant at :data:`LEVEL` in the first screen; None without a p-value;
-        * ``clusters_open``: number of exploration clusters.
+        * ``clusters``: number of exploration clusters.
     """
-    case, verdict = truth["case"], str(report["verdict"])
-    hidden = [item["name"] for item in truth["effects"]]
-    named = report.get("effects", [])
-    names, leads = (_names(items) for items in (named, report.get("leads", ())))
-    equals = {item["name"]: _names(item.get("alternatives", ())) for item in named}
-    asked = hidden if case["arm"] in ("single", "pair", "near_miss") else []
-    true = {*asked, *_names(truth["nuisance"])}
-    false = [
-        name
-        for name in names
-        if name not in true and not (verdict == EQUALS and true & set(equals[name]))
-    ]
-
-    def matched(alike: Callable[[str, str], bool]) -> bool:
-        return _matched(asked, [n for n in names if n not in true or n in asked], alike)
-
-    def akin(name: str, other: str) -> bool:
-        return other in equals[name] or (
-            bool(classes.get(name)) and classes[name] == classes.get(other)
-        )
-
-    measured: dict[str, bool | None] = {
-        "exact": verdict == NAMED and matched(lambda n, t: False),
-        "among_equals": verdict == EQUALS and matched(lambda n, t: t in equals[n]),
-        "class_right": verdict in (NAMED, EQUALS) and matched(akin),
-    }
-    gap, screen = report.get("gap") or {}, report.get("screen") or {}
-    p_value = screen.get("p_value")
-    row: Content = {
-        "key": truth["key"],
-        **{name: case[name] for name in ("domain", "arm", "variant", "strength", "noise")},
-        **{name: case[name] for name in ("n_sequences", "seed")},
-        "hidden": "+".join(case["effects"]) or "nothing",
-        "reached": truth["strength"]["reached"],
-        "verdict": verdict,
-        "named": "+".join(names) or "nothing",
-        "leads": "+".join(leads),
-        **(measured if asked else dict.fromkeys(measured)),
-        "false_names": false,
-        "unknown": verdict == UNKNOWN and not names,
-        **located_faults(truth["data_faults"], report.get("data_faults", [])),
-        "coefficients": coefficient_rows(truth["effects"], named),
-        "overlap": overlap(truth["effects"], named),
-        "before": gap.get("before"),
-        "after": gap.get("after"),
-        # a model to which nothing was added is as good as before, up to rounding
-        "worse": bool(gap["after"] > gap["before"] * (1 + 1e-9)) if gap else None,
-        "closure": closure(truth, report) if gap else None,
-        "screen_p": p_value,
-        "screen_false": None
-        if p_value is None
-        else bool(p_value <= LEVEL and screen["effect"] not in true),
-        "clusters_open": (report.get("clusters") or {}).get("open"),
-    }
+    report, case = {**EMPTY, **report}, truth["case"]
+    hidden, nuisance = ([e["name"] for e in truth[k]] for k in ("effects", "nuisance"))
+    to_name = hidden if case["arm"] in ("single", "pair", "near_miss") else []
+    row = judged(report, to_name, nuisance, classes)
+    if not to_name:
+        row |= dict.fromkeys(("exact", "among_equals", "class_right", "missing"))
+    faults = located_faults(truth["data_faults"], report["data_faults"])
+    screen, gap = report["screen"], report["gap"]
+    significant = screen["p_value"] is not None and screen["p_value"] <= LEVEL
     if case["arm"] == "outside":
         right = row["unknown"]
-    elif asked:
+    elif to_name:
         right = row["exact"]
     elif case["arm"] == "no_excitation":
-        right = not false and set(hidden) <= set(_names(report.get("not_testable", ())))
+        right = not row["false_name"] and set(hidden) <= set(report["not_testable"])
     else:
-        right = not false and not row["faults_false"]
-        right = right and row["faults_located"] == row["faults_hidden"]
-    return {**row, "right": bool(right)}
-
-
-def _names(items: Iterable[Any]) -> list[str]:
-    """Names of effects, given as they are or as objects with a name."""
-    return [str(item["name"]) if isinstance(item, dict) else str(item) for item in items]
-
-
-def _matched(asked: list[str], names: list[str], alike: Callable[[str, str], bool]) -> bool:
-    """Whether hidden and named effects match one to one, by name or as ``alike`` says."""
-    left = list(asked)
-    # exact names first: others must not use them up
-    for fits in (str.__eq__, alike):
-        for name in list(names):
-            match = next((truth for truth in left if fits(name, truth)), None)
-            if match is not None:
-                left.remove(match)
-                names = [other for other in names if other != name]
-    return not left and not names
+        right = not row["false_name"] and not faults["blamed"] and faults["located"] is not False
+    return {
+        **{name: case[name] for name in ("domain", "arm", "variant", "strength", "noise")},
+        **{name: case[name] for name in ("n_sequences", "seed")},
+        "hidden": "+".join(case["effects"]),
+        "reached": truth["strength"]["reached"],
+        "right": right,
+        **row,
+        **faults,
+        "overlap": overlap(truth["effects"], report["effects"]),
+        "before": gap and gap["before"],
+        "after": gap and gap["after"],
+        # a model to which nothing was added is as good as before, up to rounding
+        "worse": gap and gap["after"] > gap["before"] * (1 + 1e-9),
+        "closure": gap and closure(truth, report),
+        "screen_p": screen["p_value"],
+        "screen_false": None
+        if screen["p_value"] is None
+        else significant and screen["effect"] not in {*to_name, *nuisance},
+        "clusters": report["clusters"]["open"],
+    }
 
 
 def tail(name: str) -> str:
@@ -166,12 +190,9 @@ def coefficient_rows(hidden: list[Content], named: list[Content]) -> list[Conten
     """
     rows = []
     for name, values, estimates in _coefficients(hidden, named):
-        for key, true in values.items():
-            estimate = estimates.get(key) or {}
-            value, low, high = (estimate.get(k) for k in ("value", "low", "high"))
-            if value is None:
-                continue
-            error = abs(value - true)
+        for key in (key for key in values if key in estimates):
+            true, estimate = values[key], estimates[key]
+            error = abs(estimate["value"] - true)
             sizes = {"relative": abs(true), "of_size": abs(true - NEUTRAL.get(key, 0.0))}
             place = key in PLACES.get(name, ())
             rows.append(
@@ -179,15 +200,21 @@ def coefficient_rows(hidden: list[Content], named: list[Content]) -> list[Conten
                     "effect": name,
                     "coefficient": key,
                     "true": true,
-                    "value": value,
-                    "low": low,
-                    "high": high,
+                    "value": estimate["value"],
+                    "low": estimate["low"],
+                    "high": estimate["high"],
                     "absolute": error,
                     **{k: error / s if s > 0 and not place else None for k, s in sizes.items()},
-                    "covered": None if low is None or high is None else low <= true <= high,
+                    "covered": covers(estimate["low"], estimate["high"], true),
                 }
             )
     return rows
+
+
+def covers(low: float | None, high: float | None, value: float) -> bool | None:
+    """Whether an interval contains a value; None without an interval."""
+    ends = np.array([low, high], dtype=float)
+    return bool(ends[0] <= value <= ends[1]) if np.isfinite(ends).all() else None
 
 
 def overlap(hidden: list[Content], named: list[Content]) -> float | None:
@@ -206,7 +233,7 @@ def overlap(hidden: list[Content], named: list[Content]) -> float | None:
 
 
 def located_faults(hidden: list[Content], reported: list[Content]) -> Content:
-    """How many hidden faults were located, and how many sequences were reported without a fault.
+    """Whether all hidden faults were located (None without one), and a sound sequence blamed.
 
     Located: the sequence, at least one of the agents, and the time to within 1 s. Agents may be
     given by name or by their number in the sequence.
@@ -222,51 +249,25 @@ def located_faults(hidden: list[Content], reported: list[Content]) -> Content:
         )
 
     wrong = {tail(f["sequence"]) for f in reported} - {tail(f["sequence"]) for f in hidden}
-    return {
-        "faults_hidden": len(hidden),
-        "faults_located": sum(any(located(f, item) for item in reported) for f in hidden),
-        "faults_false": len(wrong),
-    }
+    every = all(any(located(fault, item) for item in reported) for fault in hidden)
+    return {"located": every if hidden else None, "blamed": bool(wrong)}
 
 
 def closure(truth: Content, report: Content) -> float | None:
-    """The removed part of the cost on confirmation sequences, relative to that of the truth.
+    """The share of the excess error that the diagnosis removed on confirmation sequences, relative
+    to the share that the truth removes there.
 
-    In traffic both are compared on the report's own scale. A crowd's costs depend on the estimated
-    initial states: models are simulated again with the reported coefficients, or, where this is
-    impossible, shares of each one's own excess are compared. None without an effect, or where the
-    truth removes next to nothing on these sequences.
+    The excess is what exceeds the error of measurement. Both shares are those of their own costs:
+    those of a diagnosis depend on its leaders and estimated starts, those of the truth do not. None
+    without an effect, or where the truth removes next to nothing on these sequences.
     """
-    sealed = {tail(name) for name in (report.get("split") or {}).get("sealed", ())}
+    sealed = {tail(name) for name in report["split"]["sealed"]}
     cost = truth["cost"]
     if cost is None or truth["case"]["arm"] == "no_excitation":
         return None
-    places = [i for i, name in enumerate(cost["oracle"]) if tail(name) in sealed]
-    if not places:
+    names = [name for name in cost["oracle"] if tail(name) in sealed]
+    if not names:
         return None
-    base, best = (
-        sum(list(cost[name].values())[i] for i in places) / len(places)
-        for name in ("base", "oracle")
-    )
-    before, after = report["gap"]["before"], report["gap"]["after"]
-    if truth["case"]["domain"] == "traffic":
-        return _of_possible(before, after, best, cost["floor"])
-    # imported here: compiled code is loaded for crowds alone
-    from benchmarks.synthetic_cases.crowd.closure import crowd_costs
-
-    costs = crowd_costs(truth, report, places)
-    if costs is not None:
-        return _of_possible(*costs, cost["floor"])
-    possible = (base - best) / max(base - cost["floor"], 1e-300)
-    excess = before - (report["gap"].get("noise_floor") or 0.0)
-    if possible < _LOWEST_SHARE or excess <= 0:
-        return None
-    return float((before - after) / excess / possible)
-
-
-def _of_possible(before: float, after: float, best: float, floor: float) -> float | None:
-    """The removed part of what can be removed."""
-    possible = before - best
-    if possible <= max(_LOWEST_SHARE * (before - floor), 0.0):
-        return None
-    return (before - after) / possible
+    base, best = (sum(cost[model][name] for name in names) for model in ("base", "oracle"))
+    possible = (base - best) / max(base - len(names) * cost["floor"], 1e-300)
+    return float(report["gap"]["closed"] / possible) if possible >= _LOWEST_SHARE else None

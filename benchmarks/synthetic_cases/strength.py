@@ -214,8 +214,7 @@ def set_strength(subject: Subject, rng: np.random.Generator, limits: Range) -> A
     silent = case.arm == "no_excitation" or case.variant == "white"
     if silent or (case.effects and share == 1.0):
         return Amplitude(share=share, value=0.0)
-    if not case.effects or "leader_speed" in case.effects:
-        # a leader at the wrong speed is beyond all noise that could be set against it
+    if not case.effects:
         value = float(rng.uniform(*limits.idle))
         subject.truth = replace(subject.truth, amplitude=value)
         return Amplitude(share=share, value=value)

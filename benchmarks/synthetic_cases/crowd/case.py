@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.synthetic_cases.case import STRENGTHS, Case, check_effects
+from benchmarks.synthetic_cases.case import Case, check_effects
 from benchmarks.synthetic_cases.crowd import catalogue
 from benchmarks.synthetic_cases.crowd.catalogue import EFFECTS, Coefficients
 from benchmarks.synthetic_cases.crowd.motion import Base, Hidden, simulate
 from benchmarks.synthetic_cases.crowd.replay import Windows, cost_by_sequence
 from benchmarks.synthetic_cases.crowd.scene import BURN_IN, SUBSTEPS, Scene, set_scene
-from benchmarks.synthetic_cases.strength import Amplitude, Costs, Range, Subject, set_strength
+from benchmarks.synthetic_cases.strength import Costs, Range, Subject, set_strength
 
 #: Standard deviation of people's accelerations, m/s².
 AMPLITUDES = Range(preferred=(0.02, 0.15), extreme=(0.005, 0.35), idle=(0.04, 0.15), probe=0.02)
@@ -56,10 +56,6 @@ class Truth:
 class CrowdCase(Subject):
     """A case of crowds: draws what is hidden, sets its strength, and measures.
 
-    Args:
-        case: what is asked for.
-        truth: what acts, where it is known already; None draws it.
-
     Attributes:
         scene: the people and the corridor.
 
@@ -67,17 +63,13 @@ class CrowdCase(Subject):
         ConfigError: an effect that crowds do not know.
     """
 
-    def __init__(self, case: Case, truth: Truth | None = None) -> None:
+    def __init__(self, case: Case) -> None:
         check_effects(case, EFFECTS)
         self.case, self.catalogue, self.unit = case, catalogue, "m/s²"
         self.scene: Scene = set_scene(case)
         self.clocks, self.correlation = self.scene.clocks, self.scene.correlation
         self.walls = self.scene.segments
         self._some = list(range(min(_SOME, case.n_sequences)))
-        if truth is not None:
-            self.truth = truth
-            self.amplitude = Amplitude(STRENGTHS[case.strength], truth.amplitude)
-            return
         rng = case.generator("effects")
         effects = {name: EFFECTS[name].draw(rng, self.scene.width) for name in case.effects}
         if case.variant == "heterogeneous":

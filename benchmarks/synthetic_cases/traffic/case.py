@@ -12,6 +12,7 @@ from benchmarks.synthetic_cases.strength import Costs, Range, Subject, set_stren
 from benchmarks.synthetic_cases.traffic import catalogue
 from benchmarks.synthetic_cases.traffic.catalogue import (
     EFFECTS,
+    NUISANCE,
     SMOOTH_EDGE,
     Coefficients,
 )
@@ -21,8 +22,6 @@ from benchmarks.synthetic_cases.traffic.road import BURN_IN, SUBSTEPS, Road, lay
 
 #: Standard deviation of drivers' velocities, m/s.
 AMPLITUDES = Range(preferred=(0.02, 0.6), extreme=(0.005, 1.5), idle=(0.1, 0.4), probe=0.05)
-#: Standard deviation of the factor on W where drivers differ and that is a nuisance.
-_NUISANCE = (0.04, 0.1)
 #: Largest product of a delay and W' that may occur.
 _STABLE = 0.4
 #: Effects that make vehicles react late, and their coefficients in s.
@@ -89,7 +88,7 @@ class TrafficCase(Subject):
         if late:
             around = surroundings(case, late)
         if case.variant == "heterogeneous":
-            effects["driver_heterogeneity"] = {"sigma": float(rng.uniform(*_NUISANCE))}
+            effects |= {name: nuisance.draw(rng, around) for name, nuisance in NUISANCE.items()}
         edge = 0.0
         if case.variant == "smooth":
             edge = float(rng.uniform(*SMOOTH_EDGE[case.effects[0]]))
@@ -109,8 +108,7 @@ class TrafficCase(Subject):
 
     def base(self) -> dict[str, Any]:
         around = self.road.around
-        leader = "constant" if "leader_speed" in self.case.effects else "measured"
-        model = {"name": around.law, "leader": leader, "options": {}}
+        model = {"name": around.law, "options": {}}
         return {"model": model, "base": {"v0": around.v0, "L": around.L}}
 
     def more(self) -> dict[str, Any]:
@@ -156,9 +154,8 @@ class TrafficCase(Subject):
 
     def recording(self, x: np.ndarray) -> Recording:
         """Positions as a model is compared with them."""
-        constant = "leader_speed" in self.case.effects
         around = self.road.around
-        return Recording(x, around.clocks, self.case.dt, around.law, constant)
+        return Recording(x, around.clocks, self.case.dt, around.law)
 
     def base_cost(self, x: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
         """``(S,)`` cost (m²) of the recalibrated base law, and its v0 and L."""
@@ -174,9 +171,8 @@ class TrafficCase(Subject):
         """
         past_x, past_v = motion.past
         moved = past_x + (x[:, :1] - past_x[:, -1:])
-        recording = replace(self.recording(x), constant=False)
         around = self.road.around
-        error = recording.errors(
+        error = self.recording(x).errors(
             around.v0, around.L, truth.hidden, self.own(truth), (moved, past_v), SUBSTEPS
         )
         return cost_by_sequence(error)

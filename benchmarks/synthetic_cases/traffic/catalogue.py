@@ -157,7 +157,7 @@ def _bump(rng: np.random.Generator, around: Surroundings) -> Coefficients:
     }
 
 
-#: Effects of the catalogue.
+#: Effects of the catalogue that a diagnosis can name where drivers may differ.
 CATALOGUE: dict[str, Effect] = {
     "relative_speed": _simple(
         "W + kappa (v_a - W)",
@@ -190,26 +190,12 @@ CATALOGUE: dict[str, Effect] = {
         reach=(0.75, 0.97),
         fields={},
     ),
-    "driver_heterogeneity": _simple(
-        "(1 + eta_i) W, eta_i normal of mean 0 and standard deviation sigma",
-        "sigma",
-        (0.05, 0.12),
-        reach=(0.02, 0.12),
-        fields={},
-    ),
     "free_flow_speed": Effect(
         formula="min(W, v_max)",
         units={"v_max": "m/s"},
         draw=_top_speed,
         rescaled=_nearer_top,
         fields={"v_max": "v_max"},
-    ),
-    "leader_speed": Effect(
-        formula="the leader drives as recorded, not at v0",
-        units={"weight": "1"},
-        draw=lambda _rng, _around: {"weight": 1.0},
-        rescaled=None,
-        fields={},
     ),
     # two responses have to stay apart: they are left as they were drawn
     "asymmetric_response": Effect(
@@ -261,7 +247,17 @@ OUTSIDE: dict[str, Effect] = {
     ),
 }
 
-EFFECTS: dict[str, Effect] = {**CATALOGUE, **OUTSIDE}
+#: What acts in the variant ``heterogeneous``: the diagnosis estimates it with the law.
+NUISANCE: dict[str, Effect] = {
+    "driver_heterogeneity": _simple(
+        "(1 + eta_i) W, eta_i normal of mean 0 and standard deviation sigma",
+        "sigma",
+        (0.04, 0.1),
+        fields={},
+    )
+}
+
+EFFECTS: dict[str, Effect] = {**CATALOGUE, **OUTSIDE, **NUISANCE}
 
 #: What cannot show while every leader keeps its speed and the platoon is in equilibrium.
 NEEDS_EXCITATION = (

@@ -25,14 +25,12 @@ class Recording:
         clock: ``(S,)`` time of the day of the first sample, s.
         dt: sampling interval, s.
         law: ``lin`` or ``log``.
-        constant: leaders are taken to drive at v0, not as recorded.
     """
 
     x: np.ndarray
     clock: np.ndarray
     dt: float
     law: str
-    constant: bool = False
 
     def errors(
         self,
@@ -57,14 +55,10 @@ class Recording:
         x, step = self.x, self.dt / substeps
         sequences, samples, vehicles = x.shape
         half = np.arange(2 * substeps * (samples - 1) + 1) / (2 * substeps)
-        if self.constant:
-            lead_x = x[:, :1, -1] + v0 * self.dt * half
-            lead_v = np.full_like(lead_x, v0)
-        else:
-            k = np.minimum(half.astype(int), samples - 2)
-            away = np.diff(x[:, :, -1], axis=1)[:, k]
-            lead_x = x[:, k, -1] + away * (half - k)
-            lead_v = away / self.dt
+        k = np.minimum(half.astype(int), samples - 2)
+        away = np.diff(x[:, :, -1], axis=1)[:, k]
+        lead_x = x[:, k, -1] + away * (half - k)
+        lead_v = away / self.dt
         if past is None:
             past = x[:, :1], np.zeros((sequences, 1, vehicles))
         found, _ = simulate(

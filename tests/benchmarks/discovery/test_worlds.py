@@ -6,13 +6,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from benchmarks.config import DiscoveryBenchmarkOptions
 from benchmarks.discovery import jupedsim_scenes, sumo_scenes, worlds
-from benchmarks.discovery.tables import share
-from benchmarks.discovery.worlds import Answer, allowed, criteria
+from benchmarks.discovery.worlds import Answer, allowed
 from benchmarks.programs.sumo import STEP
 from benchmarks.synthetic_cases.laws import RANGES
 from nnode.app import discover
@@ -39,91 +37,45 @@ def test_answers_are_names_of_the_catalogue() -> None:
         kind = "sumo" if domain == "traffic" else "jupedsim"
         assert len(worlds.cases(kind, DiscoveryBenchmarkOptions(seeds=2), 5)) == 2 * len(scenes)
     laws = worlds.cases("laws", DiscoveryBenchmarkOptions(seeds=2), 5)
-    assert [laws[f"laws-idm-s{seed}"]["asked"] for seed in (5, 6)] == ["lin", "idm"]
-
-
-def report(*effects: tuple[str, ...], verdict: str = "named", first: str = "idm") -> dict[str, Any]:
-    """A report that names effects, each with its equals."""
-    named = [{"name": n, "alternatives": [{"name": o} for o in more]} for n, *more in effects]
-    laws = {"ranking": [{"name": first}]}
-    return {"laws": laws, "laws_again": None, "verdict": verdict, "effects": named, "leads": []}
+    assert [laws[f"laws-idm-s{seed}"]["law"] for seed in (5, 6)] == ["lin", "idm"]
 
 
 PILLAR = Answer(right=("obstacle",), allowed=("anticipation",))
 LATE = Answer(right=("reaction_delay", "inertia"), unknown=True)
-DRIVERS = Answer(first=("idm",), right=("driver_heterogeneity",))
 
 
 @pytest.mark.parametrize(
     ("answer", "effects", "verdict", "right", "false"),
     [
-        (PILLAR, [("obstacle",)], "named", True, []),
-        (PILLAR, [("anticipation",), ("attraction", "obstacle")], "named", True, []),
-        (PILLAR, [("anticipation",)], "named", False, []),
-        (PILLAR, [], "unknown", False, []),
-        (PILLAR, [("obstacle",), ("drift",)], "named", False, ["drift"]),
-        (LATE, [("multi_anticipation", "inertia")], "named", True, []),
-        (LATE, [], "unknown", True, []),
-        (LATE, [], "none", False, []),
-        (DRIVERS, [("memory", "lasting_time_gap")], "named", True, []),
-        (DRIVERS, [("memory", "inertia")], "named", False, ["memory"]),
-        (worlds.NOTHING, [], "none", True, []),
+        (PILLAR, [("obstacle",)], "named", True, ""),
+        (PILLAR, [("anticipation",), ("attraction", "obstacle")], "named", True, ""),
+        (PILLAR, [("anticipation",)], "named", False, ""),
+        (PILLAR, [], "unknown", False, ""),
+        (PILLAR, [("obstacle",), ("drift",)], "named", False, "drift"),
+        (LATE, [("multi_anticipation", "inertia")], "named", True, ""),
+        (LATE, [], "unknown", True, ""),
+        (LATE, [], "none", False, ""),
+        (worlds.NOTHING, [], "none", True, ""),
     ],
 )
 def test_right_answers(
-    answer: Answer, effects: list[tuple[str, ...]], verdict: str, right: bool, false: list[str]
+    answer: Answer, effects: list[tuple[str, ...]], verdict: str, right: bool, false: str
 ) -> None:
-    row = answer.judge(report(*effects, verdict=verdict), None)
-    assert (row["right"], row["false"]) == (right, false)
-    assert row["law_right"] is (True if answer.first else None)
-    assert row["names"] == [answer.called(effect) for effect in report(*effects)["effects"]]
-
-
-def test_the_best_fitting_law_and_the_last_ranking_are_judged() -> None:
-    asked = {**report(verdict="unknown", first="gipps")}
-    asked["laws_again"] = {"ranking": [{"name": "krauss"}]}
-    nearest = {**report(("speed_zone",)), "leads": [{"name": "inertia"}]}
-    row = Answer(first=("krauss",), right=("speed_zone",)).judge(asked, nearest)
-    assert (row["first"], row["law_right"], row["right"]) == ("krauss", True, True)
-    assert (row["verdict"], row["asked_verdict"]) == ("named", "unknown")
-    assert (row["names"], row["asked_names"], row["leads"]) == (["speed_zone"], [], ["inertia"])
-    assert not Answer(first=("krauss",)).judge(report(), None)["law_right"]
-
-
-def test_shares_are_counted_by_program() -> None:
-    law = {"program": "laws", "asked": "lin", "asked_false": [], "right": True, "false": []}
-    sumo = {"program": "sumo", "first": "idm", "law_right": False, "right": True, "false": []}
-    rows = [
-        {**law, "first": "idm", "law_right": True},
-        {**law, "first": "idm", "law_right": True, "false": ["inertia"], "right": False},
-        {**law, "first": "fvdm", "law_right": False, "asked_false": ["memory"]},
-        {**law, "first": "lin", "law_right": True, "false": ["memory"], "asked_false": ["memory"]},
-        sumo,
-        {**sumo, "law_right": None},
-    ]
-    table = criteria(rows).set_index("program")
-    assert table.loc["laws", "right law ranks first"].startswith("3 of 4 (75 %")
-    # if the requested law ranks first, there is one diagnosis, not two
-    assert table.loc["laws", "false name"].startswith("3 of 7")
-    assert table.loc["sumo", "right law ranks first"].startswith("0 of 1")
-    assert len(worlds.blocks(rows)) == 3
+    named = [{"name": n, "alternatives": [{"name": o} for o in more]} for n, *more in effects]
+    row = answer.judge({"verdict": verdict, "effects": named, "leads": []})
+    assert (row["right"], row["false_names"]) == (right, false)
 
 
 def test_a_world_of_a_law_is_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
-    said = {**report(("memory",)), "laws_again": None}
-    said["laws"] = {"ranking": [{"name": "lin", "behind": 0.0, "p_value": None}]}
-    answer = SimpleNamespace(plain=lambda: said, nearest=None)
-    monkeypatch.setattr(discover, "diagnose_table", lambda *given, **options: answer)
-    row = worlds.evaluate("laws", "lin", 5, "lin")
-    assert (row["law_right"], row["false"], row["asked_false"]) == (True, ["memory"], ["memory"])
-    assert (row["behind"], row["p"]) == (0.0, None)
-
-
-def test_shares_have_exact_intervals() -> None:
-    # Clopper and Pearson 1934: 0 of 10 leaves up to 1 - 0.025^(1/10)
-    limit = 100 * (1 - 0.025**0.1)
-    assert share(pd.Series([False] * 10)) == f"0 of 10 (0 %, 0–{limit:.0f} %)"
-    assert share(pd.Series([], dtype=bool)) == "–"
+    memory = {"name": "memory", "alternatives": []}
+    requested = {"verdict": "named", "effects": [memory], "leads": [], "laws_again": None}
+    requested["laws"] = {"ranking": [{"name": "lin"}]}
+    best = SimpleNamespace(plain=lambda: {"verdict": "none", "effects": [], "leads": []})
+    found = SimpleNamespace(plain=lambda: requested, nearest=best)
+    monkeypatch.setattr(discover, "diagnose_table", lambda *given, **options: found)
+    first, second = worlds.evaluate("laws", "lin", 5, "idm")["worlds"]
+    assert (first["law"], first["law_first"], first["false_name"]) == ("lin", True, False)
+    assert (second["law"], second["right"], second["false_names"]) == ("idm", False, "memory")
 
 
 @pytest.mark.parametrize("name", ["krauss_light", "krauss_lane_drop", "krauss_factors"])

@@ -12,9 +12,7 @@ from benchmarks.synthetic_cases.arms import cases
 from benchmarks.synthetic_cases.case import TABLE, WALLS
 from benchmarks.synthetic_cases.crowd.case import CrowdCase
 from benchmarks.synthetic_cases.crowd.catalogue import CATALOGUE, EFFECTS
-from benchmarks.synthetic_cases.crowd.closure import crowd_costs
 from benchmarks.synthetic_cases.crowd.replay import Windows, cost_by_sequence
-from benchmarks.synthetic_cases.score import closure
 from nnode.data.quality import find_faults
 from nnode.data.readers.table import TableOptions, read_table
 
@@ -139,25 +137,3 @@ def test_all_arms_have_cases():
         assert found
         assert all(name in EFFECTS for case in found for name in case.effects)
     assert len(cases("crowd", "single", seeds=[0])) == len(CATALOGUE) == 16
-
-
-def test_a_diagnosis_that_reports_the_truth_closes_the_whole_gap(tmp_path):
-    truth = generate(small("alignment", strength="strong", n_sequences=4), tmp_path)
-    base = {
-        f"social_force.{name}": {"before": value, "after": value}
-        for name, value in truth["base"].items()
-    }
-    told = {"name": "alignment", "coefficients": truth["effects"][0]["coefficients"]}
-    report = {
-        "effects": [told],
-        "base": base,
-        "gap": {"before": 1.0, "after": 1.0, "noise_floor": 0.0},
-        "split": {"sealed": [name.split("/")[1] for name in list(truth["cost"]["oracle"])[1:3]]},
-    }
-    assert closure(truth, report) == pytest.approx(1.0, abs=1e-6)
-    assert closure(truth, {**report, "effects": []}) == pytest.approx(0.0, abs=1e-6)
-    before, after, best = crowd_costs(truth, report, [1, 2])
-    wanted = list(truth["cost"]["oracle"].values())[1:3]
-    # the truth was replayed with finer steps
-    assert (after, best) == pytest.approx((np.mean(wanted), np.mean(wanted)), rel=0.02)
-    assert before > 1.5 * best
