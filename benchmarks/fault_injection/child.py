@@ -58,6 +58,10 @@ def _be_child(work: Callable[[], object], output: Path | None) -> None:
         descriptor = os.open(place, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         os.dup2(descriptor, 1)
         os.dup2(descriptor, 2)
+        # a parent such as pytest may have others
+        sys.stdout, sys.stderr = (
+            os.fdopen(descriptor, "w", closefd=False) for descriptor in (1, 2)
+        )
         work()
         status = 0
     except SystemExit as error:

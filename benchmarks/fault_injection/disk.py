@@ -6,22 +6,19 @@ a limit on the size of files breaks writing off in the middle of them.
 
 from __future__ import annotations
 
-import logging
 import os
 import resource
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from benchmarks.fault_injection.campaign import Work, on_jobs
 from benchmarks.fault_injection.jobs import Job
 from benchmarks.fault_injection.kills import broken
-from benchmarks.fault_injection.report import Row
+from benchmarks.fault_injection.row import Row
 from nnode.files import PARTIAL
 
 #: Bytes left on the disk in memory.
@@ -30,59 +27,59 @@ ROOM = (0, 36864, 49152, 65536, 131072)
 LIMITS = (0, 200, 33000, 40000, 60000, 120000)
 #: Size of the disk in memory.
 _DISK = 24 << 20
+#: A resumed training goes on, so that it has something to write.
+_LONGER = ["trainer.max_epochs=8"]
 
 _WORDS = ("cannot be written", "cannot be kept", "No space left", "File too large")
 
 
-def disk(
-    root: Path, folder: Path, names: list[str] | None = None, *, mount: bool = True
-) -> list[Row]:
+def full_disks(jobs: list[Job], scratch: Path) -> Iterator[Row]:
     """Run each job over its own finished results, with less and less room.
 
     Args:
-        root: of the repository, with its scripts.
-        folder: of the campaign; what it writes is removed where nothing was lost.
-        names: of the jobs; None takes all but the benchmark, which writes as the study does.
-        mount: whether a disk in memory is tried as well.
+        scratch: receives all files.
     """
-
-    def plan(chosen: list[Job]) -> tuple[list[float], Work]:
-        return [1.0] * len(chosen), lambda job, place, within: _of_job(root, place, job, mount)
-
-    return on_jobs(folder, "disk", "full disks", plan, names, but=["benchmark_discovery"])
-
-
-def _of_job(root: Path, place: Path, job: Job, mount: bool) -> list[Row]:
-    finished = place / "finished"
-    assert _run(root, job, finished, place / "output.txt") == 0, "it fails with room"
-    limited = Row("disk", f"{job.name}, size of files", 0)
-    for limit in LIMITS:
-        run = place / f"limit{limit}"
-        shutil.copytree(finished, run)
-        _try(root, job, run, limited, f"{limit} bytes", partial(_limit, limit))
-        shutil.rmtree(run)
-    if not mount:
-        return [limited]
-    full = Row("disk", f"{job.name}, disk in memory", 0)
-    for room in ROOM:
-        with _mounted(place / f"disk{room}") as where:
-            if where is None:
-                full.facts = {"mounting": "not allowed"}
-                break
-            shutil.copytree(finished, where / "run")
-            _fill(where, room)
-            _try(root, job, where / "run", full, f"{room} bytes left", lambda: None)
-    return [limited, full]
+    for job in jobs:
+        place = scratch / job.name
+        finished = place / "finished"
+        place.mkdir()
+        assert job.start(finished).status(300) == 0, f"it fails with room: {job.words(finished)}"
+        row = Row(f"{job.name}, size of files", facts={"refused": 0})
+        for limit in LIMITS:
+            run = place / f"limit{limit}"
+            shutil.copytree(finished, run)
+            _try(job, run, row, f"{limit} bytes", partial(_limit, limit))
+            shutil.rmtree(run)
+        yield row.ended()
+        row = Row(f"{job.name}, disk in memory", facts={"refused": 0})
+        for room in ROOM:
+            with _mounted(place / f"disk{room}") as where:
+                if where is None:
+                    row.facts = {"mounting": "not allowed"}
+                    break
+                shutil.copytree(finished, where / "run")
+                _fill(where, room)
+                output = place / "output.txt"
+                _try(job, where / "run", row, f"{room} bytes left", lambda: None, output)
+        yield row.ended()
 
 
-def _try(root: Path, job: Job, run: Path, row: Row, what: str, prelude: Callable[[], None]) -> None:
+def _try(
+    job: Job,
+    run: Path,
+    row: Row,
+    what: str,
+    before: Callable[[], None],
+    output: Path | None = None,
+) -> None:
     """One run over finished results; the checks after it."""
-    start = time.monotonic()
     row.tried += 1
-    output = run.parents[1] / "output.txt" if run.name == "run" else run.parent / "output.txt"
-    status = _run(root, job, run, output, prelude)
+    output = output or job.output(run)
+    child = job.start(run, before=before, resumed=_LONGER, output=output)
+    status = child.status(300)
+    child.kill()
     words = output.read_text()
-    row.facts["refused"] = row.facts.get("refused", 0) + (status != 0)
+    row.facts["refused"] += status != 0
     if status != 0 and not any(word in words for word in _WORDS):
         row.losses.append(f"{what}: status {status} without a word of the disk: {words[-900:]}")
     if "Traceback" in words:
@@ -92,23 +89,9 @@ def _try(root: Path, job: Job, run: Path, row: Row, what: str, prelude: Callable
     row.losses += [f"{what}: {path} is left" for path in sorted(run.rglob(f"*{PARTIAL}"))]
     row.losses += [f"{what}: {words}" for words in broken(run)]
     try:
-        kept = job.kept(run)
-        assert kept or job.name == "discover", "what was finished is gone"
+        assert job.kept(run) or job.name == "discover", "what was finished is gone"
     except Exception as error:
         row.losses.append(f"{what}: {type(error).__name__}: {error}")
-    row.seconds += time.monotonic() - start
-
-
-def _run(
-    root: Path, job: Job, folder: Path, output: Path, prelude: Callable[[], None] = lambda: None
-) -> int | None:
-    again = job.again(folder)
-    # a training that goes on, so that it has something to write
-    given = job.first if again is None else [*again, "trainer.max_epochs=8"]
-    child = job.child(root, given, folder, output, prelude)
-    status = child.status(300)
-    child.kill()
-    return status
 
 
 def _limit(size: int) -> None:
@@ -158,4 +141,3 @@ def _fill(where: Path, room: int) -> None:
             while True:
                 file.write(bytes(512))
         file.truncate(file.tell() - room)
-    logging.debug("%s has %d bytes left", where, shutil.disk_usage(where).free)

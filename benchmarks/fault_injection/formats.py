@@ -1,17 +1,14 @@
-"""More readers that are fuzzed: formats of other programs, data frames, the check of a file."""
+"""Sound files of other programs, and what reads them without the last resort for foreign errors."""
 
 from __future__ import annotations
 
 import gzip
 import pickle
-import random
 import sqlite3
-import warnings
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from nnode.data.identity import identify
@@ -23,51 +20,6 @@ from nnode.data.sequence import Domain, Sequence
 from nnode.data.sequences import Sequences
 
 ROOM = "POLYGON ((0 0, 20 0, 20 4, 0 4, 0 0), (4 1, 5 1, 5 2, 4 2, 4 1))"
-
-#: Cells of data frames that no file of text holds.
-CELLS: tuple[Any, ...] = (
-    None,
-    pd.NA,
-    pd.NaT,
-    b"a\xff",
-    b"1",
-    10**400,
-    -(10**30),
-    1j,
-    [1],
-    {},
-    (),
-    object,
-    True,
-    np.inf,
-    np.array([1, 2]),
-    pd.Timestamp("2000-01-01"),
-    pd.Timedelta("1s"),
-    float("nan"),
-    "",
-    "1",
-    2**63,
-    "\x1b[31m",
-    "x" * 5000,
-    frozenset({1}),
-    1e308,
-    -1e308,
-)
-_KINDS = (
-    "object",
-    "float32",
-    "int8",
-    "uint64",
-    "string",
-    "category",
-    "complex",
-    "bool",
-    "Int64",
-    "datetime64[ns]",
-    "timedelta64[s]",
-    "Sparse[float]",
-    "period[D]",
-)
 
 
 def read_all(options: DataOptions, files: dict[str, Any]) -> None:
@@ -185,53 +137,6 @@ def flat_platoons() -> bytes:
         for k in range(60)
     ]
     return str(pd.DataFrame(rows).to_csv(index=False)).encode()
-
-
-def strange_frame(content: bytes, rng: random.Random) -> bytes:
-    """A data frame with strange cells, types, names, indices or doubled columns."""
-    frame: pd.DataFrame = pickle.loads(content)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for _ in range(rng.randint(1, 3)):
-            # pandas itself refuses some of it
-            with suppress(TypeError, ValueError, ArithmeticError):
-                frame = _changed(frame, rng)
-            if not frame.size:
-                break
-    return pickle.dumps(frame)
-
-
-def _changed(frame: pd.DataFrame, rng: random.Random) -> pd.DataFrame:
-    frame, place = frame.copy(), rng.randrange(frame.shape[1])
-    match rng.randrange(7):
-        case 0 | 1:
-            cells = list(frame.iloc[:, place])
-            cells[rng.randrange(len(cells))] = rng.choice(CELLS)
-            frame.isetitem(place, pd.Series(cells, frame.index, dtype=object).array)
-        case 2:
-            cells = [rng.choice(CELLS)] * len(frame)
-            frame.isetitem(place, pd.Series(cells, frame.index, dtype=object).array)
-        case 3:
-            column = frame.iloc[:, place].astype(cast(Any, rng.choice(_KINDS)))
-            frame.isetitem(place, column.array)
-        case 4:
-            frame = pd.concat([frame, frame.iloc[:, [place]]], axis=1)
-        case 5:
-            names: list[Any] = list(frame.columns)
-            names[place] = rng.choice((None, 1, ("x", "y"), b"x", "\x1b", "x" * 5000, "x"))
-            frame.columns = pd.Index(names, dtype=object)
-        case _:
-            frame = rng.choice(
-                (
-                    frame.iloc[:0],
-                    frame.iloc[:, :0],
-                    frame.T,
-                    frame.sample(frac=1.0, random_state=1),
-                    pd.concat([frame, frame]),
-                    frame.set_index(frame.columns[place]),
-                )
-            )
-    return frame
 
 
 def read_frame(path: Path) -> None:

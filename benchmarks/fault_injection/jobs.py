@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,13 @@ from nnode.data.readers.esimas import EsimasOptions
 from nnode.data.store import MANIFEST, Store
 from nnode.data.synthetic import traffic_recording
 from nnode.pages.page import Block, TableBlock
+from nnode.program import configuration
 from studies.runner import Task, run_tasks
 from studies.traffic.tasks import fit, scan
 
-#: Names of entries that tell how long something took, or when.
+#: Names of entries that say how long something took, or when, and columns of tables that do.
 _CLOCKS = ("seconds", "time taken", "laps")
+_TIMED = ("s", "duration", "minutes")
 
 
 @dataclass(frozen=True)
@@ -44,34 +46,44 @@ class Job:
     name: str
     first: list[str]
     results: Callable[[Path], Any]
-    kept: Callable[[Path], float | set[str]]
+    kept: Callable[[Path], Any]
     share: int = 1
     again: Callable[[Path], list[str] | None] = lambda folder: None
     before: Callable[[], None] = field(default=lambda: None)
 
-    def child(
+    def start(
         self,
-        root: Path,
-        given: list[str],
         folder: Path,
-        output: Path,
-        prelude: Callable[[], object] = lambda: None,
+        *,
+        before: Callable[[], object] = lambda: None,
+        resumed: Collection[str] = (),
+        output: Path | None = None,
     ) -> Child:
-        """Start it in a process of its own, in a run's folder.
+        """Start it in a process of its own, or go on with what is in a run's folder.
 
         Args:
-            root: of the repository.
-            given: overrides.
-            output: receives what it prints.
-            prelude: done in the process as the last thing before the script.
+            before: done in the process as the last thing before the script.
+            resumed: further overrides of a run that goes on.
+            output: receives what it prints; by default a file beside the folder.
         """
+        again = self.again(folder)
+        given = self.first if again is None else [*again, *resumed]
 
         def work() -> None:
             self.before()
-            prelude()
-            script(root, self.name, [*given, f"hydra.run.dir={folder}"])
+            before()
+            script(configuration().parent, self.name, [*given, f"hydra.run.dir={folder}"])
 
-        return Child(work, output)
+        return Child(work, output or self.output(folder))
+
+    @staticmethod
+    def output(folder: Path) -> Path:
+        """The file that receives what a run prints, beside its folder."""
+        return folder.with_name(f"{folder.name}.txt")
+
+    def words(self, folder: Path) -> str:
+        """The last words of a run."""
+        return self.output(folder).read_text()[-1500:]
 
 
 def timeless(value: Any) -> Any:
@@ -119,13 +131,9 @@ def _tasks(folder: Path) -> dict[str, Any]:
     tables = {}
     for path in sorted(folder.glob("*.csv")):
         frame = pd.read_csv(path)
-        frame = frame[[name for name in frame.columns if not _of_clock(name)]]
-        tables[path.name] = frame.drop(columns=_timed(frame)).to_csv(index=False)
+        timed = [name for name in frame.columns if name in _TIMED or _of_clock(name)]
+        tables[path.name] = frame.drop(columns=timed).to_csv(index=False)
     return {"results": found, "tables": tables}
-
-
-def _timed(frame: pd.DataFrame) -> list[str]:
-    return [name for name in frame.columns if name in ("s", "duration", "minutes")]
 
 
 def _names(folder: Path) -> set[str]:
@@ -174,6 +182,7 @@ class Small:
 
 def jobs(raw: Path) -> list[Job]:
     """All jobs; the demonstration's traffic is written to ``raw``."""
+    _load_libraries()
     recorded = traffic_recording(raw / "esimas" / "sequence_datademo.mat", seed=0)
     source, table = f"data.source={raw}", raw / "lane.csv"
     _lane(recorded, table)
@@ -300,7 +309,7 @@ def _lane(recorded: Path, table: Path) -> None:
     pd.DataFrame(rows).to_csv(table, index=False)
 
 
-def load_libraries() -> None:
+def _load_libraries() -> None:
     """What the scripts load, so that forked children need not."""
     import tensorboard  # noqa: F401
     import torch.utils.tensorboard

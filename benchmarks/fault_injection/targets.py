@@ -1,12 +1,10 @@
-"""What is fuzzed: each reader and each loader, sound seeds for it, and ways to damage them."""
+"""What is fuzzed: each reader and each loader, and the malformed files that it is given."""
 
 from __future__ import annotations
 
 import copy
 import io
 import json
-import pickle
-import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +13,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from hypothesis.strategies import SearchStrategy
 from omegaconf import MISSING
 from scipy.io import savemat
 
 from benchmarks.fault_injection import formats
+from benchmarks.fault_injection.damage import (
+    damaged_bytes,
+    damaged_formula,
+    damaged_text,
+    evil_checkpoint,
+    strange_checkpoint,
+    strange_frame,
+)
 from benchmarks.fault_injection.formats import read_all
-from benchmarks.fault_injection.gadgets import evil_checkpoint, strange_checkpoint
-from benchmarks.fault_injection.inputs import damaged_bytes, damaged_formula, damaged_text
 from nnode.app.check import check_file
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.optimizers import AdadeltaOptions, build_optimizer
@@ -44,9 +49,6 @@ from nnode.model.laws import law_from
 from nnode.simulation.kernels import source
 from studies.runner import KEPT, Task, run_tasks
 
-Damage = Callable[[bytes, random.Random], bytes]
-
-
 #: Accelerations that can be read.
 _FORMULAS = (
     "a*(1 - (v/v0)**4 - ((s0 + max(v*T + v*dv/(2*sqrt(a*b)), 0))/gap)**2)",
@@ -56,6 +58,10 @@ _FORMULAS = (
 _QUANTITIES = {"v0": "30 m/s", "T": "1.2 s", "s0": "2 m", "a": "1.3 m/s²", "b": "1.7 m/s²"}
 
 
+#: Name of what evil files try to write.
+OUTSIDE = "outside"
+
+
 @dataclass(frozen=True, eq=False)
 class Target:
     """A reader and its malformed inputs.
@@ -63,18 +69,14 @@ class Target:
     Attributes:
         name: of the target.
         file: name of the file that it reads.
-        seeds: contents of sound files.
-        damage: makes a malformed file of a sound one.
+        inputs: contents of malformed files.
         read: reads all of the file; takes its path.
-        share: of all inputs, relative to the other targets.
     """
 
     name: str
     file: str
-    seeds: list[bytes]
-    damage: Damage
+    inputs: SearchStrategy[bytes]
     read: Callable[[Path], Any]
-    share: float = 1.0
 
 
 def _trajectories() -> pd.DataFrame:
@@ -244,13 +246,14 @@ def _read_formula(path: Path) -> None:
     compile(source(model), "law", "exec")
 
 
-def targets(scratch: Path, outside: Path) -> list[Target]:
+def targets(scratch: Path) -> list[Target]:
     """All targets.
 
     Args:
-        scratch: receives the seeds, and the store whose files are damaged.
-        outside: what evil files try to write; nothing else does.
+        scratch: receives the sound files, and the store whose files are damaged; evil files try to
+            write beside it.
     """
+    outside = scratch.with_name(OUTSIDE)
     traffic = _trajectories().drop(columns=["y", "dest_y", "dest_x"])
     crowd, walls = (
         _trajectories().assign(x=lambda f: f["x"] / 15),
@@ -268,8 +271,8 @@ def targets(scratch: Path, outside: Path) -> list[Target]:
     pandas_only = JuelichOptions(frame_rate=None, unit=None, walls={"corridor": [0.0, 3.0]})
     tracks = formats.highd(scratch / "highd")
     (scratch / "room.txt").write_bytes(_corridor())
-    pickled = [pickle.dumps(f) for f in (traffic, crowd, _vehicles(), _pairs())]
-    texts = [_csv(f) for f in (traffic, crowd, _vehicles(), _pairs())]
+    frames = [traffic, crowd, _vehicles(), _pairs()]
+    texts = [_csv(frame) for frame in frames]
     texts += [_corridor(), formats.ngsim(), _platoon(), formats.flat_platoons()]
 
     def reads(*every: DataOptions, key: str | None = None, **more: Path) -> Callable[[Path], None]:
@@ -299,102 +302,62 @@ def targets(scratch: Path, outside: Path) -> list[Target]:
         Target(
             "esimas",
             "sequence_datademo.mat",
-            [_mat(packed=False), _mat(packed=True)],
-            damaged_bytes,
+            damaged_bytes(_mat(packed=False), _mat(packed=True)),
             reads(EsimasOptions(), key="demo"),
         ),
+        Target("juelich", "corridor.txt", damaged_text(_corridor()), reads(pandas_only)),
+        Target("table CSV", "table.csv", damaged_text(_csv(traffic)), reads(of_traffic, key=TIDY)),
         Target(
-            "juelich",
-            "corridor.txt",
-            [_corridor()],
-            damaged_text,
-            reads(pandas_only, key="corridor"),
-        ),
-        Target(
-            "table CSV",
-            "table.csv",
-            [_csv(traffic)],
-            damaged_text,
-            reads(of_traffic, key=TIDY),
-        ),
-        Target(
-            "table CSV, crowd",
-            "people.csv",
-            [_csv(crowd)],
-            damaged_text,
-            reads(of_crowd, key=TIDY),
+            "table CSV, crowd", "people.csv", damaged_text(_csv(crowd)), reads(of_crowd, key=TIDY)
         ),
         Target(
             "table Parquet",
             "table.parquet",
-            [_parquet(traffic)],
-            damaged_bytes,
+            damaged_bytes(_parquet(traffic)),
             reads(of_traffic, key=TIDY),
         ),
-        Target("vehicles CSV", "cars.csv", [_csv(_vehicles())], damaged_text, reads(*vehicles)),
+        Target("vehicles CSV", "cars.csv", damaged_text(_csv(_vehicles())), reads(*vehicles)),
         Target(
-            "pairs CSV", "pairs.csv", [_csv(_pairs())], damaged_text, reads(*pairs, key="pairs.csv")
+            "pairs CSV", "pairs.csv", damaged_text(_csv(_pairs())), reads(*pairs, key="pairs.csv")
         ),
         Target(
             "OpenACC",
             "platoon.csv",
-            [_platoon(), formats.flat_platoons()],
-            damaged_text,
+            damaged_text(_platoon(), formats.flat_platoons()),
             reads(OpenAccOptions(min_duration=0.3), key="platoon.csv"),
         ),
-        Target("NGSIM", "ngsim.csv", [formats.ngsim()], damaged_text, reads(*ngsim)),
-        Target("highD, tracks", f"highd/01{TRACKS}", [tracks], damaged_text, formats.read_highd),
-        Target(
-            "SUMO",
-            "fcd.xml",
-            formats.sumo(),
-            damaged_text,
-            reads(fcd),
-        ),
+        Target("NGSIM", "ngsim.csv", damaged_text(formats.ngsim()), reads(*ngsim)),
+        Target("highD, tracks", f"highd/01{TRACKS}", damaged_text(tracks), formats.read_highd),
+        Target("SUMO", "fcd.xml", damaged_text(*formats.sumo()), reads(fcd)),
         Target(
             "JuPedSim",
             "walk.sqlite",
-            [formats.walkway(scratch)],
-            damaged_bytes,
+            damaged_bytes(formats.walkway(scratch)),
             reads(WalkwayOptions(t_seq=1.0), key=PEOPLE),
         ),
         Target(
             "walkable area",
             "area.wkt",
-            [formats.ROOM.encode()],
-            damaged_text,
+            damaged_text(formats.ROOM.encode()),
             reads(area, key=GEOMETRY, **{PEOPLE: scratch / "room.txt"}),
         ),
-        Target("data frame", "frame.pickle", pickled, formats.strange_frame, formats.read_frame),
-        Target("check", "checked.csv", texts, damaged_text, lambda path: repr(check_file(path))),
+        Target("data frame", "frame.pickle", strange_frame(frames), formats.read_frame),
+        Target("check", "checked.csv", damaged_text(*texts), lambda path: repr(check_file(path))),
         Target(
             "walls CSV",
             "walls.csv",
-            [walls],
-            damaged_text,
+            damaged_text(walls),
             reads(of_crowd, key=WALLS, **{TIDY: scratch / "crowd.csv"}),
         ),
-        Target("checkpoint, bytes", "bytes.pt", [checkpoint], damaged_bytes, _open_checkpoint),
+        Target("checkpoint, bytes", "bytes.pt", damaged_bytes(checkpoint), _open_checkpoint),
         Target(
-            "checkpoint, evil",
-            "evil.pt",
-            [checkpoint],
-            lambda data, rng: evil_checkpoint(data, rng, outside),
-            _open_checkpoint,
+            "checkpoint, evil", "evil.pt", evil_checkpoint(checkpoint, outside), _open_checkpoint
         ),
-        Target(
-            "checkpoint, values", "values.pt", [checkpoint], strange_checkpoint, _open_checkpoint
-        ),
-        Target(
-            "formula",
-            "law.txt",
-            [text.encode() for text in _FORMULAS],
-            damaged_formula,
-            _read_formula,
-        ),
-        Target("store, manifest", f"manifest/{MANIFEST}", [manifest], damaged_text, _read_store),
-        Target("store, table", f"table/{TABLE}", [table], damaged_bytes, _read_store),
-        Target("kept result", f"kept/{KEPT}/one.json", [kept], damaged_text, _read_kept),
+        Target("checkpoint, values", "values.pt", strange_checkpoint(checkpoint), _open_checkpoint),
+        Target("formula", "law.txt", damaged_formula(*_FORMULAS), _read_formula),
+        Target("store, manifest", f"manifest/{MANIFEST}", damaged_text(manifest), _read_store),
+        Target("store, table", f"table/{TABLE}", damaged_bytes(table), _read_store),
+        Target("kept result", f"kept/{KEPT}/one.json", damaged_text(kept), _read_kept),
     ]
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import strategies as st
 
 from benchmarks.fault_injection.fuzz import fuzz
 from benchmarks.fault_injection.jobs import jobs
@@ -25,7 +26,7 @@ def report(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
 def test_every_campaign_shortly(script: Script, tmp_path: Path) -> None:
     found = report(script, tmp_path, "jobs=[prepare_data]", "kills=6", "repeats=2", "inputs=1150")
     assert found["tried"]["kills"] == 6
-    assert found["tried"]["fuzz"] == 1150
+    assert found["tried"]["fuzz"] >= 1150
     assert found["tried"]["disk"] >= 6
     assert found["tried"]["folder"] >= 2
     rows = {(row["campaign"], row["what"]): row for row in found["rows"]}
@@ -33,8 +34,7 @@ def test_every_campaign_shortly(script: Script, tmp_path: Path) -> None:
     assert rows["disk", "prepare_data, size of files"]["facts"]["refused"] >= 3
     for (campaign, _), row in rows.items():
         if campaign == "fuzz":
-            assert row["tried"] == 50
-            assert row["facts"]["read"] + row["facts"]["refused"] == 50
+            assert row["facts"]["read"] + row["facts"]["refused"] == row["tried"] >= 50
     # nothing of the campaigns is left beside the report
     assert not [p.name for p in tmp_path.iterdir() if p.name in ("kills", "disk", "fuzz")]
 
@@ -51,33 +51,27 @@ def test_many_inputs(script: Script, tmp_path: Path) -> None:
     assert found["tried"]["fuzz"] >= 100_000
 
 
-def test_a_reader_that_misbehaves_is_a_loss(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    outside = tmp_path / "elsewhere"
+def test_a_reader_that_misbehaves_is_a_loss(tmp_path: Path) -> None:
+    outside, scratch = tmp_path / "elsewhere", tmp_path / "fuzz"
+    scratch.mkdir()
 
-    def read(path: Path) -> None:
-        match path.read_bytes()[0] % 4:
-            case 0:
-                raise KeyError("not an error of the package")
-            case 1:
-                outside.write_text("written outside")
-            case 2:
-                bytearray(1 << 40)
+    def unknown(path: Path) -> None:
+        raise KeyError("not an error of the package")
 
-    from benchmarks.fault_injection import fuzz as campaign
+    def written(path: Path) -> None:
+        outside.write_text("written outside")
 
-    bad = Target("bad", "bad.bin", [bytes(8)], lambda data, rng: rng.randbytes(8), read)
-    monkeypatch.setattr(campaign, "targets", lambda *_: [bad])
-    found = fuzz(tmp_path, 16, 0)[0]
-    words = " ".join(found.losses)
-    assert found.tried == 16
-    assert "KeyError" in words
-    assert f"did open {outside}" in words
-    assert "MemoryError" in words
-    assert len(found.losses) == 16 - found.facts["read"] + sum(
-        "did open" in w for w in found.losses
-    )
+    def large(path: Path) -> None:
+        bytearray(1 << 40)
+
+    readers = [unknown, written, large, lambda path: None]
+    targets = [Target(str(i), "bad.bin", st.binary(), read) for i, read in enumerate(readers)]
+    rows = list(fuzz(targets, scratch, 40, 0))
+    losses = [" ".join(row.losses) for row in rows]
+    assert "KeyError" in losses[0]
+    assert f"did ['open {outside}" in losses[1]
+    assert "MemoryError" in losses[2]
+    assert (rows[3].losses, rows[3].tried, rows[3].facts["read"]) == ([], 10, 10)
 
 
 def test_the_jobs_are_asked_for_in_words_that_the_scripts_know(tmp_path: Path) -> None:
