@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -21,8 +22,7 @@ LOOKS: dict[str, tuple[str, int, bool]] = {
     "scan_batch_last": ("JAX lax.scan, batch innermost", 1, True),
     "fused_1": ("fused, 1 thread", 0, False),
     "fused_2": ("fused, 2 threads", 0, True),
-    "wall_s": ("time of a diagnosis", 0, False),
-    "peak_memory_MB": ("peak memory (GB)", 1, False),
+    "diagnosis": ("time of a diagnosis", 0, False),
 }
 #: Shapes of a panel, the number by which they differ, and the label of the axis.
 _PANELS = (
@@ -30,11 +30,23 @@ _PANELS = (
     (("people", "scale"), "agents", "people"),
     (("diagnosis",), "sequences", "sequences"),
 )
+#: Columns of the results that are drawn.
+_COLUMNS = (
+    "shape",
+    "model",
+    "engine",
+    "sequences",
+    "agents",
+    "steps",
+    "median",
+    "min",
+    "max",
+)
 
 
 def performance_figure(results: dict[str, Any]) -> Figure | None:
-    """Time of one gradient against the number of steps and of people; time and memory of a
-    diagnosis against the number of sequences.
+    """Time of one gradient against the number of steps and of people, and of a diagnosis against
+    the number of sequences.
 
     Points are medians, bars reach from the fastest to the slowest repeat, both axes are
     logarithmic. The thin grey line is proportional to the number on the horizontal axis.
@@ -45,25 +57,20 @@ def performance_figure(results: dict[str, Any]) -> Figure | None:
     Returns:
         One panel for every number that differs between at least two problems; None without any.
     """
-    panels = []
-    for shapes, key, label in _PANELS:
-        rows = sorted(
-            (row for row in results["problems"] if row["shape"] in shapes), key=lambda row: row[key]
-        )
-        if len({row[key] for row in rows}) > 1:
-            panels.append((key, label, rows))
+    rows = pd.DataFrame(results["rows"], columns=list(_COLUMNS))
+    rows = rows[rows["engine"].isin(LOOKS)]
+    panels = [(rows[rows["shape"].isin(shapes)], key, label) for shapes, key, label in _PANELS]
+    panels = [(part, key, label) for part, key, label in panels if part[key].nunique() > 1]
     if not panels:
         return None
     figure = new_figure(3.4 * len(panels) + 2.3, 3.7)
     curves: dict[str, Any] = {}
-    for i, (key, label, rows) in enumerate(panels):
-        ax = figure.add_subplot(1, len(panels), i + 1)
-        _draw(ax, key, label, rows)
-        curves |= {str(curve.get_gid()): curve for curve in ax.lines}
-    names = [name for name in (*LOOKS, "slope 1") if name in curves]
+    for i, (part, key, label) in enumerate(panels):
+        curves |= _draw(figure.add_subplot(1, len(panels), i + 1), part, key, label)
+    names = [name for name in LOOKS if name in curves]
     figure.legend(
-        [curves[name] for name in names],
-        [LOOKS[name][0] if name in LOOKS else name for name in names],
+        [*(curves[name] for name in names), curves["slope 1"]],
+        [*(LOOKS[name][0] for name in names), "slope 1"],
         loc="outside right center",
         fontsize=SMALL_FONT,
         frameon=False,
@@ -74,36 +81,27 @@ def performance_figure(results: dict[str, Any]) -> Figure | None:
     return figure
 
 
-def _times(row: dict[str, Any]) -> dict[str, tuple[float, float, float]]:
-    """Smallest value, median and largest value by curve."""
-    if "engines" in row:
-        return {name: (t["min"], t["median"], t["max"]) for name, t in row["engines"].items()}
-    return {key: (row[key] * s,) * 3 for key, s in (("wall_s", 1.0), ("peak_memory_MB", 1e-3))}
-
-
-def _draw(ax: Axes, key: str, label: str, rows: list[dict[str, Any]]) -> None:
-    """One panel."""
-    times = [_times(row) for row in rows]
-    lowest = []
-    for name in dict.fromkeys(name for each in times for name in each):
-        x = [row[key] for row, each in zip(rows, times, strict=True) if name in each]
-        low, y, high = zip(*(each[name] for each in times if name in each), strict=True)
-        _, index, hollow = LOOKS.get(name, ("", 5, False))
+def _draw(ax: Axes, rows: pd.DataFrame, key: str, label: str) -> dict[str, Any]:
+    """One panel; its curves by name."""
+    curves: dict[str, Any] = {}
+    for name, part in rows.sort_values(key).groupby("engine"):
+        _, index, hollow = LOOKS[str(name)]
         look = curve_style(index)
-        colour = look["color"]
         # a hollow marker is a ring around the full one
-        look |= {"markerfacecolor": "none" if hollow else colour, "linewidth": 1.2}
-        look |= {"markersize": 7.0 if hollow else 4.5}
-        ax.plot(x, y, gid=name, **look)
-        bars = [[b - a for a, b in zip(*pair, strict=True)] for pair in ((low, y), (y, high))]
-        ax.errorbar(x, y, bars, fmt="none", ecolor=colour, elinewidth=0.8)
-        lowest.append(min(t / n for t, n in zip(y, x, strict=True)))
+        look |= {"markerfacecolor": "none" if hollow else look["color"], "linewidth": 1.2}
+        look |= {"markersize": 7.0 if hollow else 4.5, "elinewidth": 0.8}
+        bars = [part["median"] - part["min"], part["max"] - part["median"]]
+        curves[str(name)] = ax.errorbar(part[key], part["median"], bars, **look)
     ax.set(xscale="log", yscale="log")
-    ends = [rows[0][key], rows[-1][key]]
     # below all points, so that slopes can be compared without hiding any
-    line = [0.5 * min(lowest) * n for n in ends]
-    ax.plot(ends, line, color=GREY, linewidth=0.7, gid="slope 1", zorder=1)
-    first = rows[0]
-    fixed = [f"{first[name]} {name}" for name in ("sequences", "agents", "steps") if name in first]
-    fixed = [text for text in fixed if not text.endswith(key)]
-    dress(ax, x=label, y="time (s)", title=f"{first.get('model', 'lin')}: {', '.join(fixed)}")
+    ends = rows[key].agg(["min", "max"])
+    below = 0.5 * (rows["median"] / rows[key]).min() * ends
+    (curves["slope 1"],) = ax.plot(ends, below, color=GREY, linewidth=0.7, zorder=1)
+    first = rows.iloc[0]
+    fixed = [
+        f"{first[name]:g} {name}"
+        for name in ("sequences", "agents", "steps")
+        if name != key and pd.notna(first[name])
+    ]
+    dress(ax, x=label, y="time (s)", title=f"{first['model']}: {', '.join(fixed)}")
+    return curves

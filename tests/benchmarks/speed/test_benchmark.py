@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -37,22 +38,25 @@ def options(**changes: object):  # type: ignore[no-untyped-def]
     return config
 
 
+def measured(folder: Path) -> pd.DataFrame:
+    """The rows of a run."""
+    return pd.DataFrame(json.loads((folder / "benchmark.json").read_text())["rows"])
+
+
 @pytest.mark.thorough
 def test_all_engines(small, tmp_path) -> None:  # type: ignore[no-untyped-def]
     chosen = ["odeint_adjoint", "odeint", "loop", "fused_1", "fused_2"]
     benchmark(options(engines=chosen), tmp_path)
-    found = json.loads((tmp_path / "benchmark.json").read_text())
-    assert len(found["problems"]) == 4
-    for problem in found["problems"]:
-        assert list(problem["engines"]) == chosen
-        for engine in problem["engines"].values():
-            assert 0 < engine["min"] <= engine["median"] <= engine["max"]
-            assert len(engine["all"]) == 1
-            assert engine["peak_memory_MB"] <= problem["peak_memory_MB"]
-    assert found["problems"][0]["ensemble"]["threads_1"]["single_runs"] > 0
-    # softplus of 4 neurons for 2 followers in 3 sequences and 20 steps, and none in other laws
-    floors = [problem.get("floor", {}).get("evaluations") for problem in found["problems"]]
-    assert floors == [None, 4 * 2 * 3 * 20, None, None]
+    rows = measured(tmp_path)
+    assert list(rows["model"].unique()) == ["lin", "n4", "sf", "nn"]
+    assert (rows[["min", "median", "max"]].diff(axis=1).iloc[:, 1:] >= 0).all(axis=None)
+    for model, part in rows.groupby("model"):
+        restarts = ["restarts_1", "restarts_2"] if model in ("lin", "n4") else []
+        floor = ["floor"] if model == "n4" else []
+        assert list(part["engine"]) == [*chosen, *restarts, *floor]
+    # softplus of 4 neurons for 2 followers in 3 sequences and 20 steps
+    assert rows["evaluations"].dropna().tolist() == [4 * 2 * 3 * 20]
+    np.testing.assert_allclose(rows.loc[rows["engine"] == "fused_1", "times fused_1"], 1.0)
     assert not (tmp_path / "benchmark.png").exists()  # one number of steps, one of people
 
 
@@ -66,16 +70,13 @@ def series(monkeypatch) -> None:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.parametrize("engine", ["loop", pytest.param("fused_1", marks=pytest.mark.thorough)])
-def test_a_series_is_drawn(engine, series, tmp_path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_a_series_is_drawn(engine, series, tmp_path) -> None:  # type: ignore[no-untyped-def]
     chosen = {"shapes": ["steps", "scale"], "engines": ["odeint", engine]}
     benchmark(options(**chosen), tmp_path)
-    found = json.loads((tmp_path / "benchmark.json").read_text())
-    scale = found["scale"][engine]
-    assert scale["people"] == [50, 100]
-    medians = [row["engines"][engine]["median"] for row in found["problems"][2:]]
-    np.testing.assert_allclose(scale["seconds"], [medians[0] / 1250, medians[1] / 2500])
-    assert scale["ratio"] == max(scale["seconds"]) / min(scale["seconds"])
-    assert f"{engine}: one step of one person takes" in capsys.readouterr().out
+    rows = measured(tmp_path)
+    scale = rows[(rows["engine"] == engine) & (rows["shape"] == "scale")]
+    assert list(scale["agents"]) == [50, 100]
+    np.testing.assert_allclose(scale["µs"], 1e6 * scale["median"] / [1250, 2500])
     drawn = (tmp_path / "benchmark.png").read_bytes()
     again = tmp_path / "again"
     benchmark(options(redraw=str(tmp_path / "benchmark.json")), again)
@@ -88,8 +89,8 @@ def test_a_series_is_drawn(engine, series, tmp_path, capsys) -> None:  # type: i
     [
         (None, "cannot be read.*FileNotFoundError"),
         ("{", "cannot be read.*expected the benchmark.json of an earlier run"),
-        ('{"rows": 3}', "cannot be read.*problems"),
-        ('{"problems": []}', "has nothing to draw; expected at least two problems"),
+        ('{"problems": 3}', "cannot be read.*rows"),
+        ('{"rows": []}', "has nothing to draw; expected at least two problems"),
     ],
 )
 def test_results_that_cannot_be_drawn(text: str | None, message: str, tmp_path: Path) -> None:
@@ -197,8 +198,6 @@ def test_methods_are_timed_beside_their_errors(tmp_path, monkeypatch, capsys) ->
     tiny = replace(shape, models=("idm",), sequences=2, agents=3, samples=20)
     monkeypatch.setitem(SHAPES, "methods", (tiny,))
     benchmark(options(shapes=["methods"]), tmp_path)
-    (row,) = json.loads((tmp_path / "benchmark.json").read_text())["problems"]
-    away = [row["errors"][name]["gradient"] for name in ("rk4 0.1 s", "euler 0.002 s")]
-    assert 0 < away[0] < away[1] < row["errors"]["ballistic 0.1 s"]["gradient"]
-    assert all(taken["median"] > 0 for taken in row["engines"].values())
+    away = measured(tmp_path).set_index("engine")["gradient"]
+    assert 0 < away["rk4 0.1 s"] < away["euler 0.002 s"] < away["ballistic 0.1 s"]
     assert "idm: 2 sequences, 3 cars" in capsys.readouterr().out
