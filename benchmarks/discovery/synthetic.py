@@ -104,7 +104,7 @@ def evaluate(
         baselines: scores of the baselines as well.
         change: name of a change of thresholds. values: their values, by name.
     """
-    hidden = Case.from_dict(case)
+    hidden = Case(**case)
     classes = {effect.name: effect.confusable_group for effect in CATALOGUE.effects.values()}
     reports: dict[str, dict[str, Any]] = {}
     with TemporaryDirectory(prefix="nnode-case-") as made, TemporaryDirectory() as given:

@@ -75,7 +75,7 @@ def surroundings(case: Case, late: float) -> Surroundings:
             grows from it without bound.
     """
     rng = case.generator("law")
-    law = case.law or ("log" if rng.uniform() < 0.2 else "lin")
+    law = "log" if rng.uniform() < 0.2 else "lin"
     if law == "lin":
         v0, L = float(rng.uniform(26, 34)), float(rng.uniform(7, 10))
         fast = min(25.0, 0.85 * v0)

@@ -42,7 +42,7 @@ def test_equal_cases_give_equal_files_and_other_seeds_others(tmp_path):
 
 def test_a_case_survives_json_and_has_a_key_of_its_own():
     some = cases("traffic", "single", seeds=range(2), strengths=["weak", "full"])
-    again = [Case.from_dict(json.loads(json.dumps(case.to_dict()))) for case in some]
+    again = [Case(**json.loads(json.dumps(case.to_dict()))) for case in some]
     assert again == some
     assert len({case.key for case in some}) == len(some) == 2 * 2 * len(CATALOGUE)
 
