@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from benchmarks.synthetic_cases.crowd.motion import Base, Hidden, simulate
 from benchmarks.synthetic_cases.crowd.scene import Scene
-from benchmarks.synthetic_cases.fitting import least_squares
 
 #: Length of a window, s.
 WINDOW = 1.5
@@ -85,11 +85,12 @@ class Windows:
         found = least_squares(
             lambda p: self.errors(model(p)).ravel(),
             guess,
-            low=np.zeros(3),
-            scale=guess,
-            enough=_ENOUGH,
+            bounds=(0.0, np.inf),
+            x_scale=guess,
+            diff_step=1e-5,
+            ftol=_ENOUGH,
         )
-        return model(found)
+        return model(found.x)
 
 
 def cost_by_sequence(error: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
 
-from benchmarks.synthetic_cases.fitting import least_squares
 from benchmarks.synthetic_cases.traffic.motion import LAWS, Hidden, simulate
 
 #: Steps between two samples for a smooth right-hand side.
@@ -88,10 +88,12 @@ class Recording:
 
         found = least_squares(
             residuals,
-            np.array([v0, L]),
-            low=np.array([1.0, _LEAST_LENGTH]),
-            scale=np.array([v0, L]),
-        )
+            [v0, L],
+            bounds=([1.0, _LEAST_LENGTH], np.inf),
+            x_scale=[v0, L],
+            diff_step=1e-5,
+            ftol=1e-7,
+        ).x
         return float(found[0]), float(found[1])
 
 
