@@ -46,11 +46,9 @@ def write(subject: Subject, folder: Path) -> dict[str, Any]:
         "case": case.to_dict(),
         "key": case.key,
         **subject.base(),
-        "recalibrated": None if costs is None else costs.recalibrated,
         "effects": described([n for n in case.effects if n not in outside]),
         "outside": described([n for n in case.effects if n in outside]),
         "nuisance": described([n for n in truth.effects if n not in case.effects]),
-        "not_testable": list(catalogue.NEEDS_EXCITATION) if case.arm == "no_excitation" else [],
         "data_faults": [fault.to_dict(names, agents, clock) for fault in faults],
         "noise": {
             "measurement": case.sigma,
@@ -73,7 +71,6 @@ def write(subject: Subject, folder: Path) -> dict[str, Any]:
             "base": dict(zip(names, costs.base.tolist(), strict=True)),
             "oracle": dict(zip(names, costs.oracle.tolist(), strict=True)),
         },
-        **subject.more(),
     }
     write_json(folder / TRUTH, content)
     return content

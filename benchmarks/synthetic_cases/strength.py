@@ -44,13 +44,11 @@ class Costs:
         base: ``(S,)`` of the recalibrated base law.
         oracle: ``(S,)`` of the truth without noise of drivers or walkers.
         floor: of the measurement.
-        recalibrated: parameters of the base law that fit best.
     """
 
     base: np.ndarray
     oracle: np.ndarray
     floor: float
-    recalibrated: dict[str, float]
 
     @property
     def share(self) -> float:
@@ -186,10 +184,6 @@ class Subject:
 
     def base(self) -> dict[str, Any]:
         """What the diagnosis is told of the base ``model``, and its true parameters, ``base``."""
-        raise NotImplementedError
-
-    def more(self) -> dict[str, Any]:
-        """Further entries of the truth."""
         raise NotImplementedError
 
     def rescaled(self, name: str, values: dict[str, float], factor: float) -> dict[str, float]:

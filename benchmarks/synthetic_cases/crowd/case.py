@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.synthetic_cases.case import Case, check_effects
 from benchmarks.synthetic_cases.crowd import catalogue
 from benchmarks.synthetic_cases.crowd.catalogue import EFFECTS, Coefficients
-from benchmarks.synthetic_cases.crowd.motion import Base, Hidden, simulate
+from benchmarks.synthetic_cases.crowd.motion import Hidden, simulate
 from benchmarks.synthetic_cases.crowd.replay import Windows, cost_by_sequence
 from benchmarks.synthetic_cases.crowd.scene import BURN_IN, SUBSTEPS, Scene, set_scene
 from benchmarks.synthetic_cases.strength import Costs, Range, Subject, set_strength
@@ -126,9 +126,6 @@ class CrowdCase(Subject):
         parameters = {"A": base.A, "k": base.k, "kappa": base.kappa}
         return {"model": {"name": "sf", "options": options}, "base": parameters}
 
-    def more(self) -> dict[str, Any]:
-        return {"eta": np.round(self.scene.eta, 6).tolist() if self.truth.eta else []}
-
     def rescaled(self, name: str, values: Coefficients, factor: float) -> Coefficients:
         return EFFECTS[name].rescaled(values, factor)
 
@@ -150,12 +147,9 @@ class CrowdCase(Subject):
         x, v = self.simulate(truth)
         measured = x + self.case.sigma * self.scene.error
         windows = Windows(self.scene, x, v, measured, self.case.dt)
-        base: Base = windows.recalibrated(self.scene.base)
+        base = cost_by_sequence(windows.errors(windows.recalibrated(self.scene.base)))
         floor = float(((measured - x) ** 2).sum(-1).mean())
-        parameters = {"A": base.A, "k": base.k, "kappa": base.kappa}
-        return Costs(
-            cost_by_sequence(windows.errors(base)), self._oracle(windows, truth), floor, parameters
-        )
+        return Costs(base, self._oracle(windows, truth), floor)
 
     def _oracle(self, windows: Windows, truth: Truth) -> np.ndarray:
         error = windows.errors(self.scene.base, truth.hidden, eta=truth.eta, substeps=_FINE)

@@ -109,10 +109,8 @@ class TrafficCase(Subject):
     def base(self) -> dict[str, Any]:
         around = self.road.around
         model = {"name": around.law, "options": {}}
-        return {"model": model, "base": {"v0": around.v0, "L": around.L}}
-
-    def more(self) -> dict[str, Any]:
-        return {"edge": self.truth.edge}
+        base = {"v0": around.v0, "L": around.L}
+        return {"model": model, "base": base, "edge": self.truth.edge}
 
     def own(self, truth: Truth) -> np.ndarray:
         """``(S, N)`` factor on W of each vehicle."""
@@ -157,11 +155,10 @@ class TrafficCase(Subject):
         around = self.road.around
         return Recording(x, around.clocks, self.case.dt, around.law)
 
-    def base_cost(self, x: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
-        """``(S,)`` cost (m²) of the recalibrated base law, and its v0 and L."""
+    def base_cost(self, x: np.ndarray) -> np.ndarray:
+        """``(S,)`` cost (m²) of the recalibrated base law."""
         recording, around = self.recording(x), self.road.around
-        v0, L = recording.recalibrated(around.v0, around.L)
-        return cost_by_sequence(recording.errors(v0, L)), (v0, L)
+        return cost_by_sequence(recording.errors(*recording.recalibrated(around.v0, around.L)))
 
     def oracle_cost(self, x: np.ndarray, motion: Motion, truth: Truth) -> np.ndarray:
         """``(S,)`` cost (m²) of the truth without drivers' noise.
@@ -207,7 +204,7 @@ class TrafficCase(Subject):
     def misfit(self, names: list[str]) -> float:
         kept = {k: v for k, v in self.truth.effects.items() if k in names}
         motion = self.simulate(replace(self.truth, effects=kept, amplitude=0.0))
-        return float(self.base_cost(motion.x)[0].mean())
+        return float(self.base_cost(motion.x).mean())
 
     def spread(self, probe: float) -> float:
         truth = replace(self.truth, amplitude=probe)
@@ -217,7 +214,5 @@ class TrafficCase(Subject):
     def costs(self, truth: Truth) -> Costs:
         motion = self.simulate(truth)
         x = motion.x + self.case.sigma * self.road.error
-        base, (v0, L) = self.base_cost(x)
-        oracle = self.oracle_cost(x, motion, truth)
         floor = float(np.mean((x - motion.x)[:, :, :-1] ** 2))
-        return Costs(base, oracle, floor, {"v0": v0, "L": L})
+        return Costs(self.base_cost(x), self.oracle_cost(x, motion, truth), floor)

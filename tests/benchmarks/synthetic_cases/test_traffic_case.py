@@ -85,7 +85,7 @@ def test_an_oracle_explains_sound_data_and_the_base_law_does_not(effect):
     made = TrafficCase(small(effect, strength="full", noise=0.0))
     motion = made.simulate(made.truth)
     oracle = made.oracle_cost(motion.x, motion, made.truth).mean()
-    base = made.base_cost(motion.x)[0].mean()
+    base = made.base_cost(motion.x).mean()
     # what is left to the oracle is that leaders are straight between samples
     assert oracle < 4e-4
     assert base > 20 * oracle
@@ -94,9 +94,10 @@ def test_an_oracle_explains_sound_data_and_the_base_law_does_not(effect):
 def test_no_effect_leaves_the_base_law_true():
     made = TrafficCase(small(arm="nothing", variant="white", noise=0.0, strength="full"))
     around = made.road.around
-    cost, (v0, L) = made.base_cost(made.simulate(made.truth).x)
-    assert cost.mean() < 4e-4
-    assert (v0, L) == pytest.approx((around.v0, around.L), rel=2e-3)
+    recording = made.recording(made.simulate(made.truth).x)
+    found = recording.recalibrated(around.v0, around.L)
+    assert found == pytest.approx((around.v0, around.L), rel=2e-3)
+    assert cost_by_sequence(recording.errors(*found)).mean() < 4e-4
 
 
 def test_without_excitation_an_effect_changes_nothing_that_is_measured():
