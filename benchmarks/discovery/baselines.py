@@ -98,7 +98,6 @@ def baselines_on_table(
                 "after": after,
                 "closed": (before - after) / (before - floor),
             },
-            "split": {"sealed": [sequences[i].name for i in confirmation]},
         }
     return reports
 

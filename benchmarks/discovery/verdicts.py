@@ -8,7 +8,7 @@ import pandas as pd
 from scipy.stats import binomtest
 
 #: Columns of numbers whose medians are in the table.
-MEDIANS = ("closure", "overlap", "relative", "of_size", "seconds")
+MEDIANS = ("closed", "overlap", "relative", "of_size", "seconds")
 
 
 def verdicts(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:

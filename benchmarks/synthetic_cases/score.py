@@ -19,8 +19,6 @@ PLACES = {"obstacle": ("x_o", "y_o"), "attraction": ("x_o", "y_o"), **EDGES}
 NEUTRAL = {"alpha": 1.0, "phi": 1.0, "lambda_": 1.0}
 #: A fault is located within this time, s.
 NEAR = 1.0
-#: Closure is not defined where a truth removes a smaller part of the excess.
-_LOWEST_SHARE = 0.05
 
 Content = dict[str, Any]
 #: What a report lacks that names nothing.
@@ -30,7 +28,6 @@ EMPTY: Content = {
     "gap": None,
     "screen": {"p_value": None},
     "clusters": {"open": None},
-    "split": {"sealed": []},
     "data_faults": [],
     "not_testable": [],
 }
@@ -121,7 +118,8 @@ def score(truth: Content, report: Content, classes: Mapping[str, str]) -> Conten
           is reported;
         * ``overlap``: of the estimated with the true interval of a zone or period;
         * ``before`` and ``after``: errors on confirmation sequences, m²; ``worse``: they
-          increased; ``closure``: see :func:`closure`;
+          increased; ``closed``: the share above measurement noise that was removed; ``reached``:
+          the share that the truth removes, in simulations of the generator;
         * ``screen_p``; ``screen_false``: an effect that is neither hidden nor a nuisance is
           significant at :data:`LEVEL` in the first screen; None without a p-value;
         * ``clusters``: number of exploration clusters.
@@ -156,7 +154,7 @@ def score(truth: Content, report: Content, classes: Mapping[str, str]) -> Conten
         "after": gap and gap["after"],
         # a model to which nothing was added is as good as before, up to rounding
         "worse": gap and gap["after"] > gap["before"] * (1 + 1e-9),
-        "closure": gap and closure(truth, report),
+        "closed": gap and gap["closed"],
         "screen_p": screen["p_value"],
         "screen_false": None
         if screen["p_value"] is None
@@ -251,23 +249,3 @@ def located_faults(hidden: list[Content], reported: list[Content]) -> Content:
     wrong = {tail(f["sequence"]) for f in reported} - {tail(f["sequence"]) for f in hidden}
     every = all(any(located(fault, item) for item in reported) for fault in hidden)
     return {"located": every if hidden else None, "blamed": bool(wrong)}
-
-
-def closure(truth: Content, report: Content) -> float | None:
-    """The share of the excess error that the diagnosis removed on confirmation sequences, relative
-    to the share that the truth removes there.
-
-    The excess is what exceeds the error of measurement. Both shares are those of their own costs:
-    those of a diagnosis depend on its leaders and estimated starts, those of the truth do not. None
-    without an effect, or where the truth removes next to nothing on these sequences.
-    """
-    sealed = {tail(name) for name in report["split"]["sealed"]}
-    cost = truth["cost"]
-    if cost is None or truth["case"]["arm"] == "no_excitation":
-        return None
-    names = [name for name in cost["oracle"] if tail(name) in sealed]
-    if not names:
-        return None
-    base, best = (sum(cost[model][name] for name in names) for model in ("base", "oracle"))
-    possible = (base - best) / max(base - len(names) * cost["floor"], 1e-300)
-    return float(report["gap"]["closed"] / possible) if possible >= _LOWEST_SHARE else None

@@ -46,10 +46,10 @@ def test_coefficients_become_an_effect(name, probes, theta, options):
 def test_baselines_are_scored_with_the_diagnosis():
     pytest.importorskip("pysindy")
     case = Case(domain="crowd", arm="single", effects=("drift",), strength="strong", n_sequences=8)
-    row = evaluate(case.to_dict(), baselines=True)
-    assert not row["failure"]
-    assert list(row["baselines"]) == list(BASELINES)
-    nothing, ensemble = row["baselines"]["recalibration"], row["baselines"]["ensemble_sindy"]
-    assert (nothing["named"], nothing["closure"], nothing["worse"]) == ("nothing", 0.0, False)
+    rows = {row["method"]: row for row in evaluate(case.to_dict(), baselines=True)["synthetic"]}
+    assert not rows["diagnosis"]["failure"]
+    assert list(rows) == ["diagnosis", *BASELINES]
+    nothing, ensemble = rows["recalibration"], rows["ensemble_sindy"]
+    assert (nothing["named"], nothing["closed"], nothing["worse"]) == ("", 0.0, False)
     assert "drift" in ensemble["named"]
-    assert ensemble["closure"] > 0.5
+    assert ensemble["closed"] > 0.5

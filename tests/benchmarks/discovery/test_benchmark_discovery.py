@@ -29,7 +29,6 @@ def relative_speed(path: Path, domain: str, **given: Any) -> SimpleNamespace:
     values = {name: v for name, v in vars(thresholds).items() if name.isupper()}
     CALLS.append({"domain": domain, "thresholds": values, **given})
     table = pd.read_csv(path)
-    names = sorted(f"trajectories/{name}" for name in table["sequence"].unique())
     if table["x"].groupby([table["sequence"], table["agent"]]).diff().abs().max() > 6.5:
         raise DataError("too far within one step")
     kappa = {"value": 0.4, "low": 0.0, "high": 1.0, "unit": "1"}
@@ -39,7 +38,6 @@ def relative_speed(path: Path, domain: str, **given: Any) -> SimpleNamespace:
             {"name": "relative_speed", "coefficients": {"kappa": kappa}, "alternatives": []}
         ],
         "gap": {"before": 2.0, "after": 1.0, "closed": 0.5},
-        "split": {"sealed": names[:1]},
     }
     return SimpleNamespace(plain=lambda: report)
 

@@ -53,11 +53,6 @@ def truth(*effects: str, arm: str = "single", **more: Any) -> dict[str, Any]:
         "data_faults": [],
         "not_testable": [],
         "strength": {"reached": 0.4},
-        "cost": {
-            "floor": 0.1,
-            "base": dict.fromkeys(NAMES, 2.0),
-            "oracle": dict(zip(NAMES, [1.0, 1.0, 1.2, 1.0], strict=True)),
-        },
     }
     return {**content, **more}
 
@@ -70,7 +65,6 @@ def report(*effects: str, verdict: str = "named", **more: Any) -> dict[str, Any]
         "not_testable": [],
         "leads": [],
         "gap": {"before": 2.0, "after": 2.0, "closed": 0.0},
-        "split": {"open": NAMES[:2], "sealed": NAMES[2:]},
         **more,
     }
 
@@ -247,15 +241,9 @@ def test_coefficients_are_compared_with_regard_to_what_means_no_effect():
     assert score(hidden, apart)["overlap"] == 0.0
 
 
-def test_closure_is_relative_to_what_the_truth_removes_on_confirmation_sequences():
-    possible = (2.0 - 1.1) / (2.0 - 0.1)  # the last two sequences
+def test_errors_on_confirmation_sequences_are_kept():
     found = report("relative_speed", gap={"before": 10.0, "after": 6.0, "closed": 0.5})
     row = score(truth("relative_speed"), found)
-    assert row["closure"] == pytest.approx(0.5 / possible)
-    assert not row["worse"]
+    assert (row["closed"], row["worse"]) == (0.5, False)
     found["gap"]["after"] = 10.1
     assert score(truth("relative_speed"), found)["worse"]
-
-
-def test_nothing_hidden_has_no_closure():
-    assert score(truth(arm="nothing", cost=None), report(verdict="none"))["closure"] is None
