@@ -98,7 +98,6 @@ def fuzz(targets: list[Target], scratch: Path, inputs: int, number: int) -> Iter
         inputs: number of files over all targets; where something is lost, more are tried.
         number: the same seed makes the same files.
     """
-
     for target in targets:
         row, counts = Row(target.name), scratch / "counts.json"
         words = scratch / "words.txt"

@@ -57,8 +57,8 @@ def named(cost: ResidualProblem, row: np.ndarray) -> dict[str, float]:
 
 def at_limits(cost: ResidualProblem, row: np.ndarray) -> list[str]:
     """Names of the parameters that ended at a limit."""
-    low, high = at_bounds(cost, row)
-    return [name for name, at in zip(named(cost, row), low | high, strict=True) if at]
+    bounds = at_bounds(row, cost.low, cost.high)
+    return [name for name, bound in zip(named(cost, row), bounds, strict=True) if bound]
 
 
 def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int) -> Result:
