@@ -15,8 +15,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from benchmarks.discovery.recover import Recovered
-from benchmarks.discovery.recovery import CASES
+from benchmarks.discovery.recovery import CASES, NORMAL, Recovered
 
 pytestmark = pytest.mark.slow
 
@@ -38,11 +37,12 @@ def recovered(name: str) -> Recovered:
 
 def check(found: Recovered, unknown: set[str], same: float = SAME) -> None:
     """All but the unknown are found, and said to be; intervals hold what was typed in."""
-    assert {n for n, known in zip(found.names, found.identified, strict=True) if not known} == (
-        unknown
-    )
-    assert (found.off[found.identified] < same).all()
-    assert (np.abs(found.score[found.identified]) < FAR).all()
+    parameters = found.parameters
+    assert set(parameters.index[~parameters["identified"]]) == unknown
+    identified = parameters[parameters["identified"]]
+    assert (identified["off"] < same).all()
+    score = (identified["measured"] - identified["typed"]) / (identified["half"] / NORMAL)
+    assert (score.abs() < FAR).all()
 
 
 @pytest.mark.parametrize("name", ["idm_euler", "idm_ballistic_rest", "krauss_crawl"])
@@ -57,7 +57,7 @@ def test_a_speed_that_nobody_reaches_is_not_identified(sumo: Path) -> None:
     found = recovered("krauss_moving")
     assert found.forward < ROUNDED
     check(found, {"v0"})
-    assert np.isinf(found.half[found.names.index("v0")])
+    assert np.isinf(found.parameters.loc["v0", "half"])
 
 
 def test_the_field_s_idm_differs_from_sumo_s_where_a_ballistic_step_ends_at_rest(
@@ -66,7 +66,7 @@ def test_the_field_s_idm_differs_from_sumo_s_where_a_ballistic_step_ends_at_rest
     # SUMO drives v dt/2 in it, here it is v²/(2 A): at most A dt²/8 less, A being what they brake
     # with, b at most as they come to rest; and each of seven stops behind the one ahead
     found = recovered("idm_ballistic")
-    once = found.typed[found.names.index("b")] * 0.1**2 / 8
+    once = found.parameters.loc["b", "typed"] * 0.1**2 / 8
     assert ROUNDED < found.worst < 7 * once
     # what 1 mm does: a hundredth of 0.1 m, which leave 0.3 %
     check(found, set(), same=3e-5)
@@ -78,9 +78,9 @@ def test_the_field_s_krauss_differs_from_sumo_s_in_the_last_metre_behind_who_sta
     # there SUMO drives at b dt until a centimetre is left, here the gap shrinks at its own rate
     # 1/T: at most the stretch itself, b dt (1 s)
     found = recovered("krauss_stopping")
-    stretch = found.typed[found.names.index("b")] * 0.1
+    stretch = found.parameters.loc["b", "typed"] * 0.1
     assert 1e-3 < found.worst < stretch
-    assert (found.off < 0.01).all()
+    assert (found.parameters["off"] < 0.01).all()
 
 
 def test_sumo_s_krauss_in_ballistic_steps_is_a_formula(sumo: Path) -> None:
@@ -106,13 +106,13 @@ def test_jupedsim_s_collision_free_speeds_are_the_same(jupedsim: ModuleType) -> 
     # directions here have 1e-6 m and 1e-12 added within their lengths
     assert found.worst < 1e-9
     # with errors of measurement the cost has many minima, and intervals are those of one of them
-    assert found.identified.all()
-    assert (found.off < SAME).all()
+    assert found.parameters["identified"].all()
+    assert (found.parameters["off"] < SAME).all()
 
 
 def test_jupedsim_s_centrifugal_force_is_the_same_but_for_who_stands(jupedsim: ModuleType) -> None:
     # the ellipse of somebody at 3 mm/s turns with any rounding: 1e-7 m become millimetres
     found = recovered("centrifugal")
     assert found.forward < 0.01
-    assert found.identified.all()
-    assert (found.off < 0.01).all()
+    assert found.parameters["identified"].all()
+    assert (found.parameters["off"] < 0.01).all()
