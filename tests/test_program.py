@@ -44,8 +44,3 @@ def test_the_program_lists_its_commands(
     assert commands == {path.stem for path in program.COMMANDS.glob("[a-z]*.py")}
     assert scripts - commands == {"benchmark", "benchmark_discovery", "fault_injection"}
     assert max(len(line) for line in said.splitlines()) <= 100
-    monkeypatch.setattr(sys, "argv", ["nnode", "discovr"])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert left.value.code == 2
-    assert "did you mean discover?" in capsys.readouterr().err

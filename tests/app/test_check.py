@@ -36,30 +36,6 @@ def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
     assert options["columns"]["vehicle"] == "Vehicle ID"
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["file=$T/absent.csv"], "there is no file"),
-        (["file=$T"], "is a folder"),
-        (["file=$T/junk.csv"], "is no text"),
-        (["file=$T/junk.csv", "domain=sea"], "domain=sea: expected traffic, crowd, or null"),
-        (["file=$T/junk.csv", "frame_rate=-1"], "frame_rate=-1.0: expected a positive number"),
-        ([], "file is missing; type file=VALUE"),
-        (["$T/junk.csv", "other.csv"], "other.csv is no option: expected NAME=VALUE"),
-    ],
-)
-def test_what_cannot_be_looked_at_is_told_in_a_line(
-    script: Script, tmp_path: Path, options: list[str], words: str
-) -> None:
-    (tmp_path / "junk.csv").write_bytes(bytes(range(256)))
-    given = [option.replace("$T", str(tmp_path)) for option in options]
-    done = script("check", *given, f"hydra.run.dir={tmp_path / 'run'}", status=None)
-    assert done.returncode in (1, 2)
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
-
-
 @pytest.fixture
 def pedpy(tmp_path: Path) -> Path:
     """People in the format of PedPy, in cm."""
