@@ -141,3 +141,5 @@ def test_the_social_force_does_not_depend_on_where_people_walk(form: str) -> Non
     people = [PEOPLE[form](crowd(seed)) for seed in range(4)]
     fitted = nnode.Calibrator(start, optimizer="gauss_newton").fit(people)
     np.testing.assert_allclose(fitted.parameters_.estimate, TRUTH, rtol=1e-3)
+    assert list(fitted.parameters_.unit) == ["N", "kg/s²", "kg/(m s)"]
+    assert {"x", "y", "vx", "vy"} <= set(fitted.predict(people).to_dataframe())

@@ -10,19 +10,15 @@ import pytest
 
 from nnode.app.saved_run import choose
 from nnode.calibrate.checkpoint import Checkpoint
-from nnode.data.sequence import Sequence
 from nnode.data.store import Store, write_store
 from nnode.errors import ConfigError
+from tests.builders import lane
 
 
 def store(folder: Path, recordings: str, **options: Any) -> Store:
     """Three sequences of each recording; a recording's hash is its name."""
-    x = np.arange(6.0).reshape(3, 2, 1)
-    sequences = [
-        Sequence(name=f"{r}/{i}", recording=r, time=np.arange(3.0), x=x)
-        for r in recordings
-        for i in range(3)
-    ]
+    x = np.arange(6.0).reshape(3, 2)
+    sequences = [lane(x, 1.0, name=f"{r}/{i}") for r in recordings for i in range(3)]
     files = {r: {"name": r, "sha256": r} for r in recordings}
     return write_store(folder, sequences, {"files": files, "options": options})
 

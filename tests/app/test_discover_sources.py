@@ -73,7 +73,8 @@ def test_a_diagnosis_ends_with_a_verdict(
     given = [*options, f"data={source}", f"data.path={path}"]
     given += [f"data.geometry={area}" for area in path.parent.glob("area.wkt")]
     folder = tmp_path / "run"
-    done = script("discover", *given, "discover.page=false", f"hydra.run.dir={folder}")
+    given += ["discover.page=false", "discover.compare=[]", f"hydra.run.dir={folder}"]
+    done = script("discover", *given)
     report: dict[str, Any] = json.loads((folder / "report.json").read_text())
     assert f"verdict: {report['verdict']}" in done.stdout
     # six open clusters are as many as it takes to test one effect

@@ -6,8 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
 import pytest
 
 import nnode
@@ -22,6 +20,7 @@ from nnode.errors import CheckpointError, ConfigError
 from nnode.exchange.running_sumo import Steps
 from nnode.model import build_model
 from tests.app.conftest import Script
+from tests.data.tables import saved, tidy
 
 
 @pytest.fixture(scope="module")
@@ -146,16 +145,9 @@ def test_lengths_are_asked_for_as_the_data_had_them(known: bool, tmp_path: Path)
     checkpoint = load_checkpoint(run / "checkpoints" / "best.pt")
     with pytest.raises(ConfigError, match=r"run/data, are not there.*lengths=true"):
         _has_lengths(checkpoint, str(run), checkpoint.build())
-    k = np.arange(20)
-    rows = [
-        pd.DataFrame({"sequence": "a", "time": 0.1 * k, "agent": n, "x": 30 * n + k})
-        for n in range(2)
-    ]
-    table = pd.concat(rows)
-    if known:
-        table["length"] = 4.5
-    table.to_csv(tmp_path / "a.csv", index=False)
-    prepare(TableOptions(domain="traffic", path=str(tmp_path / "a.csv")), run / "data")
+    table = tidy(samples=20, agents=2)
+    path = saved(tmp_path / "a.csv", table.assign(length=4.5) if known else table)
+    prepare(TableOptions(domain="traffic", path=str(path)), run / "data")
     assert _has_lengths(checkpoint, str(run), checkpoint.build()) is known
     # a law that does not ask
     assert _has_lengths(checkpoint, str(tmp_path), build_model(model_options("lin", "measured")))

@@ -13,14 +13,12 @@ from nnode.app.followers import by_driver, follower_errors, write_followers
 from nnode.data.clusters import index_of
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.simulation.base import Trajectory
+from tests.builders import lane
 
 
 def pair(number: int, samples: int) -> Sequence:
-    time = 0.1 * np.arange(samples)
-    x = np.stack([10 * time, 40 + 10 * time], 1)[:, :, None]
-    v = np.full_like(x, 10.0)
-    agents = ("driver", f"leader {number}")
-    return Sequence(name=f"run/{number}", recording="run", time=time, x=x, v=v, agents=agents)
+    x = np.arange(samples)[:, None] + [0.0, 40.0]
+    return lane(x, 0.1, v=10.0, name=f"run/{number}", agents=("driver", f"leader {number}"))
 
 
 def late(batch: Batch) -> Trajectory:
