@@ -42,7 +42,7 @@ WRONG = [
     ),
     ("nnode/simulation/base.py", "from nnode import load", "nnode.simulation -> nnode.app"),
     ("nnode/errors.py", "import nnode.files", "nnode.errors -> nnode.files"),
-    ("nnode/errors.py", "import benchmarks.synthetic_cases", "nnode -> benchmarks"),
+    ("nnode/app/laws.py", "import benchmarks.synthetic_cases", "nnode -> benchmarks"),
     (
         "benchmarks/synthetic_cases/case.py",
         "import nnode.model",
