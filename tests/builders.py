@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from nnode.data.sequence import Sequence
+from nnode.data.sequences import Sequences
 from nnode.discover.residuals.fit import Fit
 from nnode.model import Law, System, make_law
 
@@ -45,6 +48,13 @@ def straight(x: Any, v: Any, samples: int, dt: float, **more: Any) -> Sequence:
     time = dt * np.arange(samples)[:, None, None]
     path = np.asarray(x, float) + time * np.asarray(v, float)
     return people(path, dt, v=np.broadcast_to(v, path.shape).copy(), **more)
+
+
+def as_table(sequences: Iterable[Sequence]) -> pd.DataFrame:
+    """The tidy table of sequences, of which each has agents of its own."""
+    return Sequences(
+        replace(s, agents=tuple(f"{s.name}/{i}" for i in range(s.n_agents))) for s in sequences
+    ).to_dataframe()
 
 
 def linear(

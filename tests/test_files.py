@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from nnode.files import file_name, interpolation
 
-
 USUAL = ["sf", "n4", "sf_1-1_1_seed 3", "a.b", "sf'", "größe", "1,5 m"]
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.app.following import TRUE, pairs
+from tests.builders import as_table
 from tests.discover.platoons import platoons
 from tests.installed import Run, built, installed
 
@@ -72,11 +73,7 @@ def test_a_command_takes_what_its_script_takes(alone: Run, name: str) -> None:
 @pytest.mark.thorough
 def test_a_table_of_one_s_own_is_calibrated_evaluated_and_gone_on_with(alone: Run) -> None:
     work = Path(alone("python", "-c", "import os; print(os.getcwd())").stdout.strip())
-    rows = ["sequence,time,agent,x"]
-    for number, one in enumerate(platoons(number=4, seconds=6.0)):
-        for time, places in zip(one.time, one.x[..., 0], strict=True):
-            rows += [f"{number},{time},{number}/{i},{x}" for i, x in enumerate(places.tolist())]
-    (work / "mine.csv").write_text("\n".join(rows))
+    as_table(platoons(number=4, seconds=6.0)).to_csv(work / "mine.csv", index=False)
     done = alone(
         "nnode",
         "train",

@@ -7,11 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pandas as pd
 import pytest
 
 from tests.app.conftest import composed, examples
 from tests.app.following import table
+from tests.builders import as_table
 from tests.discover.platoons import platoons
 from tests.docs.test_tutorials import ROOT, blocks
 
@@ -44,14 +44,9 @@ def test_every_link_leads_somewhere() -> None:
 @pytest.mark.thorough
 def test_your_own_data_in_python(tmp_path: Path) -> None:
     text = "".join(t for lang, t in blocks(README) if lang == "python" and "mine.csv" in t)
-    rows = [
-        (number, time, f"{number}/{i}", x)
-        for number, one in enumerate(platoons(number=6, seconds=8.0))
-        for time, places in zip(one.time, one.x[..., 0], strict=True)
-        for i, x in enumerate(places)
-    ]
-    drives = pd.DataFrame(rows, columns=["platoon", "t", "car", "pos"])
-    drives.to_csv(tmp_path / "mine.csv", index=False)
+    drives = as_table(platoons(number=6, seconds=8.0)).drop(columns="recording")
+    names = {"sequence": "platoon", "time": "t", "agent": "car", "x": "pos"}
+    drives.rename(columns=names).to_csv(tmp_path / "mine.csv", index=False)
     said = in_a_folder(text, tmp_path)
     assert re.search(r" Log-likelihood +-?\d", said, re.M)
     assert re.search(r"^v0 +\d+(\.\d+)? .* m/s$", said, re.M)
