@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
 import signal
 import time
@@ -17,12 +16,9 @@ import pytest
 
 from nnode.app import discover as app
 from nnode.app import nearest_law
-from nnode.app.python.inputs import model_options
+from nnode.app.python.report import Report
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.data.readers.esimas import EsimasOptions
-from nnode.data.readers.table import TableOptions
 from nnode.discover import thresholds
-from nnode.discover.inputs import Inputs
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report import page
@@ -54,6 +50,7 @@ def overrides(table: Path, folder: Path) -> list[str]:
         "data.domain=traffic",
         f"hydra.run.dir={folder}",
         "discover.sealed=0.4",
+        "discover.compare=[idm]",
     ]
 
 
@@ -94,14 +91,19 @@ if __name__ == "__main__":
 """
 
 
+def with_a_fault(path: Path) -> Path:
+    """A table in which a vehicle of the first sequence jumps after 3 s."""
+    frame = pd.read_csv(lane(path, sequences=6, seconds=4.0, cars=3))
+    frame.loc[(frame["agent"] == "v0-1") & (frame["time"] > 3), "x"] += 40
+    frame.to_csv(path, index=False)
+    return path
+
+
 @pytest.fixture(scope="module")
 def run(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished diagnosis on a table in which one sequence is faulty, and what takes its model."""
     folder = tmp_path_factory.mktemp("discover")
-    table = lane(folder / "lane.csv", sequences=6, seconds=4.0, cars=3)
-    frame = pd.read_csv(table)
-    frame.loc[(frame["agent"] == "v0-1") & (frame["time"] > 3), "x"] += 40
-    frame.to_csv(table, index=False)
+    table = with_a_fault(folder / "lane.csv")
     given = [*overrides(table, folder / "run"), "discover.replay=false"]
     done = script(CHAIN, str(folder), *given)
     (folder / "run" / "shown.txt").write_text(done.stdout.partition("== evaluate")[0])
@@ -186,7 +188,6 @@ def test_training_goes_on_with_the_open_sequences(
     assert after.history[0]["parameters/speed_zone.alpha"] == pytest.approx(0.65)
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
 def test_a_signal_leaves_no_half_report(forks: Forks, run: Path, tmp_path: Path) -> None:
     sign = tmp_path / "sign"
     given = overrides(run.parent / "lane.csv", tmp_path / "run")
@@ -207,38 +208,25 @@ def test_effects_can_be_given_on_the_command_line() -> None:
     assert effects == [{"name": "relative_speed", "kappa": 0.3}]
 
 
-def job(model: dict[str, Any], data: Any, **options: Any) -> app.Job:
-    full = model_options(model, "measured")
-
-    def never() -> Inputs:
-        pytest.fail("data were read")
-
-    return app._job(full, data, {}, {}, DiscoverOptions(**options), never)
-
-
-def test_model_and_data_of_two_domains_are_refused() -> None:
-    with pytest.raises(ConfigError, match="model=social_force is a crowd model, data=esimas are"):
-        job({"term": "social_force"}, EsimasOptions())
-
-
-def test_an_unknown_effect_is_refused_before_any_data_are_read() -> None:
-    data = TableOptions(domain="traffic", path="there/is/none.csv")
-    with pytest.raises(ConfigError, match=r"no traffic effect relative_sped.*relative_speed\?"):
-        job({"term": "lin"}, data, effects=["relative_sped"])
-
-
 @pytest.mark.parametrize(
-    ("model", "message"),
+    ("model", "effects", "message"),
     [
-        ({"term": "linn"}, r"model\.term=linn is unknown"),
-        ({}, r"model\.term= is unknown"),
-        ({"term": "lin", "w0": 3}, "w0"),
-        ({"term": "lin", "v0": "fast"}, "v0|fast"),
+        ({"term": "social_force"}, None, "model=social_force is a crowd model, data='table' are"),
+        ({"term": "lin"}, ["relative_sped"], r"no traffic effect relative_sped.*relative_speed\?"),
+        ({"term": "linn"}, None, r"model\.term=linn is unknown"),
+        ({}, None, r"model\.term= is unknown"),
+        ({"term": "lin", "w0": 3}, None, "w0"),
+        ({"term": "lin", "v0": "fast"}, None, "v0|fast"),
     ],
 )
-def test_wrong_options_of_a_model_are_refused(model: dict[str, Any], message: str) -> None:
+def test_wrong_options_are_refused_before_any_data_are_read(
+    tmp_path: Path, model: dict[str, Any], effects: list[str] | None, message: str
+) -> None:
+    table = tmp_path / "one_vehicle.csv"  # which no reader takes
+    table.write_text("sequence,time,agent,x\n0,0,a,0\n0,1,a,9\n")
+    options = DiscoverOptions(effects=effects)
     with pytest.raises(ConfigError, match=message):
-        app.diagnose_table("any.csv", "traffic", model=model)
+        app.diagnose_table(table, "traffic", model=model, options=options)
 
 
 @pytest.fixture
@@ -252,6 +240,15 @@ def by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page, "draw", never)
 
 
+def lin_diagnosed(folder: Path) -> Report:
+    """The diagnosis of the linear law by hand, without a page; the law is compared with idm."""
+    table = lane(folder / "lane.csv", sequences=4, seconds=3.0, cars=3)
+    chosen = DiscoverOptions(page=False, compare=["idm"])
+    return app.diagnose_table(
+        table, "traffic", model={"term": "lin"}, folder=folder / "run", options=chosen
+    )
+
+
 @pytest.mark.usefixtures("by_hand")
 def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> None:
     table, walls = corridor(tmp_path / "walk.csv", sequences=4, seconds=2.0, people=4)
@@ -263,6 +260,7 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
         model={"term": "social_force", "B": 0.3, "walls": False},
         walls=walls,
         seed=3,
+        options=DiscoverOptions(compare=[]),
     ).plain()
     assert report["verdict"] == "named"
     assert report["model"] == "social_force"
@@ -275,14 +273,7 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
 def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(nearest_law, "with_effects", lambda laws, effects: laws)
     monkeypatch.setattr(thresholds, "STRICT", 0.5)
-    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
-    report = app.diagnose_table(
-        table,
-        "traffic",
-        model={"term": "lin"},
-        folder=tmp_path / "run",
-        options=DiscoverOptions(page=False, compare=["idm"]),
-    )
+    report = lin_diagnosed(tmp_path)
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert report.nearest is not None
     assert report.nearest.diagnosis.model == "idm"
@@ -299,9 +290,7 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
 
 @pytest.mark.usefixtures("by_hand")
 def test_a_law_that_is_not_rejected_is_diagnosed_alone(tmp_path: Path) -> None:
-    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
-    options = DiscoverOptions(page=False, compare=["idm"])
-    report = app.diagnose_table(table, "traffic", model={"term": "lin"}, options=options)
+    report = lin_diagnosed(tmp_path)
     laws = report.plain()["laws"]
     assert laws["ranking"][0]["name"] == "idm"
     assert laws["ranking"][1]["p_value"] > 0.01
@@ -325,10 +314,9 @@ def test_laws_are_compared_again_with_the_missing_effect(
         return dataclasses.replace(outcome, searched=system) if keeps else outcome
 
     monkeypatch.setattr(nearest_law, "diagnose", diagnose)
-    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
-    report = app.diagnose_table(
-        table, "traffic", model={"term": "lin"}, options=DiscoverOptions(compare=["idm"])
-    )
+    monkeypatch.setattr(thresholds, "STRICT", 0.5)
+    monkeypatch.setattr(thresholds, "LEVEL", 0.5)
+    report = lin_diagnosed(tmp_path)
     assert report.nearest is None
     first, again = report.diagnosis.laws, report.diagnosis.laws_again
     assert first is not None
@@ -340,15 +328,12 @@ def test_laws_are_compared_again_with_the_missing_effect(
 
 @pytest.mark.usefixtures("by_hand")
 def test_faults_stand_beside_the_verdict(tmp_path: Path) -> None:
-    table = lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3)
-    frame = pd.read_csv(table)
-    frame.loc[(frame["agent"] == "v1-1") & (frame["time"] > 41), "x"] += 40
-    frame.to_csv(table, index=False)
-    report = app.diagnose_table(table, "traffic", model={"term": "lin"}).plain()
+    table, options = with_a_fault(tmp_path / "lane.csv"), DiscoverOptions(compare=[])
+    report = app.diagnose_table(table, "traffic", model={"term": "lin"}, options=options).plain()
     assert report["verdict"] == "named"
-    faults = {(fault["sequence"], *fault["agents"]) for fault in report["data_faults"]}
-    assert ("lane/1", "v1-1") in {fault[:2] for fault in faults}
-    assert "lane/1" not in report["split"]["open"] + report["split"]["sealed"]
+    faults = [(fault["sequence"], *fault["agents"]) for fault in report["data_faults"]]
+    assert ("lane/0", "v0-1") in {fault[:2] for fault in faults}
+    assert "lane/0" not in report["split"]["open"] + report["split"]["sealed"]
 
 
 @pytest.mark.slow

@@ -73,7 +73,8 @@ def test_a_notebook_takes_such_a_table(tmp_path: Path) -> None:
 
 
 def test_a_diagnosis_needs_the_folder_alone(script: Script, table: Path, tmp_path: Path) -> None:
-    script("discover", f"data.prepared={table}", "discover.page=false", f"hydra.run.dir={tmp_path}")
+    options = ["discover.page=false", "discover.compare=[]", f"hydra.run.dir={tmp_path}"]
+    script("discover", f"data.prepared={table}", *options)
     assert (tmp_path / "report.json").is_file()
 
 
