@@ -75,32 +75,39 @@ def test_the_typical_driver_and_every_driver_are_found(
     assert found.drivers.plot().axes[0].get_xlabel() == "T (s)"
 
 
-def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
-    script: Script, tmp_path: Path, small: pd.DataFrame
-) -> None:
-    small.to_parquet(tmp_path / "table.parquet")
-    script(
-        "train",
+def options(table: pd.DataFrame, folder: Path) -> list[str]:
+    """Of the same calibration by the command."""
+    table.to_parquet(folder / "table.parquet")
+    return [
         "model=idm",
         "trainer.drivers=[T]",
-        "data=table",
         "seed=3",
+        "data=table",
         "data.domain=traffic",
-        f"data.path={tmp_path / 'table.parquet'}",
-        f"hydra.run.dir={tmp_path}",
-    )
-    written = json.loads((tmp_path / "result.json").read_text())
-    found = nnode.Calibrator("idm", drivers=["T"], seed=3, heldout=0.2).fit(small).result_
+        "data.split.heldout=0",
+        f"data.path={folder / 'table.parquet'}",
+        f"hydra.run.dir={folder / 'run'}",
+    ]
+
+
+def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
+    script: Script, tmp_path: Path, small: pd.DataFrame, fitted: nnode.Calibrator
+) -> None:
+    script("train", *options(small, tmp_path))
+    run = tmp_path / "run"
+    written = json.loads((run / "result.json").read_text())
+    found = fitted.result_
     assert found.drivers is not None
     ours = found.plain(written["paths"])
     for key in ("parameters", "drivers"):
         assert json.dumps(ours[key], sort_keys=True) == json.dumps(written[key], sort_keys=True)
-    own = pd.read_csv(tmp_path / "drivers.csv", dtype={"driver": str})
+    own = pd.read_csv(run / "drivers.csv", dtype={"driver": str})
     pd.testing.assert_frame_equal(own, found.drivers.table)
-    model = nnode.load(tmp_path / "checkpoints" / "best.pt")
+    model = nnode.load(run / "checkpoints" / "best.pt")
     values = {name: float(value) for name, (value, _) in model.physical().items()}
     assert values == {name: row["value"] for name, row in written["parameters"].items()}
-    script("evaluate", f"checkpoint={tmp_path}/checkpoints/best.pt", f"hydra.run.dir={tmp_path}/e")
+    evaluation = [f"checkpoint={run}/checkpoints/best.pt", "part=train", "replay=false"]
+    script("evaluate", *evaluation, f"hydra.run.dir={tmp_path}/evaluation")
 
 
 @pytest.mark.parametrize("model", ["idm", "fvdm"])
@@ -176,18 +183,8 @@ def test_too_few_followers_are_refused(small: pd.DataFrame) -> None:
 def test_a_run_that_is_stopped_while_drivers_are_told_apart_goes_on(
     script: Script, tmp_path: Path, small: pd.DataFrame, fitted: nnode.Calibrator
 ) -> None:
-    small.to_parquet(tmp_path / "table.parquet")
     folder = tmp_path / "run"
-    words = [
-        "model=idm",
-        "trainer.drivers=[T]",
-        "data=table",
-        "seed=3",
-        "data.domain=traffic",
-        "data.split.heldout=0",
-        f"data.path={tmp_path / 'table.parquet'}",
-    ]
-    process = background(*words, f"hydra.run.dir={folder}")
+    process = background(*options(small, tmp_path))
     assert process.stdout is not None
     for line in process.stdout:
         if "with drivers who differ" in line:
