@@ -84,7 +84,6 @@ def test_elsewhere_a_line_comes_during_a_long_step_as_well(
     assert not [one for one in threading.enumerate() if one.name == "progress"]
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
 @pytest.mark.parametrize("forks", [False, True])
 def test_on_a_terminal_there_is_a_bar_on_standard_error_alone(tmp_path: Path, forks: bool) -> None:
     leader, follower = pty.openpty()

@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from benchmarks.config import register
 from nnode.app.cli import saved
 from nnode.data.synthetic import demo_data
+from tests.app.following import table
 from tests.app.forked import Forks
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,31 +68,6 @@ def environment() -> dict[str, str]:
     return {**os.environ, "OMP_NUM_THREADS": "1", "NNODE_DATA": ""}
 
 
-def ended(
-    done: subprocess.CompletedProcess[str], status: int | None
-) -> subprocess.CompletedProcess[str]:
-    """A script's result, which ended with this exit status; None allows any."""
-    assert status in (None, done.returncode), done.stdout + done.stderr
-    return done
-
-
-def start_script(
-    name: str, *overrides: str, status: int | None = 0, cwd: Path = ROOT, **env: str
-) -> subprocess.CompletedProcess[str]:
-    """What :func:`started` gives; in place of a script's name may stand code, of several lines."""
-    what = ["-c", name] if "\n" in name else [f"scripts/{name}.py"]
-    done = subprocess.run(
-        [sys.executable, *what, *overrides],
-        cwd=cwd,
-        env={**environment(), **env},
-        capture_output=True,
-        text=True,
-        timeout=1500,
-        check=False,
-    )
-    return ended(done, status)
-
-
 def background(
     *command: str, program: Sequence[str] = (sys.executable, "scripts/train.py"), **env: str
 ) -> subprocess.Popen[str]:
@@ -107,31 +83,34 @@ def background(
 
 
 @pytest.fixture(scope="session")
-def started() -> Script:
-    """Run ``scripts/<name>.py`` with overrides in a new Python, as a user does.
-
-    The exit status must be ``status``, 0 by default; None allows any.
-    """
-    return start_script
-
-
-@pytest.fixture(scope="session")
 def forks() -> Iterator[Forks]:
     """What runs scripts without seconds of imports."""
-    found = Forks(environment())
-    yield found
-    found.close()
+    processes = Forks(ROOT, environment())
+    yield processes
+    processes.close()
 
 
 @pytest.fixture(scope="session")
 def script(forks: Forks) -> Script:
-    """The same as ``started`` in a process that is forked, where the system can."""
-    if not hasattr(os, "fork"):
-        return start_script
+    """Run ``scripts/<name>.py`` with overrides, as a user does, in a process that is forked.
 
-    def run(
-        name: str, *overrides: str, status: int | None = 0, **env: str
-    ) -> subprocess.CompletedProcess[str]:
-        return ended(forks.run(name, *overrides, **env), status)
+    The exit status must be ``status``, 0 by default; None allows any.
+    """
+    return forks.run
 
-    return run
+
+@pytest.fixture(scope="session")
+def idm_run(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short training of vehicles that follow the model exactly."""
+    folder = tmp_path_factory.mktemp("idm")
+    table(10, 10.0).to_csv(folder / "mine.csv", index=False)
+    script(
+        "train",
+        "model=idm",
+        "data=table",
+        "data.domain=traffic",
+        f"data.path={folder}/mine.csv",
+        "trainer.max_epochs=2",
+        f"hydra.run.dir={folder}/run",
+    )
+    return folder / "run"

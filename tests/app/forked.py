@@ -16,14 +16,12 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from benchmarks.fault_injection.child import Child, script
 
-ROOT = Path(__file__).resolve().parents[2]
 #: What scripts use of the libraries and of the package.
 LOADED = (
     "matplotlib.pyplot",
@@ -67,29 +65,27 @@ class Forks:
     """Runs ``scripts/<name>.py``; the process it forks from is started with the first of them.
 
     Args:
+        root: of the checkout, where the scripts run.
         environment: of the processes.
     """
 
-    def __init__(self, environment: dict[str, str]) -> None:
-        self._environment = environment
+    def __init__(self, root: Path, environment: dict[str, str]) -> None:
+        self._root, self._environment = root, environment
         self._server: subprocess.Popen[str] | None = None
         self._folder = tempfile.TemporaryDirectory(prefix="forked-")
         self._number = 0
 
-    def run(self, name: str, *overrides: str, **env: str) -> subprocess.CompletedProcess[str]:
-        """As ``subprocess.run`` with captured text."""
-        return self.together(name, overrides, [env])[0]
+    def run(
+        self, name: str, *overrides: str, status: int | None = 0, **env: str
+    ) -> subprocess.CompletedProcess[str]:
+        """As ``subprocess.run`` with captured text.
 
-    def together(
-        self, name: str, overrides: Sequence[str], envs: list[dict[str, str]]
-    ) -> list[subprocess.CompletedProcess[str]]:
-        """One script in several processes at a time, each with variables of its own."""
-        started = [self.start(name, *overrides, **env) for env in envs]
-        said = [process.communicate() for process in started]
-        return [
-            subprocess.CompletedProcess([name, *overrides], process.returncode or 0, *words)
-            for process, words in zip(started, said, strict=True)
-        ]
+        The exit status must be ``status``; None allows any.
+        """
+        process = self.start(name, *overrides, **env)
+        out, errors = process.communicate()
+        assert status in (None, process.returncode), out + errors
+        return subprocess.CompletedProcess(name, process.returncode or 0, out, errors)
 
     def start(self, name: str, *overrides: str, **env: str) -> Forked:
         """As ``subprocess.Popen``; in place of a script's name may stand code, of several lines."""
@@ -107,7 +103,7 @@ class Forks:
         if self._server is None:
             self._server = subprocess.Popen(
                 [sys.executable, "-m", "tests.app.forked"],
-                cwd=ROOT,
+                cwd=self._root,
                 env=self._environment,
                 text=True,
                 stdin=subprocess.PIPE,
@@ -135,11 +131,10 @@ def typed(order: dict[str, Any]) -> None:
     sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w"), open(2, "w")  # noqa: SIM115
     name, overrides = order["name"], list(order["overrides"])
     if "\n" in name:
-        os.chdir(ROOT)
         sys.argv = ["-c", *overrides]
         exec(name, {"__name__": "__main__"})
     else:
-        script(ROOT, name, overrides)
+        script(Path.cwd(), name, overrides)
 
 
 def main() -> None:

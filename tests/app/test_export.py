@@ -27,8 +27,9 @@ from nnode.model.system import Crowd
 from tests.app.conftest import Script
 
 
-def trained(script: Script, raw: Path, folder: Path, domain: str, model: str) -> Path:
+def trained(script: Script, raw: Path, domain: str, model: str) -> Path:
     """The folder of a short training."""
+    folder = raw.with_name(f"{raw.name}-{domain}")
     script(
         "train",
         f"experiment=demo_{domain}",
@@ -41,13 +42,8 @@ def trained(script: Script, raw: Path, folder: Path, domain: str, model: str) ->
 
 
 @pytest.fixture(scope="module")
-def traffic(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained(script, raw, tmp_path_factory.mktemp("runs") / "traffic", "traffic", "lin")
-
-
-@pytest.fixture(scope="module")
-def crowd(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained(script, raw, tmp_path_factory.mktemp("runs") / "crowd", "crowd", "sf")
+def traffic(script: Script, raw: Path) -> Path:
+    return trained(script, raw, "traffic", "lin")
 
 
 def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Path) -> None:
@@ -92,13 +88,11 @@ def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Pat
 
 
 def test_idm_s_vehicle_type_has_the_run_s_intervals(
-    script: Script, raw: Path, tmp_path: Path
+    script: Script, idm_run: Path, tmp_path: Path
 ) -> None:
-    run, out = tmp_path / "run", tmp_path / "out"
-    script("train", "model=idm", "data=demo_traffic", f"data.source={raw}", f"hydra.run.dir={run}")
-    found = json.loads((run / "result.json").read_text())["parameters"]
-    script("export", f"run={run}", "to=sumo", f"hydra.run.dir={out}")
-    text = (out / "vtype.add.xml").read_text()
+    found = json.loads((idm_run / "result.json").read_text())["parameters"]
+    script("export", f"run={idm_run}", "to=sumo", f"hydra.run.dir={tmp_path}")
+    text = (tmp_path / "vtype.add.xml").read_text()
     known = [name for name, own in found.items() if own["low"] is not None]
     assert known
     for name in known:
@@ -106,12 +100,13 @@ def test_idm_s_vehicle_type_has_the_run_s_intervals(
         short = name.rpartition(".")[2]
         interval = f"95 % [{own['low']:.6g}, {own['high']:.6g}]"
         assert f"<!-- {short} = {own['value']:.6g} {own['unit']}, {interval} -->" in text
-    assert intervals_of(str(run)) == found
+    assert intervals_of(str(idm_run)) == found
     assert intervals_of(str(tmp_path)) == {}
 
 
 @pytest.mark.slow
-def test_crowd_held_out_and_simulated(script: Script, crowd: Path, tmp_path: Path) -> None:
+def test_crowd_held_out_and_simulated(script: Script, raw: Path, tmp_path: Path) -> None:
+    crowd = trained(script, raw, "crowd", "sf")
     script(
         "export",
         f"run={crowd}",

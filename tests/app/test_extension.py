@@ -10,9 +10,8 @@ import html
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from subprocess import CompletedProcess
 
 import numpy as np
 import pandas as pd
@@ -20,8 +19,9 @@ import pytest
 
 from benchmarks.programs import sumo as by_sumo
 from nnode.data.readers.sumo import SumoOptions, read_sumo
-from nnode.data.sequence import Sequence
-from tests.app.conftest import ROOT, Script, start_script
+from tests.app.conftest import ROOT, Script, environment
+from tests.app.forked import Forks
+from tests.builders import as_table
 from tests.discover import walkers
 from tests.discover.platoons import platoons
 
@@ -110,8 +110,6 @@ seen = DriverInputs(v=np.full(2, 9.0), gap=gap, v_1=np.full(2, 9.0), length_1=np
 print(json.dumps({"package": nnode.__file__, "speeds": drivers.speeds(0.0, seen).tolist()}))
 """
 
-Copy = Callable[..., CompletedProcess[str]]
-
 
 def speeds(x: np.ndarray) -> np.ndarray:
     """Of followers, m/s, by law and effect; ``x`` with the leader's place behind."""
@@ -123,23 +121,6 @@ def waves(x: np.ndarray) -> np.ndarray:
     """Of people at ``(..., 2)``, m/s²."""
     phase = x[..., 0] / 1.5
     return C * np.stack([np.sin(phase), np.cos(phase)], -1)
-
-
-def table(sequences: list[Sequence]) -> pd.DataFrame:
-    """A tidy table; agents are numbered over all sequences."""
-    frames = []
-    for i, s in enumerate(sequences):
-        n, k, dims = s.n_agents, s.n_samples, s.x.shape[2]
-        columns = dict(zip("xy", s.x.reshape(-1, dims).T, strict=False))
-        if s.destination is not None:
-            columns |= dict(zip(("dest_x", "dest_y"), np.tile(s.destination.T, k), strict=True))
-        ids = {
-            "sequence": i,
-            "time": np.repeat(s.time, n),
-            "agent": np.tile(np.arange(n) + n * i, k),
-        }
-        frames.append(pd.DataFrame(ids | columns))
-    return pd.concat(frames)
 
 
 @pytest.fixture(scope="module")
@@ -154,27 +135,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, text in (("lane", HILLS), ("crowd", WAVES)):
         with (found / "nnode" / "model" / "effects" / f"{name}.py").open("a") as file:
             file.write(text)
-    driven = platoons(lambda x, *_: speeds(x), number=20, seconds=25.0, seed=4)
-    table(driven).to_csv(found / "platoons.csv", index=False)
+    driven = platoons(lambda x, *_: speeds(x), number=16, vehicles=4, seconds=16.0, seed=4)
+    as_table(driven).to_csv(found / "platoons.csv", index=False)
     walked = walkers.crowd(lambda x, *_: waves(x), sequences=17, samples=40)
-    table(walked).to_csv(found / "people.csv", index=False)
+    as_table(walked).to_csv(found / "people.csv", index=False)
     walls = pd.DataFrame(walkers.WALLS, columns=["x1", "y1", "x2", "y2"])
     walls.to_csv(found / "walls.csv", index=False)
     return found
 
 
 @pytest.fixture(scope="module")
-def copy(folder: Path) -> Copy:
+def copy(folder: Path) -> Iterator[Script]:
     """Run a script of the copy, or code."""
-
-    def run(name: str, *words: str, **env: str) -> CompletedProcess[str]:
-        path = os.pathsep.join([str(folder), str(ROOT), os.environ.get("PYTHONPATH", "")])
-        return start_script(name, *words, cwd=folder, PYTHONPATH=path, PYTHONSAFEPATH="1", **env)
-
-    return run
+    path = os.pathsep.join([str(folder), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    processes = Forks(folder, {**environment(), "PYTHONPATH": path, "PYTHONSAFEPATH": "1"})
+    yield processes.run
+    processes.close()
 
 
-def test_every_engine_and_what_drivers_do(copy: Copy, folder: Path) -> None:
+def test_every_engine_and_what_drivers_do(copy: Script, folder: Path) -> None:
     done = copy(PROGRAM)
     found = json.loads(done.stdout)
     assert Path(found["package"]).parents[1] == folder
@@ -183,14 +162,9 @@ def test_every_engine_and_what_drivers_do(copy: Copy, folder: Path) -> None:
     np.testing.assert_allclose(found["speeds"], wanted, rtol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def trained(copy: Copy, folder: Path) -> Path:
-    """The folder of a run."""
-    run = folder / "run"
-    copy(
-        "train",
-        "model=saturating",
-        "model.leader=measured",
+def options(folder: Path, run: Path) -> list[str]:
+    """Of a training of the law and the effect of lanes."""
+    return [
         "model.effects=[hills]",
         "data=table",
         "data.domain=traffic",
@@ -199,7 +173,14 @@ def trained(copy: Copy, folder: Path) -> Path:
         "optimizer=gauss_newton",
         "trainer.max_epochs=30",
         f"hydra.run.dir={run}",
-    )
+    ]
+
+
+@pytest.fixture(scope="module")
+def trained(copy: Script, folder: Path) -> Path:
+    """The folder of a run."""
+    run = folder / "run"
+    copy("train", "model=saturating", "model.leader=measured", *options(folder, run))
     return run
 
 
@@ -222,34 +203,21 @@ def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path
     head = "defaults: [formula_schema, _self_]\nname: saturating\nleader: measured\nlaw:"
     (conf / "mine.yaml").write_text(head + LAWS["saturating"], "utf-8")
     (tmp_path / "effects.py").write_text(IMPORTS + HILLS)
-    script(
-        "train",
-        "--config-dir",
-        str(conf.parent),
-        "model=mine",
-        "model.effects=[hills]",
-        "data=table",
-        "data.domain=traffic",
-        f"data.path={folder / 'platoons.csv'}",
-        "solver=fused",
-        "optimizer=lbfgs",
-        "trainer.max_epochs=30",
-        f"hydra.run.dir={tmp_path / 'run'}",
-        NNODE_EFFECTS=str(tmp_path / "effects.py"),
-    )
+    given = ["--config-dir", str(conf.parent), "model=mine", *options(folder, tmp_path / "run")]
+    script("train", *given, NNODE_EFFECTS=str(tmp_path / "effects.py"))
     assert estimates(tmp_path / "run") == pytest.approx(TRUTH, rel=0.02)
 
 
 @pytest.mark.parametrize("law", ["polite", "strolling"])
-def test_people_are_trained(copy: Copy, folder: Path, law: str, tmp_path: Path) -> None:
+def test_people_are_trained(copy: Script, law: str, tmp_path: Path) -> None:
     copy(
         "train",
         f"model={law}",
         *["model.effects=[waves]"] * (law == "polite"),
         "data=table",
         "data.domain=crowd",
-        f"data.path={folder / 'people.csv'}",
-        f"data.walls={folder / 'walls.csv'}",
+        "data.path=people.csv",
+        "data.walls=walls.csv",
         "solver=fused",
         "trainer.max_epochs=1",
         f"hydra.run.dir={tmp_path}",
@@ -261,35 +229,27 @@ def test_people_are_trained(copy: Copy, folder: Path, law: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("law", "effect", "strength", "value", "data"),
+    ("effect", "strength", "value", "given"),
     [
-        ("saturating", "hills", "w", W, ("traffic", "platoons.csv")),
-        ("polite", "waves", "c", C, ("crowd", "people.csv", "data.walls=walls.csv")),
+        (
+            "hills",
+            "w",
+            W,
+            "model=saturating model.leader=measured data.domain=traffic data.path=platoons.csv",
+        ),
+        (
+            "waves",
+            "c",
+            C,
+            "model=polite data.domain=crowd data.path=people.csv data.walls=walls.csv",
+        ),
     ],
 )
 def test_it_is_found_and_shown(
-    copy: Copy,
-    law: str,
-    effect: str,
-    strength: str,
-    value: float,
-    data: tuple[str, ...],
-    tmp_path: Path,
+    copy: Script, effect: str, strength: str, value: float, given: str, tmp_path: Path
 ) -> None:
-    domain, table, *walls = data
-    leader = ["model.leader=measured"] * (domain == "traffic")
-    copy(
-        "discover",
-        f"model={law}",
-        *leader,
-        "data=table",
-        f"data.domain={domain}",
-        f"data.path={table}",
-        *walls,
-        "discover.compare=[]",
-        "discover.structure=false",
-        f"hydra.run.dir={tmp_path}",
-    )
+    alone = ["discover.compare=[]", "discover.structure=false", f"hydra.run.dir={tmp_path}"]
+    copy("discover", "data=table", *given.split(), *alone)
     found = json.loads((tmp_path / "report.json").read_text())
     assert (found["verdict"], [one["name"] for one in found["effects"]]) == ("named", [effect])
     (named,) = found["effects"]
@@ -302,7 +262,7 @@ def test_it_is_found_and_shown(
     assert named["formula"] in page
 
 
-def test_it_drives_in_sumo(copy: Copy, trained: Path, tmp_path: Path) -> None:
+def test_it_drives_in_sumo(copy: Script, trained: Path, tmp_path: Path) -> None:
     by_sumo.write_scene(
         Path(pytest.importorskip("sumo").SUMO_HOME), tmp_path, "Krauss", {"decel": 4.5}
     )

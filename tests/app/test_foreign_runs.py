@@ -20,6 +20,7 @@ from nnode.app.python.inputs import model_options
 from nnode.calibrate.checkpoint import Checkpoint, save_checkpoint
 from nnode.model import build_model
 from tests.app.conftest import Script
+from tests.data.tables import saved, tidy
 
 pytestmark = pytest.mark.thorough
 
@@ -34,13 +35,7 @@ LAW = {
 
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
-    """Three cars at one speed."""
-    rows = [
-        ("s", round(0.2 * k, 3), f"car{n}", 25.0 * n + 3.0 * k) for k in range(20) for n in range(3)
-    ]
-    path = tmp_path / "cars.csv"
-    pd.DataFrame(rows, columns=["sequence", "time", "agent", "x"]).to_csv(path, index=False)
-    return path
+    return saved(tmp_path / "cars.csv", tidy(samples=40, agents=3))
 
 
 @pytest.fixture
@@ -86,10 +81,10 @@ def made(tmp_path: Path, table: Path) -> Made:
 
 
 def evaluated(
-    started: Script, path: Path, folder: Path, status: int = 0, **env: str
+    script: Script, path: Path, folder: Path, status: int = 0, **env: str
 ) -> subprocess.CompletedProcess[str]:
     words = (f"checkpoint={path}", "part=all", "replay=false", f"hydra.run.dir={folder}")
-    return started("evaluate", *words, status=status, **env)
+    return script("evaluate", *words, status=status, **env)
 
 
 @pytest.mark.parametrize(
@@ -97,15 +92,15 @@ def evaluated(
     [("states", "a: {}"), ("states", "[{}]"), ("delayed", "[{}].b"), ("where", "a=[{}]")],
 )
 def test_a_name_in_a_law_is_no_code(
-    started: Script, made: Made, tmp_path: Path, kind: str, name: str
+    script: Script, made: Made, tmp_path: Path, kind: str, name: str
 ) -> None:
     entries = {"states": ["m/s", "0*v0/T", "0*v0"], "delayed": ["v", "m/s", "T"], "where": "gap"}
     law = {**LAW, "remembered": 1, kind: {"good": entries[kind]}}
-    done = evaluated(started, made(law), tmp_path / "honest", NNODE_CACHE=str(tmp_path / "cache"))
+    done = evaluated(script, made(law), tmp_path / "honest", NNODE_CACHE=str(tmp_path / "cache"))
     trap = tmp_path / "trap"
     code = f'__import__("pathlib").Path("{trap}").touch()'
     bad = made({**law, kind: {name.format(code): entries[kind]}})
-    done = evaluated(started, bad, tmp_path / "out", 2, NNODE_CACHE=str(tmp_path / "cache"))
+    done = evaluated(script, bad, tmp_path / "out", 2, NNODE_CACHE=str(tmp_path / "cache"))
     assert not trap.exists()
     assert "cannot be a name" in done.stderr
     assert "Traceback" not in done.stderr
@@ -142,7 +137,7 @@ def callbacks(folder: Path, trap: Path) -> str:
     ],
 )
 def test_a_run_brings_no_configuration(
-    started: Script, made: Made, tmp_path: Path, command: str, option: str, group: str
+    script: Script, made: Made, tmp_path: Path, command: str, option: str, group: str
 ) -> None:
     trap, base = tmp_path / "trap", {"data": "table", "solver": "fused"}[group]
     file = tmp_path / "theirs.yaml"
@@ -151,15 +146,15 @@ def test_a_run_brings_no_configuration(
     )
     up = "../" * 15 + str(file.with_suffix("")).lstrip("/")
     path = made(groups={group: up})
-    done = started(command, option.format(path), f"hydra.run.dir={tmp_path / 'out'}", status=1)
+    done = script(command, option.format(path), f"hydra.run.dir={tmp_path / 'out'}", status=1)
     assert not trap.exists()
     assert f"and there is no such file in conf/{group}" in done.stderr
 
 
-def test_nor_does_prepared_data(started: Script, table: Path, tmp_path: Path) -> None:
+def test_nor_does_prepared_data(script: Script, table: Path, tmp_path: Path) -> None:
     store, trap = tmp_path / "store", tmp_path / "trap"
     words = ("data=table", f"data.path={table}", "data.domain=traffic")
-    started("prepare_data", *words, f"hydra.run.dir={store}")
+    script("prepare_data", *words, f"hydra.run.dir={store}")
     (store / "worse.yaml").write_text("# @package _global_\n" + callbacks(store, trap))
     up = "../" * 15 + str(store).lstrip("/")
     (store / "evil.yaml").write_text(
@@ -170,7 +165,7 @@ def test_nor_does_prepared_data(started: Script, table: Path, tmp_path: Path) ->
     (store / "manifest.json").write_text(json.dumps(content))
     words = (f"data.prepared={store}", "data.split.heldout=0", "trainer.max_epochs=1")
     # it is a table, whatever it is called
-    started("train", "model=lin", *words, f"hydra.run.dir={tmp_path / 'out'}")
+    script("train", "model=lin", *words, f"hydra.run.dir={tmp_path / 'out'}")
     assert not trap.exists()
 
 
@@ -194,7 +189,7 @@ def asked() -> Iterator[tuple[str, list[str]]]:
 
 
 def test_the_environment_stays_here(
-    started: Script, made: Made, tmp_path: Path, asked: tuple[str, list[str]]
+    script: Script, made: Made, tmp_path: Path, asked: tuple[str, list[str]]
 ) -> None:
     address, paths = asked
     secret = {"MY_SECRET": "opensesame", "no_proxy": "127.0.0.1"}
@@ -205,13 +200,13 @@ def test_the_environment_stays_here(
         {"path": "${oc.decode:${oc.env:MY_SECRET}}"},
     ):
         path = made(data=data, groups={"data": data.get("name", "table")})
-        done = evaluated(started, path, tmp_path / "out", 1, **secret)
+        done = evaluated(script, path, tmp_path / "out", 1, **secret)
         assert paths == []
         assert "opensesame" not in done.stderr + done.stdout
         assert "is refused: its configuration holds" in done.stderr
 
 
-def test_a_model_s_name_is_no_path(started: Script, made: Made, tmp_path: Path) -> None:
+def test_a_model_s_name_is_no_path(script: Script, made: Made, tmp_path: Path) -> None:
     people = {
         **model_options("sf"),
         **{"name": "../../escaped", "A": 1.0, "k": 1.0, "kappa": 1.0, "walls": False},
@@ -225,7 +220,7 @@ def test_a_model_s_name_is_no_path(started: Script, made: Made, tmp_path: Path) 
     both = path.with_name("again.pt")  # the second one's name has its recording behind it
     content["config"]["data"]["recording"] = "/../../../recorded"
     torch.save(content, both)
-    started("plot_forces", f"checkpoint=[{path},{both}]", f"hydra.run.dir={out}")
+    script("plot_forces", f"checkpoint=[{path},{both}]", f"hydra.run.dir={out}")
     found = [p for p in tmp_path.rglob("*") if "escaped" in p.name or "recorded" in p.name]
     assert len(found) == 8
     assert {p.parent for p in found} == {out}

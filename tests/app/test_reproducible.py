@@ -8,13 +8,13 @@ import pytest
 
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.synthetic import demo_data
-from tests.app.conftest import Script, forks, script  # noqa: F401
+from tests.app.conftest import Script
 
 #: Relative difference of parameters that sums in another order may make in three epochs.
 ROUNDING = 1e-9
 
 
-def trained(script: Script, raw: Path, folder: Path, *overrides: str) -> dict[str, float]:  # noqa: F811
+def trained(script: Script, raw: Path, folder: Path, *overrides: str) -> dict[str, float]:
     script(
         "train",
         "experiment=demo_crowd",
@@ -35,7 +35,7 @@ def trained(script: Script, raw: Path, folder: Path, *overrides: str) -> dict[st
 
 @pytest.mark.slow
 def test_workers_change_no_bit_and_threads_only_the_rounding(
-    script: Script,  # noqa: F811
+    script: Script,
     tmp_path: Path,
 ) -> None:
     raw = tmp_path / "raw"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import time
 from pathlib import Path
@@ -48,7 +47,6 @@ def test_what_no_study_can_work_with_is_refused(tmp_path: Path) -> None:
             study.study(OmegaConf.create({"study": options}), tmp_path)
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system that can fork")
 def test_interrupted_and_asked_for_again(forks: Forks, tmp_path: Path) -> None:
     command = ["study=traffic", "study.workers=1", f"hydra.run.dir={tmp_path}"]
     process = forks.start(CODE, *command)
