@@ -55,7 +55,7 @@ def test_a_failed_write_leaves_the_old_file(saved: Path, monkeypatch: pytest.Mon
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(WriteError, match=r"cannot be written: No space left on device\. What was"):
+    with pytest.raises(WriteError, match=r"cannot be written: No space left on device\. Earlier"):
         save_checkpoint(checkpoint, saved)
     assert saved.read_bytes() == before
     assert sorted(p.name for p in saved.parent.iterdir()) == ["best.pt", "last.pt"]
