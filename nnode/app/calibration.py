@@ -249,11 +249,16 @@ class Calibration:
             ("", "", "BIC", f"{fit.bic:.6g}"),
         ]
         lines = [f"{a:<12}{b:<26}{c:<16}{d:>12}" for a, b, c, d in facts]
-        lines += ["", *self._table(), "", *self._costs(), *self._remarks()]
+        table = self._table()
+        lines += ["", *table] if table else []
+        lines += ["", *self._costs(), *self._remarks()]
         return "\n".join(line.rstrip() for line in lines)
 
     def _table(self) -> list[str]:
-        """The table of parameters, with remarks on estimates, line by line."""
+        """The table of parameters, with remarks on estimates, line by line; none of networks, whose
+        weights have no units."""
+        if self.parameters.empty:
+            return []
         short = short_names(map(str, self.parameters.index))
         heads = {"std_error": "std err", "lower": "[0.025", "upper": "0.975]"}
         cells = self.parameters[["estimate", *heads]].rename(index=short, columns=heads)

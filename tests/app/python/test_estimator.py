@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -344,6 +345,9 @@ def test_the_summary_agrees_with_the_residuals(fitted: nnode.Calibrator) -> None
         / np.sqrt((pairs.now @ pairs.now) * (pairs.before @ pairs.before))
     )
     assert "RMSE (m)" in run.summary()
+    network = replace(run, parameters=run.parameters.iloc[:0])
+    assert "std err" in run.summary()
+    assert all(words not in network.summary() for words in ("std err", "Empty"))
 
 
 def test_residuals_leave_out_starts_and_given_leaders(
