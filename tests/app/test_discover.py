@@ -211,7 +211,7 @@ def test_effects_can_be_given_on_the_command_line() -> None:
 @pytest.mark.parametrize(
     ("model", "effects", "message"),
     [
-        ({"term": "social_force"}, None, "model=social_force is a crowd model, data='table' are"),
+        ({"term": "social_force"}, None, "model=social_force is a crowd model, data=table are"),
         ({"term": "lin"}, ["relative_sped"], r"no traffic effect relative_sped.*relative_speed\?"),
         ({"term": "linn"}, None, r"model\.term=linn is unknown"),
         ({}, None, r"model\.term= is unknown"),
