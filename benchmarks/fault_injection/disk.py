@@ -95,15 +95,18 @@ def _try(
 
 
 def _limit(size: int) -> None:
-    """No file of this process may be longer; what it prints goes through a pipe."""
-    # its words are not what is limited
+    """Go on in a process whose files may not be longer. What it prints is not limited: this process
+    copies it from a pipe, and ends as the other one does."""
     reader, writer = os.pipe()
-    words = os.dup(1)
-    if os.fork() == 0:
+    limited = os.fork()
+    if limited:
         os.close(writer)
         while part := os.read(reader, 65536):
-            os.write(words, part)
-        os._exit(0)
+            os.write(1, part)
+        status = os.waitstatus_to_exitcode(os.waitpid(limited, 0)[1])
+        if status < 0:
+            os.kill(os.getpid(), -status)
+        os._exit(status)
     os.close(reader)
     os.dup2(writer, 1)
     os.dup2(writer, 2)

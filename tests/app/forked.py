@@ -128,7 +128,11 @@ def typed(order: dict[str, Any]) -> None:
     descriptor = os.open(order["errors"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(descriptor, 2)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w"), open(2, "w")  # noqa: SIM115
+    # a script that forks replaces these files, which must not close the descriptors
+    sys.stdin, sys.stdout, sys.stderr = (
+        open(number, mode, closefd=False)  # noqa: SIM115
+        for number, mode in enumerate(("r", "w", "w"))
+    )
     name, overrides = order["name"], list(order["overrides"])
     if "\n" in name:
         sys.argv = ["-c", *overrides]
