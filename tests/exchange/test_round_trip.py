@@ -30,10 +30,9 @@ from tests.exchange.test_recovery import recovered
 
 def of_the_field(law: Any, name: str) -> Any:
     """A law with the parameters that a search has found, in float64."""
-    found = recovered(name)
     with torch.no_grad():
-        for own, value in zip(found.names, found.found, strict=True):
-            getattr(law, own).fill_(value)
+        for parameter, value in recovered(name).parameters["found"].items():
+            getattr(law, str(parameter)).fill_(value)
     return law.double()
 
 
