@@ -527,8 +527,9 @@ def _verdict(
     if not testable:
         return "not_testable"
     if selection.steps:
-        largest = max((curve.removed for curve in unexplained[:1]), default=0.0)
-        if largest * (1 - removed) > thresholds.UNEXPLAINED * removed:
+        # the named effects may have removed less than nothing, without any structure that is left
+        limit = thresholds.UNEXPLAINED * removed
+        if unexplained and unexplained[0].removed * (1 - removed) > limit:
             return "unknown"
         return "indistinguishable" if any(step.rivals for step in selection.steps) else "named"
     if individuals_named:

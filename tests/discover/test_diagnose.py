@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from nnode.data.sequence import Sequence
-from nnode.discover.diagnose import _reached_bounds, diagnose
+from nnode.discover.diagnose import _reached_bounds, _verdict, diagnose
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.outcome import DiagnosisOutcome
 from tests.discover.conftest import KAPPA, MANY
@@ -85,6 +88,20 @@ def test_a_desired_speed_that_never_binds_cannot_be_tested() -> None:
     (cap,) = d.absences
     assert (cap.testable, cap.bound, cap.detectable) == (False, None, None)
     assert cap.reason == "it acts too rarely, or in too few clusters, to be named"
+
+
+@pytest.mark.parametrize(
+    ("left", "removed", "verdict"),
+    [([], 0.9, "named"), ([], -0.1, "named"), ([0.1], 0.9, "named"), ([0.5], 0.2, "unknown")],
+)
+def test_structure_that_is_left_makes_the_verdict_unknown(
+    left: list[float], removed: float, verdict: str
+) -> None:
+    """Errors of positions may grow with a confirmed effect, without any structure that is left."""
+    selection = SimpleNamespace(steps=[SimpleNamespace(rivals=[])])
+    curves = [SimpleNamespace(removed=share) for share in left]
+    given: Any = (selection, curves, removed, False, True, False, [])
+    assert _verdict(*given) == verdict
 
 
 def test_a_law_whose_parameters_reach_bounds_with_effects_is_noted() -> None:
