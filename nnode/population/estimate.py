@@ -70,7 +70,9 @@ class Variances:
         noise: of the :class:`~nnode.population.likelihood.Noise`, in the order of its names.
         spread: ``(Q,)`` of the agents' deviations.
         start: ``(H,)`` of the starts' deviations.
-        low, high: bounds of all of them, concatenated; values with equal bounds are fixed.
+        low, high: bounds of all of them, concatenated; values with equal bounds are fixed. Within
+            bounds that are many orders of magnitude apart, a search may end at values for which
+            rounding errors dominate the likelihood.
     """
 
     noise: np.ndarray
@@ -299,22 +301,18 @@ def fit_variances(
         deviations = trial.spread, trial.start
         products = noise.products(data, trial.noise)
         centre = marginal(data, products, *deviations, low=low, high=high, restricted=restricted)
-        by_noise, slope_by_noise = np.zeros((len(trial.noise), len(centre.each))), []
-        for place, value in enumerate(trial.noise):
-            if place not in free:
-                slope_by_noise.append(0.0)
-                continue
+        by_noise = np.zeros((len(trial.noise), len(centre.each)))
+        scores = np.concatenate([by_noise, centre.by_spread.T, centre.by_start.T])
+        slope = scores.sum(1)
+        for place in free[free < len(trial.noise)]:
             shifted = trial.noise.copy()
-            shifted[place] = value * np.exp(DIFFERENCE)
+            shifted[place] *= np.exp(DIFFERENCE)
             products = noise.products(data, shifted)
             loglik, each = log_likelihood(
                 data, products, *deviations, centre.change, restricted=restricted
             )
-            by_noise[place] = (each - centre.each) / DIFFERENCE
-            slope_by_noise.append((loglik - centre.loglik) / DIFFERENCE)
-        scores = np.concatenate([by_noise, centre.by_spread.T, centre.by_start.T])
-        slope = scores.sum(1)
-        slope[: len(slope_by_noise)] = slope_by_noise
+            scores[place] = (each - centre.each) / DIFFERENCE
+            slope[place] = (loglik - centre.loglik) / DIFFERENCE
         return centre.loglik, slope[free], scores[free]
 
     loglik, _, scores = likelihood(logs_all[free])

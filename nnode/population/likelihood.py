@@ -461,12 +461,12 @@ def marginal(
     by_start_weights = by_all_weights[..., : len(weights)] - by_agents @ by_weights[data.agent]
     start_covariance = start_covariance + _moved(by_agents, covariance[data.agent])
     b, h = by_weights @ weights, by_start_weights @ weights
-    uncertain = np.zeros_like(information)
-    if restricted:
-        uncertain = np.linalg.pinv(information, rcond=FLAT, hermitian=True)
-    second = b**2 + _diagonal(covariance + _moved(by_weights[..., 1:], uncertain))
-    start_second = h**2 + _diagonal(start_covariance + _moved(by_start_weights[..., 1:], uncertain))
     variances = _diagonal(covariance)
+    second, start_second = b**2 + variances, h**2 + _diagonal(start_covariance)
+    if restricted:  # the parameters are uncertain, too
+        uncertain = np.linalg.pinv(information, rcond=FLAT, hermitian=True)
+        second += _diagonal(_moved(by_weights[..., 1:], uncertain))
+        start_second += _diagonal(_moved(by_start_weights[..., 1:], uncertain))
     return Marginal(
         loglik=loglik,
         each=each,

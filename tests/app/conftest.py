@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
@@ -99,18 +100,23 @@ def script(forks: Forks) -> Script:
     return forks.run
 
 
-@pytest.fixture(scope="session")
-def idm_run(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a short training of vehicles that follow the model exactly."""
-    folder = tmp_path_factory.mktemp("idm")
-    table(10, 10.0).to_csv(folder / "mine.csv", index=False)
+def trained_idm(script: Script, folder: Path, data: pd.DataFrame, *overrides: str) -> Path:
+    """The folder of a training of the IDM on a table."""
+    data.to_csv(folder / "mine.csv", index=False)
     script(
         "train",
         "model=idm",
         "data=table",
         "data.domain=traffic",
         f"data.path={folder}/mine.csv",
-        "trainer.max_epochs=2",
+        *overrides,
         f"hydra.run.dir={folder}/run",
     )
     return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def idm_run(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short training of vehicles that follow the model exactly."""
+    folder = tmp_path_factory.mktemp("idm")
+    return trained_idm(script, folder, table(10, 10.0), "trainer.max_epochs=2")

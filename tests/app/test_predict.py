@@ -11,7 +11,7 @@ import pytest
 
 import nnode
 from nnode.errors import CheckpointError, ConfigError
-from tests.app.conftest import Script
+from tests.app.conftest import Script, trained_idm
 from tests.app.different import table
 
 DIFFER = {"T": 0.15}
@@ -25,18 +25,7 @@ def drives(seed: int) -> pd.DataFrame:
 def run(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A training with drivers who differ."""
     folder = tmp_path_factory.mktemp("predict")
-    drives(1).to_csv(folder / "mine.csv", index=False)
-    script(
-        "train",
-        "model=idm",
-        "data=table",
-        "data.domain=traffic",
-        f"data.path={folder}/mine.csv",
-        "trainer.drivers=[T]",
-        "trainer.max_epochs=20",
-        f"hydra.run.dir={folder}/run",
-    )
-    return folder / "run"
+    return trained_idm(script, folder, drives(1), "trainer.drivers=[T]", "trainer.max_epochs=20")
 
 
 def test_new_drivers_are_predicted_better_than_the_typical_one(run: Path) -> None:

@@ -71,14 +71,14 @@ def table(name: str, subject: str) -> tuple[list[str], dict[str, np.ndarray]]:
 
 
 def spreads(residual: float, *random: float) -> Variances:
-    """Where the search for standard deviations begins, with bounds that are far away."""
-    number = 1 + len(random)
+    """Where the search for standard deviations begins, with bounds that are far away: 30 times."""
+    start = np.array([residual, *random])
     return Variances(
         noise=np.array([residual]),
         spread=np.array(random),
         start=np.zeros(0),
-        low=np.full(number, 1e-4),
-        high=np.full(number, 1e4),
+        low=start / 30,
+        high=start * 30,
     )
 
 
