@@ -190,9 +190,13 @@ def with_smaller_errors(population: Population) -> Population:
     return _estimated(population.model, before.theta, variances, before.agents, before.start)
 
 
-def fit_all_random(system: System, paths: Paths) -> Population:
+def fit_all_random(system: System, paths: Paths, steps: int = RANKING_STEPS) -> Population:
     """A quick estimate in which all parameters of the law differ between drivers, for a comparison
     of laws. The variances of those that do not differ become small.
+
+    Args:
+        system: the law; the search starts at its parameters. paths: the followers.
+        steps: largest number of steps.
 
     Raises:
         ConfigError: a model without a formula. SimulationError: its simulation diverges.
@@ -201,7 +205,7 @@ def fit_all_random(system: System, paths: Paths) -> Population:
     if not _simulated_finitely(plain):
         raise SimulationError("the followers' paths diverge")
     model = Followers(system, paths, plain.may_differ)
-    return _estimated(model, model.start, initial_variances(model), steps=RANKING_STEPS)
+    return _estimated(model, model.start, initial_variances(model), steps=steps)
 
 
 def obstacle(system: System, sequences: list[Sequence], needed: int = LEAST_DRIVERS) -> str | None:

@@ -95,7 +95,7 @@ def compare_laws(
         errors = {key: square_of(whole, fit.system) for key, fit in fits.items()}
     if differ:
         engine = FollowersEngine(exploration, label, apart=spacing(sequences, options))
-        compared = _by_likelihood(engine, fits, refused, within)
+        compared = _by_likelihood(engine, formulas, fits, refused, within)
     else:
         compared = _by_cost(windows_of(asked, exploration, label), fits, errors, within)
     ranking = [
@@ -131,6 +131,7 @@ class _Ranks:
 
 def _by_likelihood(
     engine: FollowersEngine,
+    candidates: Mapping[str, System],
     fits: Mapping[str, Fit],
     refused: dict[str, str],
     within: Callable[[float], None],
@@ -138,13 +139,17 @@ def _by_likelihood(
     """Rank laws by their marginal likelihoods.
 
     Args:
-        fits: laws, calibrated. refused: laws whose paths diverge are added.
+        candidates: the laws as given. fits: those that could be calibrated with the same parameters
+            for all drivers, which may be far from those of the typical driver.
+        refused: laws whose paths diverge are added.
     """
     values, systems = dict[str, np.ndarray](), dict[str, System]()
     for place, (name, fit) in enumerate(fits.items()):
         within((1 + place / len(fits)) / 2)
         try:
-            value, system = engine.log_likelihoods(fit.system)
+            law = candidates[name]
+            starts = fit.system, law, engine.regression_start(law)
+            value, system = engine.log_likelihoods(*starts)
         except (SimulationError, np.linalg.LinAlgError):
             value = np.array([np.nan])
         if np.isfinite(value).all():

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,7 @@ from nnode.discover.lanes.engine import (
 from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Curve
+from nnode.errors import SimulationError
 from nnode.model.effects import Effect, Probe
 from nnode.model.scene import Scene
 from nnode.model.system import System
@@ -249,15 +251,19 @@ class FollowersEngine(TrafficEngine):
             return self.population
         return with_smaller_errors(self.population)
 
-    def log_likelihoods(self, system: System) -> tuple[np.ndarray, System]:
+    def log_likelihoods(self, *starts: System) -> tuple[np.ndarray, System]:
         """``(G,)`` log marginal likelihoods of the clusters under a law with parameters of its own,
         which all differ between drivers, minus their share of the number of parameters times half
         the logarithm of the number of drivers (BIC); and the calibrated law.
 
+        Args:
+            starts: the law with different parameters. The search starts from those that are most
+                likely after one step.
+
         Raises:
-            SimulationError: its simulation diverges.
+            SimulationError: the simulations of all starts diverge.
         """
-        paths = self._paths_for(system, ParameterVector(system).row)
+        system, paths = self._likeliest_start(starts)
         population = fit_all_random(system, paths)
         cluster = np.zeros(len(paths.names), dtype=int)
         cluster[paths.agent] = self._label[paths.sequence]
@@ -265,6 +271,20 @@ class FollowersEngine(TrafficEngine):
         present = np.bincount(cluster) > 0
         price = (population.marginal.loglik - population.criterion) / present.sum()
         return each[present] - price, population.system
+
+    def _likeliest_start(self, starts: tuple[System, ...]) -> tuple[System, Paths]:
+        """The model that is most likely after one step of its search, and its followers."""
+        candidates = [(s, self._paths_for(s, ParameterVector(s).row)) for s in starts]
+        if len(candidates) == 1:
+            return candidates[0]
+        quick = list[Population]()
+        for system, paths in candidates:
+            with suppress(SimulationError, np.linalg.LinAlgError):
+                quick.append(fit_all_random(system, paths, steps=1))
+        if not quick:
+            raise SimulationError("the followers' paths diverge from all starts")
+        best = max(quick, key=lambda population: population.marginal.loglik)
+        return best.model.system, best.model.paths
 
     def with_usual_variances(self, system: System) -> FollowersEngine:
         """An engine with the variances where searches start, and all parameters of the law that can
