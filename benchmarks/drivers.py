@@ -7,7 +7,8 @@ deviation of ``--spread`` %, pushes last 4 s, and positions are measured with er
 m. ``--nature`` departs from this. Paths are integrated here by Euler's method; everything else is
 the package's public interface. The cases of a run are fixed by its seed. The table has a row per
 case; the last lines count right and false answers, with exact intervals of 95 %. ``--compare`` only
-compares laws.
+compares laws. ``--calibrate`` only calibrates, with nothing hidden; the last lines count intervals
+that contain the true value.
 """
 
 from __future__ import annotations
@@ -69,6 +70,12 @@ ZONE = (250.0, 420.0)
 V0, LENGTH, T, S0, A, B, CAR = 29.0, 6.0, 1.25, 2.0, 1.25, 1.8, 4.5
 #: Parameters of ``fvdm`` besides v0: m, m, 1/s, 1/s.
 S_C, W, KAPPA, LAM = 15.0, 12.0, 0.5, 0.5
+#: Parameters of the typical driver, by law.
+TYPICAL = {
+    "lin": {"v0": V0, "L": LENGTH},
+    "idm": {"v0": V0, "T": T, "s0": S0, "a": A, "b": B},
+    "fvdm": {"v0": V0, "s_c": S_C, "w": W, "kappa": KAPPA, "lam": LAM},
+}
 
 
 def platoons(
@@ -305,6 +312,28 @@ def compared(**case: Any) -> dict[str, Any]:
     }
 
 
+def calibrated(**case: Any) -> dict[str, Any]:
+    """The case with the estimates of a calibration, and whether their intervals contain the true
+    parameters and variances."""
+    begun = time.monotonic()
+    run = nnode.fit(platoons(**case), "traffic", model=case["law"], drivers="auto", heldout=0.0)
+    assert run.drivers is not None
+    short = run.parameters.rename(index=lambda name: name.rpartition(".")[2])
+    row = {**case, "hidden": False}
+    for true, table in (
+        (TYPICAL[case["law"]], short),
+        (_variations(case) | {"measurement": case["error"]}, run.drivers.variability),
+    ):
+        for name, value in true.items():
+            key = name if table is short else f"{name}, variation"
+            estimate: dict[str, Any] = table.loc[name].to_dict() if name in table.index else {}
+            row[key], row[f"{key}, true"] = estimate.get("estimate"), value
+            row[f"{key} covered"] = covers(estimate.get("lower"), estimate.get("upper"), value)
+    others = set(run.drivers.variability["unit"].loc[lambda unit: unit == "%"].index)
+    row["false variation"] = bool(others - set(_variations(case)))
+    return {**row, "seconds": round(time.monotonic() - begun, 1)}
+
+
 def _variations(case: dict[str, Any]) -> dict[str, float]:
     """The true standard deviations of drivers' parameters, %, and of pushes, and their time, s."""
     names = {"lin": ["v0"], "idm": ["v0", "T"], "fvdm": ["v0", "s_c"]}[case["law"]]
@@ -324,6 +353,7 @@ def main() -> None:
     parser.add_argument("--error", type=float, default=0.06, help="of measured positions, m")
     parser.add_argument("--pairs", action="store_true", help="two effects at once")
     parser.add_argument("--compare", action="store_true", help="only compare laws")
+    parser.add_argument("--calibrate", action="store_true", help="only calibrate, nothing hidden")
     parser.add_argument("--nature", default="plain", choices=NATURES)
     parser.add_argument("--laws", nargs="+", default=["lin", "idm"], choices=list(HIDDEN))
     parser.add_argument("--processes", type=int, default=2)
@@ -340,7 +370,9 @@ def main() -> None:
         pairs=given.pairs,
         nature=given.nature,
     )
-    work = compared if given.compare else diagnosed
+    work = calibrated if given.calibrate else compared if given.compare else diagnosed
+    if given.calibrate:
+        chosen = [case | {"effect": "none"} for case in chosen]
     tasks = [Task(f"{case['law']}-{case['effect']}-s{case['seed']}", work, case) for case in chosen]
     folder = given.table.with_suffix("")
     results = run_tasks(
