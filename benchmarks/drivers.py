@@ -326,7 +326,7 @@ def calibrated(**case: Any) -> dict[str, Any]:
     ):
         for name, value in true.items():
             key = name if table is short else f"{name}, variation"
-            estimate: dict[str, Any] = table.loc[name].to_dict() if name in table.index else {}
+            estimate: dict[Any, Any] = table.loc[name].to_dict() if name in table.index else {}
             row[key], row[f"{key}, true"] = estimate.get("estimate"), value
             row[f"{key} covered"] = covers(estimate.get("lower"), estimate.get("upper"), value)
     others = set(run.drivers.variability["unit"].loc[lambda unit: unit == "%"].index)
