@@ -17,25 +17,34 @@ LONG = 1000
 
 
 def smooth(x: np.ndarray) -> np.ndarray:
-    """Whittaker's smoother along the first axis, ``(K, ...)`` to ``(K, ...)``, all columns alike.
-
-    The weight of smoothness is the one with the least generalised cross-validation error over
-    all columns. Fewer than six samples are returned as they are.
+    """Whittaker's smoother along the first axis, ``(K, ...)`` to ``(K, ...)``, all columns alike,
+    with the weight of :func:`smoothing_weight`. Fewer than six samples are returned as they are.
 
     Source: Eilers 2003, Analytical Chemistry 75.
     """
+    return _whittaker(x)[0]
+
+
+def smoothing_weight(x: np.ndarray) -> float:
+    """The weight of smoothness with the least generalised cross-validation error over all columns
+    of ``(K, ...)``; 0 for fewer than six samples."""
+    return _whittaker(x)[1]
+
+
+def _whittaker(x: np.ndarray) -> tuple[np.ndarray, float]:
+    """The smoothed columns, and the weight."""
     if len(x) < 6:
-        return x.copy()
+        return x.copy(), 0.0
     columns, values, penalty = x.reshape(len(x), -1), _sizes(len(x)), _penalty(len(x))
     identity = np.eye(ORDER + 1, 1)
-    best, best_score = columns, np.inf
+    best, best_weight, best_score = columns, 0.0, np.inf
     for weight in WEIGHTS:
         smoothed = solveh_banded(identity + weight * penalty, columns, lower=True)
         kept = (1 / (1 + weight * values)).sum()
         score = ((columns - smoothed) ** 2).sum() / (len(x) - kept) ** 2
         if score < best_score:
-            best, best_score = smoothed, score
-    return best.reshape(x.shape)
+            best, best_weight, best_score = smoothed, float(weight), score
+    return best.reshape(x.shape), best_weight
 
 
 @cache

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.data.paths import smooth
+from nnode.data.paths import smooth, smoothing_weight
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import measured_noise
 from nnode.errors import ConfigError, SimulationError
@@ -79,6 +79,8 @@ class Paths:
         second: ``(F,)`` 1 where there is a second vehicle ahead.
         start: ``(2, F)`` smoothed position and speed at the first sample.
         error: standard deviation of the errors of measurement by fourth differences, m.
+        leader: standard deviation (m) and correlation time (s) of the errors of smoothed paths, see
+            :func:`_smoothed_error`; the former is 0 if positions have no white errors.
         batch: of each follower the sequence with himself and the one or two vehicles ahead.
     """
 
@@ -96,6 +98,7 @@ class Paths:
     second: np.ndarray
     start: np.ndarray
     error: float
+    leader: tuple[float, float]
     batch: Batch
 
     @property
@@ -179,8 +182,27 @@ def paths_of(sequences: list[Sequence], step: float, floor: float = FLOOR) -> Pa
         start=start,
         second=np.array([float(i + 2 < sequences[b].n_agents) for b, i in which]),
         error=max(noise, floor) if math.isfinite(noise) else floor,
+        leader=_smoothed_error([s.x[..., 0] for s in sequences], dt, noise),
         batch=collate(_with_vehicles_ahead(sequences[b], i) for b, i in which),
     )
+
+
+def _smoothed_error(paths: list[np.ndarray], dt: float, noise: float) -> tuple[float, float]:
+    """The error of smoothed paths, as an Ornstein-Uhlenbeck process.
+
+    The smoother keeps the errors of low frequencies and removes those above
+    omega = weight^(-1/6) / dt. The process has the same spectral density at frequency 0 and half of
+    it at omega, to which followers hardly respond.
+
+    Args:
+        paths: ``(K, N)`` measured positions of each sequence, m. noise: of measurement, m.
+
+    Returns:
+        Its standard deviation, m, and its correlation time, s.
+    """
+    time = dt * float(np.median([smoothing_weight(x) for x in paths])) ** (1 / 6)
+    variance = noise**2 * dt / (2 * time) if noise > NOISE[0] else 0.0
+    return math.sqrt(variance), time
 
 
 def _with_vehicles_ahead(s: Sequence, place: int) -> Sequence:
@@ -227,6 +249,10 @@ def _ahead_symbols(ahead: np.ndarray) -> dict[str, np.ndarray]:
     return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
 
 
+#: Position and speed of the vehicle ahead in formulas: their columns in :func:`_jacobian`.
+_AHEAD = {"x_1": 0, "v_1": 1, "dx_1": 1, "measured": 1}
+
+
 def follower_formula(system: System) -> LaneDynamics | None:
     """The formula of a model that only reads the positions and speeds of the vehicles ahead; None
     for other models."""
@@ -258,14 +284,17 @@ def _n_disturbed(lane: LaneDynamics) -> int:
 
 @cache
 def _jacobian(lane: LaneDynamics) -> tuple[list[tuple[int, int]], Formulas]:
-    """Derivatives of the rates by the states through which disturbances act: their places in the
-    Jacobian, and a function that computes them."""
-    states = list(lane.rates)
+    """Derivatives of the rates of the disturbed states: their places in a matrix with a row per
+    rate, whose columns are by these states, by the position and by the speed of the vehicle ahead;
+    and a function that computes them."""
     number = _n_disturbed(lane)
+    states = list(lane.rates)[:number]
+    column = {name: k for k, name in enumerate(states)}
+    column |= {name: number + k for name, k in _AHEAD.items()}
     slopes = [
-        ((p, states.index(name)), slope)
-        for p, state in enumerate(states[:number])
-        for name, slope in derivatives(lane.rates[state], states[:number]).items()
+        ((row, column[name]), slope)
+        for row, state in enumerate(states)
+        for name, slope in derivatives(lane.rates[state], list(column)).items()
     ]
     return [place for place, _ in slopes], Formulas([slope for _, slope in slopes])
 
@@ -427,7 +456,7 @@ class Followers:
         return columns.transpose(1, 2, 0), states[:, :, 0]
 
     def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
-        paths, order, n_parameters = self.paths, self.lane.order, len(theta)
+        paths, n_parameters = self.paths, len(theta)
         columns, states = self.columns(theta, agents, start, self.starts)
         fixed, by_start = columns[..., :n_parameters], columns[..., n_parameters:]
         residual = paths.x - states[:, 0].T
@@ -436,8 +465,7 @@ class Followers:
             residual = residual + np.einsum("fkq,fq->fk", by_deviation, agents[paths.agent])
         if start.size:
             residual = residual + np.einsum("fkh,fh->fk", by_start, start)
-        transition, by_forcing = self.linear(self.spread(theta, agents), states)
-        forced = np.ascontiguousarray(by_forcing[..., order - 1])
+        step, _, forced = self.linear(self.spread(theta, agents), states)
         return Linearised(
             residual=residual,
             fixed=fixed,
@@ -445,8 +473,9 @@ class Followers:
             start=by_start,
             observed=paths.observed,
             agent=paths.agent,
-            step=transition,
+            step=step,
             forced=forced,
+            leader=paths.leader,
             dt=paths.dt,
         )
 
@@ -470,32 +499,56 @@ class Followers:
             **_ahead_symbols(self.paths.ahead_at_samples.swapaxes(0, 1)),
         }
 
-    def linear(self, parameters: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linear(
+        self, parameters: np.ndarray, states: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The linear response along a run by the trapezoidal rule, of the M states of motion and
         of memory.
+
+        With the derivatives A of the rates by the states, and a and b by position and speed of the
+        vehicle ahead, whose path has the error e, y' = A y + a e + b e'. Therefore z = y - b e has
+        z' = A z + (a + A b) e; the difference b e is neglected. So are errors of the second vehicle
+        ahead.
 
         Args:
             parameters, states: as of :meth:`rates`.
 
         Returns:
-            Two arrays ``(F, K - 1, M, M)``: the states after a sampling interval by those before,
-            and by the sum of the changes of their rates at both ends.
+            Three arrays. ``(F, K - 1, M, M)``: the states after a sampling interval by those
+            before, and by the sums of the changes of their rates at both ends;
+            ``(F, K - 1, M, 2)``: by the sums at both ends of pushes on the highest rate and of e.
         """
-        paths, lane = self.paths, self.lane
-        entries, slopes = _jacobian(lane)
-        size = max([lane.order, *(max(place) + 1 for place in entries)])
-        matrix = np.zeros((len(states), len(paths.agent), size, size))
-        with np.errstate(all="ignore"):
-            for (p, q), value in zip(
-                entries, slopes(self._symbols_along(parameters, states)), strict=True
-            ):
-                matrix[..., p, q] = np.broadcast_to(value, matrix.shape[:2])
-        # the linearisation is only valid while it does not diverge
-        matrix = np.clip(np.nan_to_num(matrix), -1 / paths.dt, 1 / paths.dt)
-        step, by_forcing = (
-            matrices.numpy().swapaxes(0, 1) for matrices in trapezoidal(matrix, paths.dt)
+        by_states, by_position, by_speed = self._slopes(parameters, states)
+        step, after = (
+            matrices.numpy().swapaxes(0, 1) for matrices in trapezoidal(by_states, self.paths.dt)
         )
-        return np.ascontiguousarray(step), np.ascontiguousarray(paths.dt / 2 * by_forcing)
+        after = self.paths.dt / 2 * after
+        source = (by_position + by_states @ by_speed).swapaxes(0, 1)
+        by_push = after[..., self.lane.order - 1, None]
+        by_error = after @ (source[:, 1:] + source[:, :-1]) / 2
+        forced = np.concatenate([by_push, by_error], -1)
+        return np.ascontiguousarray(step), np.ascontiguousarray(after), forced
+
+    def _slopes(
+        self, parameters: np.ndarray, states: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives of the rates along a run: ``(K, F, M, M)`` by the states, ``(K, F, M, 1)`` by
+        position and by speed of the vehicle ahead.
+
+        Args:
+            parameters, states: as of :meth:`rates`.
+        """
+        entries, slopes = _jacobian(self.lane)
+        shape, disturbed = (len(states), len(self.paths.agent)), _n_disturbed(self.lane)
+        matrix = np.zeros((*shape, disturbed, disturbed + 2))
+        with np.errstate(all="ignore"):
+            values = slopes(self._symbols_along(parameters, states))
+        for (row, column), value in zip(entries, values, strict=True):
+            matrix[..., row, column] += value
+        # the linearisation is only valid while it does not diverge
+        matrix = np.clip(np.nan_to_num(matrix), -1 / self.paths.dt, 1 / self.paths.dt)
+        by_states, by_position, by_speed = np.split(matrix, [disturbed, disturbed + 1], -1)
+        return by_states, by_position, by_speed
 
     def simulated_paths(self, estimate: Estimate, draw: Draw) -> Paths:
         """Simulated measurements of the estimated model (parametric bootstrap).

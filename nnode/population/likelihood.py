@@ -6,10 +6,11 @@ start, the samples y of a segment are
     w = y - f(theta, b, h) + Z b + H h = X (theta* - theta) + Z b* + H h* + d + eps,
 
 where b* ~ N(0, Omega) and h* ~ N(0, S) with diagonal Omega and S, d is the response to a push e(t),
-an Ornstein-Uhlenbeck process of standard deviation sigma and correlation time tau, and eps are
-measurement errors: white noise, to which a second Ornstein-Uhlenbeck process is added where errors
-are autocorrelated. A Kalman filter whitens all columns by the covariance of d + eps;
-b* and h* are then integrated out with products of whitened columns (Woodbury's identity).
+an Ornstein-Uhlenbeck process of standard deviation sigma and correlation time tau, and to the error
+of the leader's path, a second one with known parameters. eps are measurement errors: white noise,
+to which a third one is added where errors are autocorrelated. A Kalman filter whitens all columns
+by the covariance of d + eps; b* and h* are then integrated out with products of whitened columns
+(Woodbury's identity).
 
 Source:
     Lindstrom & Bates 1990, Biometrics 46 (the linearisation at the modes);
@@ -49,7 +50,10 @@ class Linearised:
         agent: ``(S,)`` number of the segment's agent, from 0.
         step: ``(S, K - 1, M, M)`` transition matrices of the linear response over a sampling
             interval; None: there are no pushes.
-        forced: ``(S, K - 1, M)`` its derivatives by the sum of the push at both ends.
+        forced: ``(S, K - 1, M, 2)`` its derivatives by the sum of the push at both ends, and by
+            that of the error of the leader's path.
+        leader: standard deviation and correlation time of the error of the leader's path, m and s;
+            it is neglected if the former is 0.
         dt: sampling interval, s.
     """
 
@@ -61,6 +65,7 @@ class Linearised:
     agent: np.ndarray
     step: np.ndarray | None = None
     forced: np.ndarray | None = None
+    leader: tuple[float, float] = (0.0, 1.0)
     dt: float = 1.0
 
     @property
@@ -186,14 +191,16 @@ class PushNoise(Noise):
         assert data.step is not None
         assert data.forced is not None
         push, push_time, white, *autocorrelated = values
-        lasting, lasting_time = autocorrelated or (0.0, 1.0)
+        processes = [(push, push_time), data.leader][: 2 if data.leader[0] > 0 else 1]
+        number = len(processes)
+        sigma, time = np.array([*processes, autocorrelated or (0.0, 1.0)]).T
         whitened: tuple[np.ndarray, np.ndarray] = _filtered(
             np.ascontiguousarray(columns),
             data.observed,
             data.step,
-            data.forced,
-            np.array([push, lasting]),
-            np.exp(-data.dt / np.array([push_time, lasting_time])),
+            np.ascontiguousarray(data.forced[..., :number]),
+            sigma,
+            np.exp(-data.dt / time),
             white**2,
         )
         return whitened
@@ -211,33 +218,36 @@ def _filtered(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Columns whitened by a Kalman filter, and log determinants.
 
-    The state is (d, e), or (d, e, a) where errors a are autocorrelated; a is added to the first
-    element of d, so that this element is measured. The arrays of a step are allocated once,
-    because allocations would take most of the time.
+    The state is (d, e), e the J processes that force d, or (d, e, a) where errors a are
+    autocorrelated; a is added to the first element of d, so that this element is measured. The
+    arrays of a step are allocated once, because allocations would take most of the time.
 
     Args:
-        sigma: ``(2,)`` standard deviations of e and a. keep: ``(2,)`` their autocorrelations over
-            a sampling interval. variance: of white errors.
+        sigma: ``(J + 1,)`` standard deviations of e and a. keep: ``(J + 1,)`` their
+            autocorrelations over a sampling interval. variance: of white errors.
     """
     number, samples, width = columns.shape
-    m, lasting = step.shape[-1], sigma[1] > 0
-    n = m + 2 if lasting else m + 1
+    m, processes = forced.shape[-2:]
+    lasting = sigma[-1] > 0
+    n = m + processes + 1 if lasting else m + processes
     fresh = sigma**2 * (1 - keep**2)
     white, logdet = np.zeros((number, samples, width)), np.zeros(number)
     mean, before = np.empty((n, width)), np.empty((n, width))
     spread, half = np.empty((n, n)), np.empty((n, n))
-    forward, noise, gain = np.zeros((n, n)), np.zeros(n), np.empty(n)
+    forward, noise, gain = np.zeros((n, n)), np.zeros((n, processes)), np.empty(n)
     for s in range(number):
         mean[:], spread[:] = 0.0, 0.0
-        spread[m, m] = sigma[0] ** 2
+        for p in range(processes):
+            spread[m + p, m + p] = sigma[p] ** 2
         if lasting:
-            _add_error(spread, sigma[1] ** 2)
+            _add_error(spread, sigma[-1] ** 2)
         for k in range(samples):
             if k:
                 _set_transition(step[s, k - 1], forced[s, k - 1], keep, forward, noise)
-                _predict(mean, spread, forward, noise, fresh[0], before, half)
+                _predict(mean, spread, forward, before, half)
+                _add_innovations(spread, noise, fresh)
                 if lasting:
-                    _add_error(spread, fresh[1])
+                    _add_error(spread, fresh[-1])
             if observed[s, k]:
                 logdet[s] += _condition(mean, spread, columns[s, k], variance, white[s, k], gain)
     return white, logdet
@@ -248,19 +258,23 @@ def _set_transition(
     step: np.ndarray, forced: np.ndarray, keep: np.ndarray, forward: np.ndarray, noise: np.ndarray
 ) -> None:
     """Fill the transition matrix ``forward`` of the state of :func:`_filtered`, and the derivatives
-    ``noise`` of the state by the innovation of e."""
-    m, last = len(step), len(forward) - 1
-    forward[m, m], noise[m] = keep[0], 1.0
+    ``noise`` of the state by the innovations of e."""
+    m, processes = forced.shape
+    last = len(forward) - 1
+    for p in range(processes):
+        e = m + p
+        forward[e, e], noise[e, p] = keep[p], 1.0
+        for i in range(m):
+            noise[i, p] = forced[i, p]
+            forward[i, e] = forced[i, p] * (1 + keep[p])
     for i in range(m):
-        noise[i] = forced[i]
-        forward[i, m] = forced[i] * (1 + keep[0])
         for j in range(m):
             forward[i, j] = step[i, j]
-        if last > m:
+    if last >= m + processes:
+        for i in range(m):
             forward[i, last] = -step[i, 0]
-    if last > m:
-        forward[0, last] += keep[1]
-        forward[last, last] = keep[1]
+        forward[0, last] += keep[-1]
+        forward[last, last] = keep[-1]
 
 
 @njit(cache=True, nogil=True)
@@ -273,17 +287,25 @@ def _add_error(spread: np.ndarray, variance: float) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _add_innovations(spread: np.ndarray, noise: np.ndarray, fresh: np.ndarray) -> None:
+    """Add the covariance of the innovations of e, of variances ``fresh``."""
+    n, processes = noise.shape
+    for i in range(n):
+        for j in range(n):
+            for p in range(processes):
+                spread[i, j] += noise[i, p] * noise[j, p] * fresh[p]
+
+
+@njit(cache=True, nogil=True)
 def _predict(
     mean: np.ndarray,
     spread: np.ndarray,
     forward: np.ndarray,
-    noise: np.ndarray,
-    fresh: float,
     before: np.ndarray,
     half: np.ndarray,
 ) -> None:
-    """The state one sample later: mean and covariance are replaced. ``before`` and ``half`` are
-    work arrays of the sizes of ``mean`` and ``spread``."""
+    """The state one sample later without innovations: mean and covariance are replaced. ``before``
+    and ``half`` are work arrays of the sizes of ``mean`` and ``spread``."""
     n, width = mean.shape
     for i in range(n):
         for c in range(width):
@@ -299,7 +321,7 @@ def _predict(
             half[i, j] = total
     for i in range(n):
         for j in range(i + 1):
-            total = noise[i] * noise[j] * fresh
+            total = 0.0
             for q in range(n):
                 total += half[i, q] * forward[j, q]
             spread[i, j] = total

@@ -7,11 +7,12 @@ are those that are most likely for the known samples. Linearised there, the posi
 
 are jointly normal (see :mod:`nnode.population.likelihood`), with the covariance
 
-    V = Z Omega Z' + H S H' + sigma^2 R C R'
+    V = Z Omega Z' + H S H' + sigma^2 R C R' + sigma_e^2 R_e C_e R_e'
 
 of true positions, where R is the linear response to pushes at the sampling times and C their
-correlation. The prediction is the normal distribution of x given the known samples, to whose
-covariance that of their errors is added. Vehicles ahead move as measured.
+correlation; R_e and C_e are those of the errors of leaders' paths. The prediction is the normal
+distribution of x given the known samples, to whose covariance that of their errors is added.
+Vehicles ahead move as measured.
 
 Source: Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, section 2.2.
 """
@@ -100,16 +101,17 @@ def _covariance(
     """``(K, K)`` covariance of the true positions of a follower, m²."""
     assert data.step is not None
     assert data.forced is not None
-    sigma, tau = noise[:2]
     samples = len(data.residual[f])
-    response = np.zeros((samples, data.step.shape[-1], samples))
-    for k in range(samples - 1):
-        response[k + 1] = data.step[f, k] @ response[k]
-        response[k + 1, :, k] += data.forced[f, k]
-        response[k + 1, :, k + 1] += data.forced[f, k]
     time = data.dt * np.arange(samples)
-    correlation = np.exp(-np.abs(time[:, None] - time) / tau)
-    positions = sigma * response[:, 0]
     columns = np.concatenate([data.by_deviation[f] * spread, data.start[f] * start], -1)
-    covariance: np.ndarray = positions @ correlation @ positions.T + columns @ columns.T
+    covariance: np.ndarray = columns @ columns.T
+    processes = (float(noise[0]), float(noise[1])), data.leader
+    for p, (sigma, tau) in enumerate(processes):
+        response = np.zeros((samples, data.step.shape[-1], samples))
+        for k in range(samples - 1):
+            response[k + 1] = data.step[f, k] @ response[k]
+            response[k + 1, :, k : k + 2] += data.forced[f, k, :, p, None]
+        positions = sigma * response[:, 0]
+        correlation = np.exp(-np.abs(time[:, None] - time) / tau)
+        covariance += positions @ correlation @ positions.T
     return covariance

@@ -14,8 +14,12 @@ SIGMA, TAU, DT, ERROR = 0.4, 1.7, 0.2, 0.05
 SPREAD, START = np.array([0.3, 0.7]), np.array([0.2])
 
 
-def example(seed: int, states: int) -> Linearised:
-    """Three segments of two agents, some samples missing."""
+def example(seed: int, states: int, leader: tuple[float, float] = (0.0, 1.0)) -> Linearised:
+    """Three segments of two agents, some samples missing.
+
+    Args:
+        leader: standard deviation and time of errors of the leader's path.
+    """
     rng = np.random.default_rng(seed)
     segments, samples = 3, 12
     observed = rng.random((segments, samples)) < 0.8
@@ -29,7 +33,8 @@ def example(seed: int, states: int) -> Linearised:
         observed=observed,
         agent=np.array([0, 1, 0]),
         step=step,
-        forced=rng.normal(size=(segments, samples - 1, states)),
+        forced=rng.normal(size=(segments, samples - 1, states, 2)),
+        leader=leader,
         dt=DT,
     )
 
@@ -42,21 +47,22 @@ def covariance(data: Linearised, lasting: tuple[float, ...]) -> np.ndarray:
     """
     segments, samples = data.residual.shape
     apart = np.abs(np.arange(samples)[:, None] - np.arange(samples)) * DT
-    pushes = SIGMA**2 * np.exp(-apart / TAU)
     whole = np.zeros((segments * samples, segments * samples))
     assert data.step is not None
     assert data.forced is not None
     for s in range(segments):
-        response = np.zeros((samples, samples))
-        state = np.zeros((data.step.shape[-1], samples))
-        for k in range(samples - 1):
-            both = np.eye(samples)[k] + np.eye(samples)[k + 1]
-            state = data.step[s, k] @ state + np.outer(data.forced[s, k], both)
-            response[k + 1] = state[0]
         own = slice(s * samples, (s + 1) * samples)
         start = data.start[s] * START
-        whole[own, own] = response @ pushes @ response.T + ERROR**2 * np.eye(samples)
-        whole[own, own] += start @ start.T
+        whole[own, own] = start @ start.T + ERROR**2 * np.eye(samples)
+        for p, (sigma, tau) in enumerate([(SIGMA, TAU), data.leader]):
+            response = np.zeros((samples, samples))
+            state = np.zeros((data.step.shape[-1], samples))
+            for k in range(samples - 1):
+                both = np.eye(samples)[k] + np.eye(samples)[k + 1]
+                state = data.step[s, k] @ state + np.outer(data.forced[s, k, :, p], both)
+                response[k + 1] = state[0]
+            process = sigma**2 * np.exp(-apart / tau)
+            whole[own, own] += response @ process @ response.T
         if lasting:
             whole[own, own] += lasting[0] ** 2 * np.exp(-apart / lasting[1])
     random = (data.by_deviation * SPREAD).reshape(segments * samples, -1)
@@ -65,11 +71,13 @@ def covariance(data: Linearised, lasting: tuple[float, ...]) -> np.ndarray:
     return found
 
 
+@pytest.mark.parametrize("leader", [(0.0, 1.0), (0.3, 0.5)])
 @pytest.mark.parametrize("lasting", [(), (0.1, 0.7)])
 @pytest.mark.parametrize("states", [1, 2])
-@pytest.mark.parametrize("seed", range(3))
-def test_the_filter_is_a_dense_gaussian(seed: int, states: int, lasting: tuple[float, ...]) -> None:
-    data = example(seed, states)
+def test_the_filter_is_a_dense_gaussian(
+    states: int, lasting: tuple[float, ...], leader: tuple[float, float]
+) -> None:
+    data = example(states, states, leader)
     observed = data.observed.ravel()
     v = covariance(data, lasting)[np.ix_(observed, observed)]
     x, w = data.fixed.reshape(-1, 3)[observed], data.residual.ravel()[observed]

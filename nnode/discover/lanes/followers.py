@@ -445,7 +445,7 @@ class FollowersEngine(TrafficEngine):
         parameters = model.spread(
             model.at(row.numpy()[: len(model.names)]), self._deviations(model)[0]
         )
-        step, after = model.linear(parameters, states[:, :, 0])
+        step, after, _ = model.linear(parameters, states[:, :, 0])
         weight = weights_of(self._whitened(difference.transpose(2, 1, 0))[0], self.large)
         rates = model.rates(parameters, states[:, :, 0])
         run = _Run(fixed, model, parameters, states[:, :, 0], rates, step, after, weight)
