@@ -86,6 +86,16 @@ def test_errors_that_last_are_found_and_told_apart_from_pushes(name: str) -> Non
         assert value is None or noise == pytest.approx(value, rel=0.5), what
 
 
+def test_errors_of_leaders_are_neither_pushes_nor_errors_that_last() -> None:
+    table = benchmark_platoons("lin", "none", 0.15, 7606, 16, error=0.3)
+    system = Traffic([make_law("lin")], leader="measured").double()
+    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), pairs=0)
+    assert len(found.estimate.variances.noise) == 3  # the leaders' errors last, the own do not
+    push, lasts = deviation_intervals(found)[:2]
+    assert push[0] < PUSH["lin"] < push[1]
+    assert lasts[0] < LASTS < lasts[1]
+
+
 def test_with_v0_at_its_bound_l_is_the_most_likely_one_there() -> None:
     sequences, _ = platoons(0.15, 4)
     below_most = law(v0=Interval(0.0, 24.0))
