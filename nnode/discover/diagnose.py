@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
@@ -396,14 +397,18 @@ def _explore(
         raise SimulationError(BLOWS_UP)
     hints = [] if hint is None else [hint]
     if isinstance(engine, FollowersEngine):
-        populations = [engine.population_of(initial.system)]
+        try:
+            populations = [engine.population_of(initial.system)]
+        except SimulationError as error:
+            raise SimulationError(BLOWS_UP) from error
         if not populations[0].plausible:
             # a strong missing effect is attributed to pushes
             usual = engine.with_usual_variances(initial.system)
             extensions = likely_extensions(usual, refine(usual, initial.system), effects)
             hints += extensions
             for extension in extensions:
-                populations.append(engine.population_of(extension))
+                with suppress(SimulationError):
+                    populations.append(engine.population_of(extension))
                 if populations[-1].plausible:
                     break
         engine.set_likeliest(populations)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -327,8 +328,20 @@ def _estimated(
 
 
 def _most_likely(model: Followers, starts: list[np.ndarray]) -> Population:
-    """The estimate with the largest likelihood from several starts."""
-    fits = [_estimated(model, theta, initial_variances(model)) for theta in starts]
+    """The estimate with the largest likelihood from several starts.
+
+    Raises:
+        SimulationError: the linear response diverges at all of them.
+    """
+    fits = list[Population]()
+    for theta in starts:
+        with suppress(SimulationError):
+            fits.append(_estimated(model, theta, initial_variances(model)))
+    if not fits:
+        raise SimulationError(
+            "drivers who differ: small changes of the followers' simulated paths grow without "
+            "bound; start from other parameters, or take drivers=none"
+        )
     return max(fits, key=lambda fit: fit.marginal.loglik)
 
 
@@ -387,7 +400,10 @@ def _next_random_effect(best: Population, price: float) -> Population | None:
         system, paths = best.model.system, best.model.paths
         model, before = Followers(system, paths, [*best.random, name]), best.estimate
         variances = _with_random_effect(before.variances)
-        fit = _estimated(model, before.theta, variances, steps=RANKING_STEPS)
+        try:
+            fit = _estimated(model, before.theta, variances, steps=RANKING_STEPS)
+        except SimulationError:
+            continue
         if _identified(fit.estimate) and fit.marginal.loglik > limit:
             improved.append(fit)
         if len(improved) == RANKED:

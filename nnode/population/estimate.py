@@ -16,12 +16,13 @@ Source: Lindstrom & Bates 1990, Biometrics 46; Wolfinger & Lin 1997, Comput. Sta
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from scipy import stats
 from scipy.optimize import minimize
 
+from nnode.errors import SimulationError
 from nnode.population.likelihood import (
     Linearised,
     Marginal,
@@ -149,6 +150,9 @@ def estimate(
             standard error, no standard deviation by more than this share of itself, and no agent's
             deviation by more than this share of their standard deviation.
         agents, start: ``(D, Q)``, ``(S, H)`` deviations that the search starts from; by default 0.
+
+    Raises:
+        SimulationError: the linear response diverges where the search starts.
     """
     theta = np.array(theta, dtype=float)
     low = np.full(len(theta), -np.inf) if low is None else low
@@ -163,6 +167,10 @@ def estimate(
     best, logliks = (theta, agents, start, data, variances), list[float]()
     region = float(stats.chi2.ppf(REGION, max(len(theta), 1))) / 2
     for _ in range(steps):
+        if not np.isfinite(noise.products(data, variances.noise).gram).all():
+            if not logliks:
+                raise SimulationError("the linear response of the simulated paths diverges")
+            break  # the last step led to a model without a likelihood
         before = variances
         variances = fit_variances(
             data,
@@ -187,29 +195,15 @@ def estimate(
         if logliks[-1] == max(logliks):
             best = theta, agents, start, data, variances
         change = current.change
-        misfit = _misfit(data, products, variances, agents, start)
         reversed_step = previous_change @ current.information @ change < 0
         relaxation = max(relaxation / 2, LEAST) if reversed_step else min(1.25 * relaxation, 1.0)
-        previous_change, accepted, linearised = change, None, data
-        share, shares = relaxation, np.full((n_agents, 1), relaxation)
-        for _ in range(HALVINGS):
-            trial = (
-                theta + share * change,
-                agents + shares * (current.deviations - agents),
-                start + shares[data.agent] * (current.start - start),
-            )
-            linearised, n_linearisations = response(*trial), n_linearisations + 1
-            fixed = replace(linearised, step=data.step, forced=data.forced)
-            trial_products = noise.products(fixed, variances.noise)
-            trial_misfit = _misfit(fixed, trial_products, variances, *trial[1:])
-            if trial_misfit.sum() <= misfit.sum():
-                accepted = trial
-                break
-            rises = (trial_misfit > misfit)[:, None]
-            share, shares = share / 2, np.where(rises, shares / 2, shares)
+        previous_change = change
         largest_change = _largest_change(current, agents, variances, before)
+        point = _Point(theta, agents, start, data)
+        accepted, tried = _step(response, noise, point, products, variances, current, relaxation)
+        n_linearisations += tried
         if accepted is not None:
-            (theta, agents, start), data = accepted, linearised
+            theta, agents, start, data = accepted
         converged = largest_change < tolerance
         stalled = max(logliks[-PATIENCE:]) < max(logliks)
         if converged or accepted is None or stalled:
@@ -231,6 +225,50 @@ def estimate(
         steps=n_linearisations,
         converged=converged,
     )
+
+
+class _Point(NamedTuple):
+    """Parameters, deviations of agents and of starts, and the samples, linearised there."""
+
+    theta: np.ndarray
+    agents: np.ndarray
+    start: np.ndarray
+    data: Linearised
+
+
+def _step(
+    response: Response,
+    noise: Noise,
+    point: _Point,
+    products: Products,
+    variances: Variances,
+    current: Marginal,
+    relaxation: float,
+) -> tuple[_Point | None, int]:
+    """A step toward the estimates of ``current``, shortened until the penalised sum of squares
+    falls; None if it does not. And the number of steps that were tried.
+
+    Args:
+        products: of the samples at the point. relaxation: share of the step that is tried first.
+    """
+    theta, agents, start, data = point
+    misfit = _misfit(data, products, variances, agents, start)
+    share, shares = relaxation, np.full((len(agents), 1), relaxation)
+    for tried in range(1, HALVINGS + 1):
+        trial = (
+            theta + share * current.change,
+            agents + shares * (current.deviations - agents),
+            start + shares[data.agent] * (current.start - start),
+        )
+        linearised = response(*trial)
+        fixed = replace(linearised, step=data.step, forced=data.forced)
+        trial_products = noise.products(fixed, variances.noise)
+        trial_misfit = _misfit(fixed, trial_products, variances, *trial[1:])
+        if trial_misfit.sum() <= misfit.sum():
+            return _Point(*trial, linearised), tried
+        rises = (trial_misfit > misfit)[:, None]
+        share, shares = share / 2, np.where(rises, shares / 2, shares)
+    return None, HALVINGS
 
 
 def fit_deviations(

@@ -109,6 +109,7 @@ def test_a_run_that_is_not_there(tmp_path: Path) -> None:
         nnode.simulate(tmp_path / "none")
 
 
+@pytest.mark.thorough
 def test_the_lines_of_the_page(
     idm_run: Path,
     tmp_path: Path,

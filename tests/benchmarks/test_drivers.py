@@ -12,6 +12,8 @@ import pytest
 
 import nnode
 from benchmarks import drivers
+from nnode.app.python.inputs import model_options
+from nnode.model.build import build_model
 
 
 def run(monkeypatch: pytest.MonkeyPatch, path: Path, *options: str) -> pd.DataFrame:
@@ -49,8 +51,19 @@ def test_rows_are_scored_and_kept(
 
 
 def test_laws_are_compared_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    laws = {name: build_model(model_options(name, "measured")) for name in ("lin", "log")}
+    monkeypatch.setattr(drivers, "candidates", lambda *given: laws)
     size = ["--laws", "lin", "--cases", "1", "--platoons", "8", "--vehicles", "4"]
     (row,) = run(monkeypatch, tmp_path / "table.csv", "--compare", *size).to_dict("records")
     assert row["true law first"]
-    assert row["first"] == "lin" != row["second"]
+    assert (row["first"], row["second"]) == ("lin", "log")
     assert row["p second"] < row["p true"] == 1.0
+
+
+def test_calibrations_are_scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    size = ["--laws", "lin", "--cases", "1", "--platoons", "8", "--vehicles", "3"]
+    (row,) = run(monkeypatch, tmp_path / "table.csv", "--calibrate", *size).to_dict("records")
+    assert (row["effect"], row["v0, true"], row["push_time, variation, true"]) == ("none", 29, 4)
+    assert row["L"] == pytest.approx(6.0, rel=0.02)
+    assert row["v0, variation"] == pytest.approx(15.0, rel=0.5)
+    assert {row["v0 covered"], row["L covered"]} <= {True, False}

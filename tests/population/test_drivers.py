@@ -76,7 +76,7 @@ def test_drivers_alike_do_not_differ() -> None:
     assert error == pytest.approx(ERROR, rel=0.1)
 
 
-@pytest.mark.parametrize("name", ["lin", "idm"])
+@pytest.mark.parametrize("name", ["lin", pytest.param("idm", marks=pytest.mark.thorough)])
 def test_errors_that_last_are_found_and_told_apart_from_pushes(name: str) -> None:
     table = benchmark_platoons(name, "none", 0.15, 21, 16, nature="lasting")
     system = Traffic([make_law(name)], leader="measured").double()

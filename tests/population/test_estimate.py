@@ -6,10 +6,12 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import nnode
 from benchmarks.drivers import platoons
 from nnode.app.python.inputs import model_options
+from nnode.errors import SimulationError
 from nnode.model.build import build_model
 from nnode.population.drivers import LONGEST, initial_variances
 from nnode.population.estimate import STEPS, Variances, estimate
@@ -91,3 +93,28 @@ def test_trial_parameters_that_blow_up_are_refused_without_a_warning() -> None:
         warnings.simplefilter("error")
         result = estimate(model, WhiteNoise(), np.array([0.7]), VARIANCES)
     assert min(model.tried) < 0 < result.theta[0]
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.5])
+def test_steps_to_an_unstable_linear_response_are_not_taken(limit: float) -> None:
+    """The samples are 1 - theta, and small changes grow without bound where theta > ``limit``."""
+
+    def response(theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
+        shape = DRIVERS, SAMPLES
+        growth = 1e200 if theta[0] > limit else 1.0
+        return replace(
+            Kink()(np.ones(1), agents, start),
+            residual=np.full(shape, 1 - theta[0]),
+            step=np.full((DRIVERS, SAMPLES - 1, 1, 1), growth),
+            forced=np.ones((DRIVERS, SAMPLES - 1, 1, 2)),
+        )
+
+    noise = np.array([0.1, 1.0, 0.1])
+    variances = replace(VARIANCES, noise=noise, low=noise, high=noise)
+    if limit == 0.0:
+        with pytest.raises(SimulationError, match="linear response"):
+            estimate(response, PushNoise(), np.array([0.1]), variances)
+        return
+    result = estimate(response, PushNoise(), np.array([0.1]), variances)
+    assert result.theta[0] == 0.1
+    assert not result.converged

@@ -28,6 +28,7 @@ from nnode.errors import SimulationError
 from nnode.model.effects import Effect
 from nnode.model.extend import effects_of, without
 from nnode.model.system import System
+from nnode.population.drivers import Population
 
 log = logging.getLogger(__name__)
 
@@ -309,8 +310,12 @@ def _with_refitted_variances(
     model without a strong effect would attribute it to autocorrelated pushes."""
     assert selection.screen is not None
     likeliest = sorted(candidates, key=lambda c: c.fit.cost)[:LIKELY]
-    populations = {c.name: engine.population_of(c.fit.system) for c in likeliest}
-    engine.set_likeliest(populations.values())
+    populations = dict[str, Population]()
+    for candidate in likeliest:
+        with suppress(SimulationError):
+            populations[candidate.name] = engine.population_of(candidate.fit.system)
+    if populations:
+        engine.set_likeliest(populations.values())
     selection.fit = refine(engine, selection.fit.system)
     refitted = []
     for candidate in candidates:
