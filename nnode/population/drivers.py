@@ -161,15 +161,14 @@ def fit_drivers(
     row = plain.natural(plain.start)
     alternative = [(first or {}).get(n, v) for n, v in zip(plain.names, row, strict=True)]
     starts = [plain.start] if first is None else [plain.start, plain.at(np.array(alternative))]
-    law = plain.may_differ
+    names = [] if drivers in ("auto", "none") else full_names(drivers, plain.may_differ)
+    alike = _with_lasting_errors(_most_likely(plain, starts))
     if drivers == "auto":
-        population = _with_random_effects(_with_lasting_errors(_most_likely(plain, starts)))
+        population = _with_random_effects(alike)
         better = _with_lasting_errors(population)
         population = population if better is population else _with_random_effects(better)
     else:
-        names = [] if drivers == "none" else full_names(drivers, law)
-        model = Followers(system, paths, names) if names else plain
-        population = _with_lasting_errors(_most_likely(model, starts))
+        population = _with_lasting_errors(_with_named_effects(alike, names)) if names else alike
     if pairs > 0 and population.estimate.converged:
         return _bias_corrected(population, seed, pairs)
     return population
@@ -387,6 +386,15 @@ def _with_random_effects(best: Population) -> Population:
     while (better := _next_random_effect(best, price)) is not None:
         best = better
     return best
+
+
+def _with_named_effects(alike: Population, names: list[str]) -> Population:
+    """The estimate in which parameters differ between drivers, from that of drivers alike."""
+    model, before = Followers(alike.model.system, alike.model.paths, names), alike.estimate
+    variances = before.variances
+    for _ in names:
+        variances = _with_random_effect(variances)
+    return _estimated(model, before.theta, variances)
 
 
 def _next_random_effect(best: Population, price: float) -> Population | None:

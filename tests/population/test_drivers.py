@@ -76,11 +76,20 @@ def test_drivers_alike_do_not_differ() -> None:
     assert error == pytest.approx(ERROR, rel=0.1)
 
 
-@pytest.mark.parametrize("name", ["lin", pytest.param("idm", marks=pytest.mark.thorough)])
-def test_errors_that_last_are_found_and_told_apart_from_pushes(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "drivers"),
+    [
+        ("lin", "auto"),
+        ("idm", ["T", "v0"]),
+        pytest.param("idm", "auto", marks=pytest.mark.thorough),
+    ],
+)
+def test_errors_that_last_are_found_and_told_apart_from_pushes(
+    name: str, drivers: str | list[str]
+) -> None:
     table = benchmark_platoons(name, "none", 0.15, 21, 16, nature="lasting")
     system = Traffic([make_law(name)], leader="measured").double()
-    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), pairs=0)
+    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), drivers, pairs=0)
     true = [PUSH[name], LASTS, None, 0.06, 1.0]
     for what, noise, value in zip(NOISE, found.estimate.variances.noise, true, strict=True):
         assert value is None or noise == pytest.approx(value, rel=0.5), what
