@@ -30,8 +30,6 @@ from nnode.simulation.rhs import formula_of
 LEAST_SPREAD, MOST_SPREAD, SPREAD = 1e-3, 1.0, 0.1
 #: An estimate within this share of an upper bound counts as being at the bound.
 NEAR = 1e-3
-#: A parameter is a random effect if its shrinkage is below this value, in the median over drivers.
-SHRINKAGE = 0.7
 #: Pushes: bounds of their standard deviation, and its start, by the law's order, in m/s or m/s².
 PUSH = {1: (1e-4, 5.0, 0.2), 2: (1e-4, 5.0, 0.1)}
 #: Bounds of the correlation time of pushes, in sampling intervals and as a share of the record (a
@@ -412,7 +410,8 @@ def _next_random_effect(best: Population, price: float) -> Population | None:
             fit = _estimated(model, before.theta, variances, steps=RANKING_STEPS)
         except SimulationError:
             continue
-        if _identified(fit.estimate) and fit.marginal.loglik > limit:
+        bounded = (fit.estimate.variances.spread < (1 - NEAR) * MOST_SPREAD).all()
+        if bounded and fit.marginal.loglik > limit:
             improved.append(fit)
         if len(improved) == RANKED:
             break
@@ -440,12 +439,6 @@ def _refitted(best: Population, data: Linearised, variances: Variances) -> tuple
     products = PushNoise().products(data, refitted.noise)
     result = marginal(data, products, refitted.spread, refitted.start, **bounds)
     return result.loglik, refitted
-
-
-def _identified(fit: Estimate) -> bool:
-    """Whether the data identify the variances of all random effects."""
-    informative = np.median(fit.marginal.shrinkage, 0) < SHRINKAGE
-    return bool((informative & (fit.variances.spread < (1 - NEAR) * MOST_SPREAD)).all())
 
 
 def initial_variances(model: Followers) -> Variances:
