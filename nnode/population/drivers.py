@@ -151,6 +151,7 @@ def fit_drivers(
     Raises:
         ConfigError: a name that the law does not have, a model without a formula, or simulations
             that blow up.
+        SimulationError: the linear response diverges at all starts.
     """
     plain = Followers(system, paths)
     if not _simulated_finitely(plain):

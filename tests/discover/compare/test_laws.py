@@ -76,6 +76,17 @@ def test_laws_are_compared_with_drivers_who_differ() -> None:
     assert p_value < 0.01
 
 
+def test_the_search_of_a_law_begins_at_its_most_likely_start() -> None:
+    sequences = list(nnode.sequences(drivers.platoons("lin", "none", 0.15, 6013, number=6)))
+    engine, good = FollowersEngine(sequences), law("lin").double()
+    distant = ParameterVector(law("lin").double()).fill_(np.array([8.0, 2.0]))
+    alone, calibrated = engine.log_likelihoods(good)
+    best, _ = engine.log_likelihoods(distant, good)
+    np.testing.assert_array_equal(best, alone)
+    assert not np.array_equal(best, engine.log_likelihoods(distant)[0])  # of another start
+    assert float(calibrated.physical()["lin.L"][0]) == pytest.approx(drivers.LENGTH, rel=0.05)
+
+
 def test_what_cannot_be_simulated_is_told() -> None:
     models = {"lin": law("lin"), "newell": law("newell")}
     before = ParameterVector(models["lin"]).row
