@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from nnode.calibrate.options import Pooling, TrainerOptions
 from nnode.calibrate.parameters import ParameterVector
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import Sequence, evenly
 from nnode.errors import ConfigError, unknown_value
 from nnode.model import System
 from nnode.model.term import Term, short_names
@@ -201,7 +201,7 @@ def calibrated_drivers(
     Raises:
         ConfigError: see :func:`nnode.population.drivers.fit_drivers`.
     """
-    from nnode.population.drivers import STEP, checked, fit_drivers  # compiled code takes a second
+    from nnode.population.drivers import CHECKED, STEP, fit_drivers  # compiled code takes a second
     from nnode.population.followers import APART, paths_of, without_errors
     from nnode.population.intervals import variations
 
@@ -213,7 +213,7 @@ def calibrated_drivers(
     paths, apart = paths_of(sequences, STEP), 0.0
     if without_errors(sequences):
         # a law explains positions of a simulation, and not those that were smoothed
-        part = paths_of(checked(sequences), STEP)
+        part = paths_of(evenly(sequences, CHECKED), STEP)
         if not fit_drivers(double, part, first=first, pairs=0).explains_rates:
             if drivers is None:
                 return None

@@ -12,14 +12,14 @@ from nnode.app.python.inputs import Table
 from nnode.app.saved_run import SavedRun
 from nnode.data.readers.columns import Table as DataTable
 from nnode.data.readers.table import TableOptions, read_table
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import Sequence, evenly
 from nnode.discover.report.replay import zone_of
 from nnode.errors import DataError
 from nnode.exchange.trajectories import simulated as simulated_by
 from nnode.model.effects import Effect
 from nnode.model.extend import effects_of
 from nnode.pages.page import write_player
-from nnode.pages.replay import MOST, ReplayBlock, Scene, Zone, evenly
+from nnode.pages.replay import MOST, ReplayBlock, Scene, Zone
 
 _CAPTION = (
     "Outlines are measured agents. Arrows lead from the simulated to the measured position. The "

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from collections.abc import Sequence as ListLike
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 from nnode.errors import DataError
 
 Domain = Literal["traffic", "crowd"]
+T = TypeVar("T")
 
 #: Seconds by unit of time.
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -365,3 +367,9 @@ def collate(sequences: Iterable[Sequence]) -> Batch:
         group=tuple(item.group for item in items),
         **{name: torch.from_numpy(array) for name, array in arrays.items()},
     )
+
+
+def evenly(items: ListLike[T], number: int) -> list[T]:
+    """At most ``number`` of the items, at equal steps."""
+    chosen = np.linspace(0, len(items) - 1, min(number, len(items))).round().astype(int)
+    return [items[i] for i in chosen]

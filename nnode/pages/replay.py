@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
-from collections.abc import Sequence as Sequenced
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import Sequence, evenly
 from nnode.plots.style import GREY, OKABE_ITO
-
-T = TypeVar("T")
 
 #: Largest number of bytes and of sequences of a player.
 BYTES, MOST = 1_000_000, 60
@@ -121,12 +118,6 @@ class ReplayBlock:
         if any(s.x.shape[2] == 2 for s in shown):
             said.append(f"People are drawn with a radius of {BODY:g} m.")
         return text, " ".join(said)
-
-
-def evenly(items: Sequenced[T], number: int) -> list[T]:
-    """At most ``number`` of the items, at equal steps."""
-    chosen = np.linspace(0, len(items) - 1, min(number, len(items))).round().astype(int)
-    return [items[i] for i in chosen]
 
 
 def typical(scenes: list[Scene]) -> int:

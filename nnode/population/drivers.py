@@ -258,12 +258,6 @@ def refit(before: Population, system: System, paths: Paths, *, fixed: bool) -> P
     return replace(before, model=model, estimate=deviations, bias=np.zeros(len(model.start)))
 
 
-def checked(sequences: list[Sequence]) -> list[Sequence]:
-    """At most :data:`CHECKED` of some sequences, evenly spaced."""
-    number = min(CHECKED, len(sequences))
-    return [sequences[i] for i in np.linspace(0, len(sequences) - 1, number).round().astype(int)]
-
-
 def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
     """Full names of a law's parameters, from their short names.
 

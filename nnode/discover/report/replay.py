@@ -6,10 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from nnode.data.sequence import evenly
 from nnode.discover.outcome import DiagnosisOutcome
 from nnode.discover.report.files import amount
 from nnode.discover.result import Diagnosis, NamedEffect
-from nnode.pages.replay import ReplayBlock, Scene, Zone, evenly
+from nnode.pages.replay import ReplayBlock, Scene, Zone
 
 #: Largest number of confirmation sequences in the player.
 SCENES = 16
