@@ -78,12 +78,13 @@ BLOWS_UP = (
 )
 
 
-#: Stages of a diagnosis, with the seconds that they take on 120 pairs of NGSIM I-80.
+#: Stages of a diagnosis, with the seconds that they take on 40 platoons of six by ``idm`` with a
+#: zone, beside other work.
 STAGES = {
-    "calibrating": 6.0,
-    "locating": 22.0,
-    "naming": 62.0,
-    "confirming": 55.0,
+    "calibrating": 79.0,
+    "locating": 12.0,
+    "naming": 69.0,
+    "confirming": 30.0,
 }
 
 
