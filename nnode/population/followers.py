@@ -192,7 +192,8 @@ def _smoothed_error(paths: list[np.ndarray], dt: float, noise: float) -> tuple[f
 
     The smoother keeps the errors of low frequencies and removes those above
     omega = weight^(-1/6) / dt. The process has the same spectral density at frequency 0 and half of
-    it at omega, to which followers hardly respond.
+    it at omega, to which followers hardly respond. If paths are hardly smoothed, their errors are
+    white: the shortest time is half a sampling interval, at which the variance is that of errors.
 
     Args:
         paths: ``(K, N)`` measured positions of each sequence, m. noise: of measurement, m.
@@ -200,7 +201,8 @@ def _smoothed_error(paths: list[np.ndarray], dt: float, noise: float) -> tuple[f
     Returns:
         Its standard deviation, m, and its correlation time, s.
     """
-    time = dt * float(np.median([smoothing_weight(x) for x in paths])) ** (1 / 6)
+    weight = float(np.median([smoothing_weight(x) for x in paths]))
+    time = dt * max(weight ** (1 / 6), 0.5)
     variance = noise**2 * dt / (2 * time) if noise > NOISE[0] else 0.0
     return math.sqrt(variance), time
 
