@@ -105,11 +105,11 @@ def test_errors_of_leaders_are_neither_pushes_nor_errors_that_last() -> None:
     assert lasts[0] < LASTS < lasts[1]
 
 
-def test_errors_of_paths_that_are_too_short_to_be_smoothed_are_white() -> None:
+def test_paths_that_are_too_short_to_show_errors_have_no_errors_of_leaders() -> None:
     sequences, _ = platoons(0.15, 1)
     short = paths_of([s.part(0.0, 5.5 / s.n_samples) for s in sequences], 0.2)
     assert short.x.shape[1] == 5
-    assert short.leader == pytest.approx((short.error, DT / 2))
+    assert short.leader == pytest.approx((0.0, DT / 2))
 
 
 def test_with_v0_at_its_bound_l_is_the_most_likely_one_there() -> None:
