@@ -32,6 +32,7 @@ from nnode.discover.compare.laws import compare_laws
 from nnode.discover.options import DiscoverOptions
 from nnode.files import write_text
 from nnode.model.build import build_model
+from nnode.model.term import short_names
 from studies.runner import Task, run_tasks
 
 #: s, step and sampling interval, s. Steps of 0.02 s delay reactions by 0.01 s, which lowers kappa
@@ -285,9 +286,8 @@ def diagnosed(**case: Any) -> dict[str, Any]:
     }
     row = {**case, "hidden": bool(sizes), **judged(report, list(sizes))}
     for name, true in {**sizes, **_variations(case)}.items():
-        interval = intervals.get(name, {"value": None, "low": None, "high": None})
-        row[name], row[f"{name}, true"] = interval["value"], true
-        row[f"{name} covered"] = covers(interval["low"], interval["high"], true)
+        interval = intervals.get(name, {})
+        row |= _beside(name, true, *(interval.get(end) for end in ("value", "low", "high")))
     return {**row, "seconds": round(time.monotonic() - begun, 1)}
 
 
@@ -318,20 +318,27 @@ def calibrated(**case: Any) -> dict[str, Any]:
     begun = time.monotonic()
     run = nnode.fit(platoons(**case), "traffic", model=case["law"], drivers="auto", heldout=0.0)
     assert run.drivers is not None
-    short = run.parameters.rename(index=lambda name: name.rpartition(".")[2])
+    variability = run.drivers.variability
+    parameters = run.parameters.rename(index=short_names(map(str, run.parameters.index)))
+    variations = _variations(case) | {"measurement": case["error"]}
     row = {**case, "hidden": False}
-    for true, table in (
-        (TYPICAL[case["law"]], short),
-        (_variations(case) | {"measurement": case["error"]}, run.drivers.variability),
+    for table, true_values, what in (
+        (parameters, TYPICAL[case["law"]], ""),
+        (variability, variations, ", variation"),
     ):
-        for name, value in true.items():
-            key = name if table is short else f"{name}, variation"
-            estimate: dict[Any, Any] = table.loc[name].to_dict() if name in table.index else {}
-            row[key], row[f"{key}, true"] = estimate.get("estimate"), value
-            row[f"{key} covered"] = covers(estimate.get("lower"), estimate.get("upper"), value)
-    others = set(run.drivers.variability["unit"].loc[lambda unit: unit == "%"].index)
+        rows = table.reindex(list(true_values))[["estimate", "lower", "upper"]]
+        for name, values in zip(true_values, rows.to_numpy(), strict=True):
+            row |= _beside(f"{name}{what}", true_values[name], *map(float, values))
+    others = set(variability.index[variability["unit"] == "%"])
     row["false variation"] = bool(others - set(_variations(case)))
     return {**row, "seconds": round(time.monotonic() - begun, 1)}
+
+
+def _beside(
+    name: str, true: float, value: float | None, low: float | None, high: float | None
+) -> dict[str, Any]:
+    """An estimate beside the true value, and whether its interval contains it."""
+    return {name: value, f"{name}, true": true, f"{name} covered": covers(low, high, true)}
 
 
 def _variations(case: dict[str, Any]) -> dict[str, float]:

@@ -17,22 +17,19 @@ LONG = 1000
 
 
 def smooth(x: np.ndarray) -> np.ndarray:
+    """Paths ``(K, ...)``, smoothed by :func:`whittaker`."""
+    return whittaker(x)[0]
+
+
+def whittaker(x: np.ndarray) -> tuple[np.ndarray, float]:
     """Whittaker's smoother along the first axis, ``(K, ...)`` to ``(K, ...)``, all columns alike,
-    with the weight of :func:`smoothing_weight`. Fewer than six samples are returned as they are.
+    and its weight of smoothness.
+
+    The weight is the one with the least generalised cross-validation error over all columns. Fewer
+    than six samples are returned as they are, with weight 0.
 
     Source: Eilers 2003, Analytical Chemistry 75.
     """
-    return _whittaker(x)[0]
-
-
-def smoothing_weight(x: np.ndarray) -> float:
-    """The weight of smoothness with the least generalised cross-validation error over all columns
-    of ``(K, ...)``; 0 for fewer than six samples."""
-    return _whittaker(x)[1]
-
-
-def _whittaker(x: np.ndarray) -> tuple[np.ndarray, float]:
-    """The smoothed columns, and the weight."""
     if len(x) < 6:
         return x.copy(), 0.0
     columns, values, penalty = x.reshape(len(x), -1), _sizes(len(x)), _penalty(len(x))

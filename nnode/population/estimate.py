@@ -167,30 +167,31 @@ def estimate(
     best, logliks = (theta, agents, start, data, variances), list[float]()
     region = float(stats.chi2.ppf(REGION, max(len(theta), 1))) / 2
     for _ in range(steps):
-        if not np.isfinite(noise.products(data, variances.noise).gram).all():
-            if not logliks:
-                raise SimulationError("the linear response of the simulated paths diverges")
-            break  # the last step led to a model without a likelihood
         before = variances
-        variances = fit_variances(
-            data,
-            noise,
-            variances,
-            low=low - theta,
-            high=high - theta,
-            restricted=restricted,
-            tolerance=tolerance,
-        )
-        products = noise.products(data, variances.noise)
-        current = marginal(
-            data,
-            products,
-            variances.spread,
-            variances.start,
-            low=np.maximum(low - theta, -longest),
-            high=np.minimum(high - theta, longest),
-            restricted=restricted,
-        )
+        try:
+            variances = fit_variances(
+                data,
+                noise,
+                variances,
+                low=low - theta,
+                high=high - theta,
+                restricted=restricted,
+                tolerance=tolerance,
+            )
+            products = noise.products(data, variances.noise)
+            current = marginal(
+                data,
+                products,
+                variances.spread,
+                variances.start,
+                low=np.maximum(low - theta, -longest),
+                high=np.minimum(high - theta, longest),
+                restricted=restricted,
+            )
+        except SimulationError:
+            if not logliks:
+                raise
+            break  # the last step led to a model without a likelihood
         logliks.append(current.unchanged)
         if logliks[-1] == max(logliks):
             best = theta, agents, start, data, variances

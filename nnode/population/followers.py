@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.data.paths import smooth, smoothing_weight
+from nnode.data.paths import smooth, whittaker
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.data.smooth import measured_noise
 from nnode.errors import ConfigError, SimulationError
@@ -164,7 +164,7 @@ def paths_of(sequences: list[Sequence], step: float, floor: float = FLOOR) -> Pa
             names.append(key[1])
         agent.append(agents[key])
     sequence, place = np.array(which).T
-    smoothed = [smooth(s.x[..., 0]) for s in sequences]
+    smoothed, weights = map(list, zip(*[whittaker(s.x[..., 0]) for s in sequences], strict=True))
     start = np.stack([_start(smoothed[b][:, i], dt) for b, i in which], 1)
     noise = measured_noise(sequences).position
     return Paths(
@@ -182,12 +182,12 @@ def paths_of(sequences: list[Sequence], step: float, floor: float = FLOOR) -> Pa
         start=start,
         second=np.array([float(i + 2 < sequences[b].n_agents) for b, i in which]),
         error=max(noise, floor) if math.isfinite(noise) else floor,
-        leader=_smoothed_error([s.x[..., 0] for s in sequences], dt, noise),
+        leader=_smoothed_error(weights, dt, noise),
         batch=collate(_with_vehicles_ahead(sequences[b], i) for b, i in which),
     )
 
 
-def _smoothed_error(paths: list[np.ndarray], dt: float, noise: float) -> tuple[float, float]:
+def _smoothed_error(weights: list[float], dt: float, noise: float) -> tuple[float, float]:
     """The error of smoothed paths, as an Ornstein-Uhlenbeck process.
 
     The smoother keeps the errors of low frequencies and removes those above
@@ -196,13 +196,12 @@ def _smoothed_error(paths: list[np.ndarray], dt: float, noise: float) -> tuple[f
     white: the shortest time is half a sampling interval, at which the variance is that of errors.
 
     Args:
-        paths: ``(K, N)`` measured positions of each sequence, m. noise: of measurement, m.
+        weights: of smoothness, of each sequence. noise: of measurement, m.
 
     Returns:
         Its standard deviation, m, and its correlation time, s.
     """
-    weight = float(np.median([smoothing_weight(x) for x in paths]))
-    time = dt * max(weight ** (1 / 6), 0.5)
+    time = dt * max(float(np.median(weights)) ** (1 / 6), 0.5)
     variance = noise**2 * dt / (2 * time) if noise > NOISE[0] else 0.0
     return math.sqrt(variance), time
 
@@ -252,7 +251,7 @@ def _ahead_symbols(ahead: np.ndarray) -> dict[str, np.ndarray]:
 
 
 #: Position and speed of the vehicle ahead in formulas: their columns in :func:`_jacobian`.
-_AHEAD = {"x_1": 0, "v_1": 1, "dx_1": 1, "measured": 1}
+_AHEAD = {name: int(k) for name, k in _ahead_symbols(np.arange(4)).items() if k < 2}
 
 
 def follower_formula(system: System) -> LaneDynamics | None:

@@ -29,6 +29,7 @@ from numba import njit
 from scipy.optimize import lsq_linear
 
 from nnode.data.clusters import group_sums
+from nnode.errors import SimulationError
 
 #: Share of the largest eigenvalue of the scaled information below which a direction is flat.
 FLAT = 1e-10
@@ -72,6 +73,11 @@ class Linearised:
     def by_deviation(self) -> np.ndarray:
         """``(S, K, Q)`` Z, by the agent's deviations."""
         return self.fixed[..., self.random]
+
+    def processes(self, push: float, push_time: float) -> list[tuple[float, float]]:
+        """Standard deviation and correlation time of each process that acts, in the order of
+        :attr:`forced`: of the push, and of the error of the leader's path if there is one."""
+        return [(push, push_time), self.leader][: 2 if self.leader[0] > 0 else 1]
 
     @cached_property
     def columns(self) -> np.ndarray:
@@ -191,14 +197,13 @@ class PushNoise(Noise):
         assert data.step is not None
         assert data.forced is not None
         push, push_time, white, *autocorrelated = values
-        processes = [(push, push_time), data.leader][: 2 if data.leader[0] > 0 else 1]
-        number = len(processes)
+        processes = data.processes(push, push_time)
         sigma, time = np.array([*processes, autocorrelated or (0.0, 1.0)]).T
         whitened: tuple[np.ndarray, np.ndarray] = _filtered(
             np.ascontiguousarray(columns),
             data.observed,
             data.step,
-            np.ascontiguousarray(data.forced[..., :number]),
+            np.ascontiguousarray(data.forced[..., : len(processes)]),
             sigma,
             np.exp(-data.dt / time),
             white**2,
@@ -466,7 +471,12 @@ def marginal(
         start: ``(H,)`` of the starts' deviations.
         low, high: ``(P,)`` bounds of the change of the parameters.
         restricted: whether to use the restricted likelihood (REML).
+
+    Raises:
+        SimulationError: the linear response diverges.
     """
+    if not np.isfinite(segments.gram).all():
+        raise SimulationError("the linear response of the simulated paths diverges")
     agents = segments.without(start).summed(data.agent)
     without_agents = agents.without(spread)
     total = without_agents.gram.sum(0)

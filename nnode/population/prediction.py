@@ -105,8 +105,7 @@ def _covariance(
     time = data.dt * np.arange(samples)
     columns = np.concatenate([data.by_deviation[f] * spread, data.start[f] * start], -1)
     covariance: np.ndarray = columns @ columns.T
-    processes = (float(noise[0]), float(noise[1])), data.leader
-    for p, (sigma, tau) in enumerate(processes):
+    for p, (sigma, tau) in enumerate(data.processes(*noise[:2])):
         response = np.zeros((samples, data.step.shape[-1], samples))
         for k in range(samples - 1):
             response[k + 1] = data.step[f, k] @ response[k]

@@ -74,10 +74,11 @@ def covariance(data: Linearised, lasting: tuple[float, ...]) -> np.ndarray:
 @pytest.mark.parametrize("leader", [(0.0, 1.0), (0.3, 0.5)])
 @pytest.mark.parametrize("lasting", [(), (0.1, 0.7)])
 @pytest.mark.parametrize("states", [1, 2])
+@pytest.mark.parametrize("seed", range(3))
 def test_the_filter_is_a_dense_gaussian(
-    states: int, lasting: tuple[float, ...], leader: tuple[float, float]
+    seed: int, states: int, lasting: tuple[float, ...], leader: tuple[float, float]
 ) -> None:
-    data = example(states, states, leader)
+    data = example(seed, states, leader)
     observed = data.observed.ravel()
     v = covariance(data, lasting)[np.ix_(observed, observed)]
     x, w = data.fixed.reshape(-1, 3)[observed], data.residual.ravel()[observed]
