@@ -237,20 +237,23 @@ def _filtered(
     n = m + processes + 1 if lasting else m + processes
     fresh = sigma**2 * (1 - keep**2)
     white, logdet = np.zeros((number, samples, width)), np.zeros(number)
-    mean, before = np.empty((n, width)), np.empty((n, width))
-    spread, half = np.empty((n, n)), np.empty((n, n))
-    forward, noise, gain = np.zeros((n, n)), np.zeros((n, processes)), np.empty(n)
+    mean, before = np.empty((n, width)), np.empty((m, width))
+    spread, half, gain = np.empty((n, n)), np.empty((m, n)), np.empty(n)
+    forward = np.zeros((m, n))
     for s in range(number):
         mean[:], spread[:] = 0.0, 0.0
         for p in range(processes):
             spread[m + p, m + p] = sigma[p] ** 2
         if lasting:
             _add_error(spread, sigma[-1] ** 2)
-        for k in range(samples):
+        last = samples - 1
+        while last > 0 and not observed[s, last]:
+            last -= 1
+        for k in range(last + 1):
             if k:
-                _set_transition(step[s, k - 1], forced[s, k - 1], keep, forward, noise)
-                _predict(mean, spread, forward, before, half)
-                _add_innovations(spread, noise, fresh)
+                _set_transition(step[s, k - 1], forced[s, k - 1], keep, forward)
+                _predict(mean, spread, forward, keep, before, half)
+                _add_innovations(spread, forced[s, k - 1], fresh)
                 if lasting:
                     _add_error(spread, fresh[-1])
             if observed[s, k]:
@@ -260,26 +263,20 @@ def _filtered(
 
 @njit(cache=True, nogil=True)
 def _set_transition(
-    step: np.ndarray, forced: np.ndarray, keep: np.ndarray, forward: np.ndarray, noise: np.ndarray
+    step: np.ndarray, forced: np.ndarray, keep: np.ndarray, forward: np.ndarray
 ) -> None:
-    """Fill the transition matrix ``forward`` of the state of :func:`_filtered`, and the derivatives
-    ``noise`` of the state by the innovations of e."""
+    """Fill the derivatives ``forward`` ``(M, n)`` of d after a sampling interval by the state of
+    :func:`_filtered` before it. The other elements of the state decay by themselves."""
     m, processes = forced.shape
-    last = len(forward) - 1
-    for p in range(processes):
-        e = m + p
-        forward[e, e], noise[e, p] = keep[p], 1.0
-        for i in range(m):
-            noise[i, p] = forced[i, p]
-            forward[i, e] = forced[i, p] * (1 + keep[p])
     for i in range(m):
         for j in range(m):
             forward[i, j] = step[i, j]
-    if last >= m + processes:
+        for p in range(processes):
+            forward[i, m + p] = forced[i, p] * (1 + keep[p])
+    if forward.shape[1] > m + processes:
         for i in range(m):
-            forward[i, last] = -step[i, 0]
-        forward[0, last] += keep[-1]
-        forward[last, last] = keep[-1]
+            forward[i, -1] = -step[i, 0]
+        forward[0, -1] += keep[-1]
 
 
 @njit(cache=True, nogil=True)
@@ -292,13 +289,18 @@ def _add_error(spread: np.ndarray, variance: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _add_innovations(spread: np.ndarray, noise: np.ndarray, fresh: np.ndarray) -> None:
-    """Add the covariance of the innovations of e, of variances ``fresh``."""
-    n, processes = noise.shape
-    for i in range(n):
-        for j in range(n):
-            for p in range(processes):
-                spread[i, j] += noise[i, p] * noise[j, p] * fresh[p]
+def _add_innovations(spread: np.ndarray, forced: np.ndarray, fresh: np.ndarray) -> None:
+    """Add the covariance of the innovations of e, of variances ``fresh``, and of d by them."""
+    m, processes = forced.shape
+    for p in range(processes):
+        e = m + p
+        spread[e, e] += fresh[p]
+        for i in range(m):
+            change = forced[i, p] * fresh[p]
+            spread[i, e] += change
+            spread[e, i] += change
+            for j in range(m):
+                spread[i, j] += change * forced[j, p]
 
 
 @njit(cache=True, nogil=True)
@@ -306,31 +308,41 @@ def _predict(
     mean: np.ndarray,
     spread: np.ndarray,
     forward: np.ndarray,
+    keep: np.ndarray,
     before: np.ndarray,
     half: np.ndarray,
 ) -> None:
     """The state one sample later without innovations: mean and covariance are replaced. ``before``
-    and ``half`` are work arrays of the sizes of ``mean`` and ``spread``."""
-    n, width = mean.shape
-    for i in range(n):
+    and ``half`` are work arrays of d."""
+    m, n = forward.shape
+    width = mean.shape[1]
+    for i in range(m):
         for c in range(width):
             before[i, c] = mean[i, c]
             mean[i, c] = 0.0
-    for i in range(n):
         for j in range(n):
-            for c in range(width):
-                mean[i, c] += forward[i, j] * before[j, c]
             total = 0.0
             for q in range(n):
                 total += forward[i, q] * spread[q, j]
             half[i, j] = total
-    for i in range(n):
+    for i in range(m):
+        for j in range(n):
+            for c in range(width):
+                mean[i, c] += forward[i, j] * (before[j, c] if j < m else mean[j, c])
         for j in range(i + 1):
             total = 0.0
             for q in range(n):
                 total += half[i, q] * forward[j, q]
             spread[i, j] = total
             spread[j, i] = total
+    for i in range(m, n):
+        for c in range(width):
+            mean[i, c] *= keep[i - m]
+        for j in range(m):
+            spread[i, j] = keep[i - m] * half[j, i]
+            spread[j, i] = spread[i, j]
+        for j in range(m, n):
+            spread[i, j] *= keep[i - m] * keep[j - m]
 
 
 @njit(cache=True, nogil=True)
@@ -359,8 +371,9 @@ def _condition(
             mean[i, c] += gain[i] * white[c]
         for j in range(n):
             spread[i, j] -= gain[i] * gain[j] * total
+    scale = 1 / np.sqrt(total)
     for c in range(width):
-        white[c] /= np.sqrt(total)
+        white[c] *= scale
     return float(np.log(total))
 
 
