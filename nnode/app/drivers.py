@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from nnode.calibrate.options import Pooling, TrainerOptions
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, evenly
-from nnode.errors import ConfigError, unknown_value
+from nnode.errors import CheckpointError, ConfigError, unknown_value
 from nnode.model import System
 from nnode.model.term import Term, short_names
 from nnode.plots.traffic import driver_figure
@@ -178,6 +178,39 @@ class Drivers:
             "apart": self.apart,
             "table": self.table.to_dict("records"),
         }
+
+
+def variances_of(drivers: Any) -> tuple[dict[str, float], float] | None:
+    """Standard deviations and times by name, as :func:`nnode.population.prediction.predict` takes
+    them, and the smallest time between positions that are used, s. None: drivers do not differ.
+
+    Args:
+        drivers: what :meth:`Drivers.plain` gives, or None.
+
+    Raises:
+        CheckpointError: values are missing or have no meaning.
+    """
+    if drivers is None:
+        return None
+    from nnode.population.likelihood import NOISE  # compiled code takes a second
+
+    try:
+        rows = drivers["variability"]
+        lasting = [name for name in NOISE[3:] if name in rows]
+        names = [*NOISE[:3], *lasting, *drivers["differ"]]
+        values = {name: float(rows[name]["estimate"]) for name in names}
+        apart = float(drivers.get("apart", 0.0))
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            "the differences between drivers in result.json are damaged: expected an estimate of "
+            "push, push_time, measurement and of each parameter that differs; train again"
+        ) from error
+    if not 0 <= apart < np.inf:
+        raise CheckpointError(f"result.json: apart is {apart:g}, expected a number of seconds")
+    for name, value in values.items():
+        if not 0 < value < np.inf:
+            raise CheckpointError(f"result.json: {name} is {value:g}, expected a positive number")
+    return values | {name: values[name] / 100 for name in drivers["differ"]}, apart
 
 
 def calibrated_drivers(

@@ -14,13 +14,14 @@ from scipy.stats import norm
 
 from nnode.app.calibration import Calibration
 from nnode.app.cli.saved import load_run
+from nnode.app.drivers import variances_of
 from nnode.app.python.inputs import Table
-from nnode.app.saved_run import SavedRun, result_of
+from nnode.app.saved_run import SavedRun, drivers_of
 from nnode.app.training import threads_given_back
 from nnode.calibrate.resampling import Paired, paired
 from nnode.data.clusters import clusters
 from nnode.data.sequences import Sequences
-from nnode.errors import CheckpointError, ConfigError
+from nnode.errors import ConfigError
 from nnode.files import write_csv, write_json
 
 if TYPE_CHECKING:
@@ -142,11 +143,7 @@ def predict_run(
         ConfigError: the run has no differences between drivers, the beginning is too short, or no
             sequence is longer.
     """
-    if isinstance(run, Calibration):
-        drivers = None if run.drivers is None else run.drivers.plain()
-    else:
-        drivers = result_of(run).get("drivers")
-    return _predicted(SavedRun.of_python(run, data, part), *_noise(drivers), seconds)
+    return _predicted(SavedRun.of_python(run, data, part), *_variances(run), seconds)
 
 
 def predict(config: DictConfig, folder: Path) -> None:
@@ -155,41 +152,23 @@ def predict(config: DictConfig, folder: Path) -> None:
     Raises:
         NNodeError: see :func:`predict_run`.
     """
-    noise = _noise(result_of(config.run).get("drivers"))
+    variances = _variances(config.run)
     run = SavedRun.of_command(load_run(config.run), config, folder)
-    predictions = _predicted(run, *noise, float(config.seconds))
+    predictions = _predicted(run, *variances, float(config.seconds))
     print(predictions)
     for path in predictions.write(folder):
         print(f"{'plot' if path.suffix == '.png' else path.name.partition('.')[0]}: {path}")
 
 
-def _noise(drivers: Any) -> tuple[dict[str, float], float]:
-    """Standard deviations and times by name, as :func:`nnode.population.prediction.predict` takes
-    them, and the smallest time between positions that are used, s."""
-    if drivers is None:
+def _variances(run: str | Path | Calibration) -> tuple[dict[str, float], float]:
+    """See :func:`nnode.app.drivers.variances_of`."""
+    variances = variances_of(drivers_of(run))
+    if variances is None:
         raise ConfigError(
             "the run has no differences between drivers, from which a driver's parameters are "
             "predicted; train with trainer.drivers=auto, in Python nnode.fit(..., drivers='auto')"
         )
-    from nnode.population.likelihood import NOISE  # compiled code takes a second
-
-    try:
-        rows = drivers["variability"]
-        lasting = [name for name in NOISE[3:] if name in rows]
-        names = [*NOISE[:3], *lasting, *drivers["differ"]]
-        values = {name: float(rows[name]["estimate"]) for name in names}
-        apart = float(drivers.get("apart", 0.0))
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            "the differences between drivers in result.json are damaged: expected an estimate of "
-            "push, push_time, measurement and of each parameter that differs; train again"
-        ) from error
-    if not 0 <= apart < np.inf:
-        raise CheckpointError(f"result.json: apart is {apart:g}, expected a number of seconds")
-    for name, value in values.items():
-        if not 0 < value < np.inf:
-            raise CheckpointError(f"result.json: {name} is {value:g}, expected a positive number")
-    return values | {name: values[name] / 100 for name in drivers["differ"]}, apart
+    return variances
 
 
 def _predicted(

@@ -229,3 +229,17 @@ def result_of(run: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise CheckpointError(f"{path} has no entries; give the folder of a complete training")
     return content
+
+
+def drivers_of(run: str | Path | Calibration) -> Any:
+    """What :meth:`nnode.app.drivers.Drivers.plain` gave for a run; None if its drivers do not
+    differ, or if it has no ``result.json``, as a diagnosis.
+
+    Raises:
+        CheckpointError: see :func:`result_of`.
+    """
+    if isinstance(run, Calibration):
+        return None if run.drivers is None else run.drivers.plain()
+    if not (checkpoint_of(run).parent.parent / RESULT).exists():
+        return None
+    return result_of(run).get("drivers")

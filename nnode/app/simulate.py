@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
 
 from nnode.app.calibration import Calibration
 from nnode.app.cli.saved import load_run
+from nnode.app.drivers import variances_of
 from nnode.app.python.inputs import Table
-from nnode.app.saved_run import SavedRun, choose
+from nnode.app.saved_run import SavedRun, choose, drivers_of
 from nnode.app.training import threads_given_back
 from nnode.calibrate.resampling import paired
 from nnode.data.clusters import clusters
 from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError
 from nnode.exchange.trajectories import check_format
-from nnode.generate.fit import fit_noise
+from nnode.generate.fit import FittedNoise, fit_noise
 from nnode.generate.noise import Noise, constant_speed, free_running
 from nnode.generate.scores import LEAST
 from nnode.generate.simulated import SampledModel, Sampling, Simulated, batches
+from nnode.model import System
 
 #: Largest number of randomly drawn training sequences for the fit of the noise.
 FITTED = 200
@@ -37,7 +40,8 @@ def simulate_run(
 ) -> Simulated:
     """Sample the motion of vehicles or people from a calibrated model, and score it.
 
-    The noise is fitted to the sequences that the model was calibrated to; see
+    Where the run estimated differences between drivers, drivers and disturbances are drawn from
+    them. Otherwise the noise is fitted to the sequences that the model was calibrated to; see
     ``docs/sampling.md``.
 
     Args:
@@ -57,7 +61,8 @@ def simulate_run(
     """
     _check(samples)
     place = "" if isinstance(run, Calibration) else str(run)
-    return _simulated(SavedRun.of_python(run, data, part), place, samples, seed)
+    saved = SavedRun.of_python(run, data, part)
+    return _simulated(saved, drivers_of(run), place, samples, seed)
 
 
 def simulate(config: DictConfig, folder: Path) -> None:
@@ -71,7 +76,8 @@ def simulate(config: DictConfig, folder: Path) -> None:
     if config.format is not None:  # checked before the long computation
         check_format("format", config.format, checkpoint.build().domain)
     run = SavedRun.of_command(checkpoint, config, folder)
-    result = _simulated(run, str(config.run), int(config.samples), int(config.seed))
+    drivers, place = drivers_of(config.run), str(config.run)
+    result = _simulated(run, drivers, place, int(config.samples), int(config.seed))
     print(result)
     files = result.write(folder, format=config.format)
     for path in dict.fromkeys(p.parent if p.suffix == ".txt" else p for p in reversed(files)):
@@ -85,7 +91,7 @@ def _check(samples: int) -> None:
         )
 
 
-def _simulated(run: SavedRun, place: str, samples: int, seed: int) -> Simulated:
+def _simulated(run: SavedRun, drivers: Any, place: str, samples: int, seed: int) -> Simulated:
     model, name, store = free_running(run.model), run.name, run.source
     label = clusters(store.index)
     training_indices = _some(choose(store, run.checkpoint, "train")[1], seed)
@@ -93,8 +99,10 @@ def _simulated(run: SavedRun, place: str, samples: int, seed: int) -> Simulated:
     solver = run.config["solver"]
     steps = {"dt": solver.get("dt"), "method": solver.get("method")}
     constant_speed_model = constant_speed(model.domain)
+    estimated = _estimated_noise(model, drivers, len(set(label[training_indices])))
     noise = {
-        name: fit_noise(model, training_batches, label[training_indices], seed=seed, **steps),
+        name: estimated
+        or fit_noise(model, training_batches, label[training_indices], seed=seed, **steps),
         "constant_speed": fit_noise(
             constant_speed_model, training_batches, label[training_indices], seed=seed
         ),
@@ -125,6 +133,34 @@ def _simulated(run: SavedRun, place: str, samples: int, seed: int) -> Simulated:
         sampling=job,
         sampled_model=samplers[name],
     )
+
+
+def _estimated_noise(model: System, drivers: Any, clusters: int) -> FittedNoise | None:
+    """The noise and the differences between drivers of a run; None if it did not estimate them.
+
+    Args:
+        drivers: what :meth:`nnode.app.drivers.Drivers.plain` gave. clusters: their number.
+    """
+    variances = variances_of(drivers)
+    if variances is None:
+        return None
+    from nnode.population.drivers import full_names  # compiled code takes a second
+
+    values, _ = variances
+    rows = drivers["variability"]
+    law = [name for name in model.physical() if name.startswith(f"{model.term_list[0].name}.")]
+    full = dict(zip(drivers["differ"], full_names(drivers["differ"], law), strict=True))
+    sigma, tau = (
+        None if row["lower"] is None else (row["lower"], row["upper"])
+        for row in (rows["push"], rows["push_time"])
+    )
+    noise = Noise(
+        values["push"],
+        values["push_time"],
+        values["measurement"] ** 2 + values.get("lasting_error", 0.0) ** 2,
+        parameters={full[name]: values[name] for name in drivers["differ"]},
+    )
+    return FittedNoise(noise, sigma, tau, None, clusters)
 
 
 def _some(indices: list[int], seed: int) -> list[int]:

@@ -393,6 +393,7 @@ def _explore(
     label = division.label[division.exploration]
     apart = spacing(used, options)
     engine = engine_of(system, exploration_sequences, label, differ=differ, apart=apart)
+    testable = int(engine.cluster.max()) + 1 >= _least_clusters(options, len(effects))
     initial = initial_fit(engine, copy.deepcopy(system).double())
     if initial is None:
         raise SimulationError(BLOWS_UP)
@@ -402,7 +403,7 @@ def _explore(
             populations = [engine.population_of(initial.system)]
         except SimulationError as error:
             raise SimulationError(BLOWS_UP) from error
-        if not populations[0].plausible:
+        if testable and not populations[0].plausible:
             # a strong missing effect is attributed to pushes
             usual = engine.with_usual_variances(initial.system)
             extensions = likely_extensions(usual, refine(usual, initial.system), effects)
@@ -429,7 +430,6 @@ def _explore(
     located = places(base_curves, _excess(engine, base))
     clock.lap("locate")
     stages.begin("naming")
-    testable = int(engine.cluster.max()) + 1 >= _least_clusters(options, len(effects))
     selection = search(
         engine,
         base,

@@ -9,7 +9,7 @@ intervals come from a bootstrap of clusters.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -53,7 +53,8 @@ class FittedNoise:
         noise: size, correlation time and measurement error.
         sigma, tau, drivers: 95 % intervals by a bootstrap of clusters; None for one cluster.
         clusters: number of clusters.
-        lags: lags of the compared changes of the residual, s.
+        lags: lags of the compared changes of the residual, s. It and the following are empty if the
+            noise was estimated with the law.
         measured, modelled: m², mean squares of these changes, of second differences over the first
             lags, and of the residual.
     """
@@ -63,9 +64,9 @@ class FittedNoise:
     tau: tuple[float, float] | None
     drivers: tuple[float, float] | None
     clusters: int
-    lags: list[float]
-    measured: list[float]
-    modelled: list[float]
+    lags: list[float] = field(default_factory=list)
+    measured: list[float] = field(default_factory=list)
+    modelled: list[float] = field(default_factory=list)
 
 
 @dataclass

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -20,12 +22,14 @@ from nnode.model import Crowd, Traffic
 from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.crowd import GaitSway
 from nnode.model.effects.lane import DriverHeterogeneity
-from nnode.model.formula import effect_increment
+from nnode.model.expression import Expr, substitute, symbol
+from nnode.model.formula import effect_increment, lane_of
 from nnode.model.laws import law_from
+from nnode.model.scene import Scene
 from nnode.model.steps import STAGES
 from nnode.model.system import System
 from nnode.model.term import State, Term
-from nnode.model.terms import Rule
+from nnode.model.terms import LaneDynamics, Rule
 from nnode.simulation.base import Trajectory, check_finite, substeps
 from nnode.simulation.ode import Rates, whole_steps
 
@@ -45,15 +49,19 @@ class Noise:
         drivers: relative standard deviation of the pace (first order) or time gap (second order)
             between drivers, for models without ``driver_heterogeneity``; for people of the
             preferred speed.
+        parameters: address of a parameter of the law, such as ``idm.T``, to the standard deviation
+            of its logarithm between drivers.
     """
 
     sigma: float
     tau: float
     measurement: float = 0.0
     drivers: float = 0.0
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not (min(self.sigma, self.measurement, self.drivers) >= 0 and self.tau > 0):
+        smallest = min(self.sigma, self.measurement, self.drivers, *self.parameters.values())
+        if not (smallest >= 0 and self.tau > 0):
             raise ConfigError(f"{self}: expected sizes from 0 on and a positive time")
 
 
@@ -62,6 +70,10 @@ class Push(Term):
 
     The state is constant by its formula. :func:`sample` updates it after each step. The noise may
     stop a vehicle, but vehicles do not drive backwards.
+
+    Args:
+        factors: address of a parameter to the drivers' factors ``(B, N)`` on it, for
+            :class:`DifferentDrivers`.
     """
 
     name = "noise"
@@ -72,12 +84,47 @@ class Push(Term):
     }
     source = "Uhlenbeck & Ornstein 1930; in car following: Treiber, Kesting & Helbing 2006"
 
-    def __init__(self) -> None:
+    def __init__(self, factors: Mapping[str, Tensor] | None = None) -> None:
         super().__init__()
         self.declare("tau", 1.0, unit="s")
+        self.factors = factors or {}
 
     def forward(self, state: State) -> Tensor:
         return effect_increment(self, state)
+
+    def inputs(self, scene: Scene) -> dict[str, Tensor]:
+        return dict(self.factors)
+
+
+class DifferentDrivers(Traffic):
+    """A lane behind a measured leader, whose drivers have parameters of their own.
+
+    Args:
+        terms: the law, its effects and the noise, all with formulas.
+        factors: see :class:`Push`.
+    """
+
+    def __init__(self, terms: Iterable[Term], factors: Mapping[str, Tensor]) -> None:
+        super().__init__([*terms, Push(factors)], leader="measured")
+
+    @cached_property
+    def _own_formula(self) -> LaneDynamics:
+        lane, place = lane_of(self.term_list), len(self.terms) - 1
+        assert lane is not None
+        own, inputs = dict[str, Expr](), dict(lane.inputs)
+        for address in cast(Push, self.terms[place]).factors:
+            name = address.replace(".", "__", 1)
+            own[name] = symbol(name) * symbol(f"factor_{name}")
+            inputs[f"factor_{name}"] = (place, address)
+        rates, starts = (
+            {state: substitute(formula, own) for state, formula in formulas.items()}
+            for formulas in (lane.rates, lane.starts)
+        )
+        return replace(lane, rates=rates, starts=starts, inputs=inputs)
+
+    @property
+    def formula(self) -> LaneDynamics:
+        return self._own_formula
 
 
 def constant_speed(domain: str = "traffic") -> System:
@@ -165,6 +212,7 @@ def sample_each(
     """The results of :func:`sample` for several noises, with the same random numbers.
 
     Vehicles are simulated at once for all noises if these only differ in size and correlation time.
+    Noises with ``parameters`` are sampled alone.
     """
     alike = len({noise.drivers for noise in noises}) == 1
     drawn_each = any(isinstance(term, IndividualEffect) for term in system.terms)
@@ -184,11 +232,7 @@ def sample_each(
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     n = substeps(batch.dt, dt, system)
     step = batch.dt / n
-    noisy = copy.deepcopy(system)
-    if noises[0].drivers:
-        noisy.terms.append(DriverHeterogeneity(sigma=noises[0].drivers))
-    _assign_drivers(noisy, repeated, batch.names, rng)
-    noisy.terms.append(Push())
+    noisy = _with_noise(system, noises[0], repeated, batch.names, rng)
     if method not in ("semi_implicit", "ballistic", "rk4"):
         method = noisy.step
     rates = Rates(noisy, repeated, n, method)
@@ -235,6 +279,29 @@ def sample_each(
 def numbered(names: tuple[str, ...], samples: int) -> tuple[str, ...]:
     """Names of sampled sequences: ``NAME~1`` is the first sample of ``NAME``."""
     return tuple(f"{name}~{s + 1}" for s in range(samples) for name in names)
+
+
+def _with_noise(
+    system: System, noise: Noise, repeated: Batch, names: tuple[str, ...], rng: np.random.Generator
+) -> Traffic:
+    """A model of a lane with pushes, and with drivers who differ as the noise says.
+
+    Args:
+        repeated: the sampled sequences. names: of the measured ones.
+    """
+    noisy = copy.deepcopy(system)
+    assert isinstance(noisy, Traffic)
+    if noise.drivers:
+        noisy.terms.append(DriverHeterogeneity(sigma=noise.drivers))
+    _assign_drivers(noisy, repeated, names, rng)
+    factors = {
+        address: torch.from_numpy(np.exp(deviation * rng.normal(size=repeated.agent.shape)))
+        for address, deviation in noise.parameters.items()
+    }
+    if factors:
+        return DifferentDrivers(noisy.term_list, factors)
+    noisy.terms.append(Push())
+    return noisy
 
 
 def _assign_drivers(

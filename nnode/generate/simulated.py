@@ -291,6 +291,9 @@ def _noise_text(name: str, fitted: FittedNoise, system: System) -> str:
         what = "drivers' pace" if order == 1 else "drivers' time gap"
         what = "preferred speeds" if system.domain == "crowd" else what
         drivers = f"; {what} ± {100 * noise.drivers:.3g} %"
+    if noise.parameters:
+        parts = [f"{name} ± {100 * size:.3g} %" for name, size in noise.parameters.items()]
+        drivers = f"; between drivers {', '.join(parts)}"
     return (
         f"noise of {name}: {noise.sigma:.3g} {unit}{interval(fitted.sigma)} for {noise.tau:.3g} s"
         f"{interval(fitted.tau)}; measured places ± {noise.measurement**0.5:.2g} m{drivers}"

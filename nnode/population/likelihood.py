@@ -252,7 +252,8 @@ def _filtered(
         for k in range(last + 1):
             if k:
                 _set_transition(step[s, k - 1], forced[s, k - 1], keep, forward)
-                _predict(mean, spread, forward, keep, before, half)
+                _predict_mean(mean, forward, keep, before)
+                _predict_spread(spread, forward, keep, half)
                 _add_innovations(spread, forced[s, k - 1], fresh)
                 if lasting:
                     _add_error(spread, fresh[-1])
@@ -304,45 +305,50 @@ def _add_innovations(spread: np.ndarray, forced: np.ndarray, fresh: np.ndarray) 
 
 
 @njit(cache=True, nogil=True)
-def _predict(
-    mean: np.ndarray,
-    spread: np.ndarray,
-    forward: np.ndarray,
-    keep: np.ndarray,
-    before: np.ndarray,
-    half: np.ndarray,
+def _predict_mean(
+    mean: np.ndarray, forward: np.ndarray, keep: np.ndarray, before: np.ndarray
 ) -> None:
-    """The state one sample later without innovations: mean and covariance are replaced. ``before``
-    and ``half`` are work arrays of d."""
+    """Replace the mean of the state by that of one sample later. ``before`` is a work array."""
     m, n = forward.shape
     width = mean.shape[1]
-    for i in range(m):
-        for c in range(width):
-            before[i, c] = mean[i, c]
-            mean[i, c] = 0.0
-        for j in range(n):
-            total = 0.0
-            for q in range(n):
-                total += forward[i, q] * spread[q, j]
-            half[i, j] = total
+    before[:] = mean[:m]
+    mean[:m] = 0.0
     for i in range(m):
         for j in range(n):
+            source = before[j] if j < m else mean[j]
             for c in range(width):
-                mean[i, c] += forward[i, j] * (before[j, c] if j < m else mean[j, c])
-        for j in range(i + 1):
-            total = 0.0
-            for q in range(n):
-                total += half[i, q] * forward[j, q]
-            spread[i, j] = total
-            spread[j, i] = total
+                mean[i, c] += forward[i, j] * source[c]
     for i in range(m, n):
         for c in range(width):
             mean[i, c] *= keep[i - m]
+
+
+@njit(cache=True, nogil=True)
+def _predict_spread(
+    spread: np.ndarray, forward: np.ndarray, keep: np.ndarray, half: np.ndarray
+) -> None:
+    """Replace the covariance of the state by that of one sample later, without innovations.
+    ``half`` is a work array."""
+    m, n = forward.shape
+    for i in range(m):
+        for j in range(n):
+            half[i, j] = _dot(forward[i], spread[:, j])
+    for i in range(m):
+        for j in range(i + 1):
+            spread[i, j] = spread[j, i] = _dot(half[i], forward[j])
+    for i in range(m, n):
         for j in range(m):
-            spread[i, j] = keep[i - m] * half[j, i]
-            spread[j, i] = spread[i, j]
+            spread[i, j] = spread[j, i] = keep[i - m] * half[j, i]
         for j in range(m, n):
             spread[i, j] *= keep[i - m] * keep[j - m]
+
+
+@njit(cache=True, nogil=True)
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    total = 0.0
+    for q in range(len(a)):
+        total += a[q] * b[q]
+    return total
 
 
 @njit(cache=True, nogil=True)

@@ -15,6 +15,7 @@ from nnode.data.readers.jupedsim import WalkwayOptions, read_walkway
 from nnode.data.readers.sumo import SumoOptions, read_sumo
 from nnode.data.readers.table import TableOptions
 from nnode.errors import CheckpointError, ConfigError
+from tests.app import different
 from tests.app.conftest import ROOT, Script
 from tests.app.following import table
 from tests.docs.test_tutorials import blocks
@@ -102,6 +103,19 @@ def test_in_python_it_is_an_object(simulated: nnode.Simulated, tmp_path: Path) -
     # the same calibration by the command, sampled with another seed
     assert not np.array_equal(simulated.trajectories[0].x, first.x)
     assert simulated.trajectories[0].name.rpartition("/")[2] == first.name.rpartition("/")[2]
+
+
+def test_drivers_are_drawn_as_they_were_estimated(tmp_path: Path) -> None:
+    drives = different.table(1, platoons=6, cars=4, seconds=20.0, noise=0.05, differ={"T": 0.15})[0]
+    run = nnode.fit(drives, "traffic", model="idm", drivers=["T"])
+    assert run.drivers is not None
+    simulated = nnode.simulate(run, drives, samples=SAMPLES)
+    noise, estimates = simulated.noise["idm"].noise, run.drivers.variability["estimate"]
+    assert dict(noise.parameters) == {"idm.T": estimates["T"] / 100}
+    assert (noise.sigma, noise.tau) == (estimates["push"], estimates["push_time"])
+    assert noise.measurement == pytest.approx(estimates["measurement"] ** 2)
+    assert "between drivers idm.T ± " in repr(simulated)
+    assert simulated.crps.mean < simulated.means["idm, no noise"]["crps_position_m"].mean
 
 
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError, DataError
 from nnode.generate.fit import fit_noise
 from nnode.generate.noise import (
+    DifferentDrivers,
     Noise,
     allows_driver_differences,
     constant_speed,
@@ -205,6 +207,34 @@ def test_unknown_drivers_are_drawn_and_known_ones_are_kept() -> None:
     spread = x[-1, :, :, 0, 0].std(0)
     assert float(spread[0]) == 0.0
     assert float(spread[1]) > 1.0
+
+
+def test_drivers_with_parameters_of_their_own_move_by_these() -> None:
+    zone = {"name": "speed_zone", "alpha": 0.7, "a": 50.0, "b": 200.0}
+    system, batch = model("traffic", zone, {"name": "reaction_delay"}), measured("traffic", 2, 10.0)
+    factors = {"idm.T": 1.3, "idm.v0": 0.9}
+    every = {name: torch.full((2, 3), factor) for name, factor in factors.items()}
+    solver = TorchdiffeqSolver("ballistic")
+    moved = solver(DifferentDrivers(system.term_list, every).double(), batch)
+    for name, factor in factors.items():
+        getattr(system.terms[0], name.removeprefix("idm.")).data.mul_(factor)
+    torch.testing.assert_close(moved.x, solver(system, batch).x)
+
+
+def test_parameters_are_drawn_for_each_driver() -> None:
+    batch, noise = measured("traffic", 1, 20.0), Noise(0.0, 1.0, parameters={"idm.T": 0.2})
+    system = model("traffic")
+    x = sample(system, batch, noise, 400, seed=0).x[..., 0]
+    # the response of the first follower's position to the logarithm of T
+    ends = []
+    for factor in (0.99, 1.01):
+        changed = copy.deepcopy(system)
+        changed.terms[0].T.data.mul_(factor)
+        ends.append(sample(changed, batch, Noise(0.0, 1.0), 1, seed=0).x[-1, 0, :2, 0])
+    response = (ends[1] - ends[0]).abs() / 0.02
+    assert float(x[-1, :, 1].std()) == pytest.approx(0.2 * float(response[1]), rel=0.1)
+    # the second follower's differs by what both drivers do
+    assert float(x[-1, :, 0].std()) < 0.2 * float(response[0])
 
 
 def test_paces_are_drawn_around_the_measured_ones() -> None:
