@@ -72,7 +72,7 @@ def mutants() -> pd.DataFrame:
 
 
 def outcome(mutant: dict[str, str], checkout: Path) -> str:
-    """``killed``, ``survived``, or ``slow`` beyond :data:`LIMIT`.
+    """``killed``, ``survived``, ``slow`` beyond :data:`LIMIT`, or ``gone`` if the line has changed.
 
     Args:
         mutant: a row of the list. checkout: a copy of the repository.
@@ -81,9 +81,12 @@ def outcome(mutant: dict[str, str], checkout: Path) -> str:
     from cosmic_ray.plugins import get_operator
 
     module = checkout / mutant["module"]
-    text = module.read_bytes()
-    changed = mutate_code(text, get_operator(mutant["operator"])(), int(mutant["occurrence"]))
-    module.write_bytes(changed if isinstance(changed, bytes) else changed.encode())
+    text = module.read_text(encoding="utf-8")
+    changed = mutate_code(text, get_operator(mutant["operator"])(), int(mutant["occurrence"])) or ""
+    pairs = zip(text.splitlines(), changed.splitlines(), strict=False)
+    if mutant["line"] not in [before.strip() for before, after in pairs if before != after]:
+        return "gone"
+    module.write_text(changed, encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     try:
@@ -98,7 +101,7 @@ def outcome(mutant: dict[str, str], checkout: Path) -> str:
     except subprocess.TimeoutExpired:
         return "slow"
     finally:
-        module.write_bytes(text)
+        module.write_text(text, encoding="utf-8")
     return "killed" if done.returncode else "survived"
 
 
