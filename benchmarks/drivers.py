@@ -40,8 +40,8 @@ from studies.runner import Task, run_tasks
 SECONDS, STEP, DT = 30.0, 0.002, 0.2
 #: s that pushes last; their standard deviation by law, m/s and m/s².
 LASTS, PUSH = 4.0, {"lin": 0.3, "idm": 0.06, "fvdm": 0.06}
-#: Hidden effects by law, with their sizes: a factor of v0 on 170 m of road; a share; s. With a delay
-#: of 0.6 s, platoons of ``fvdm`` are unstable, and vehicles collide.
+#: Hidden effects by law, with their sizes: a factor of v0 on 170 m of road; a share; s. Platoons of
+#: ``fvdm`` with a delay of 0.6 s are unstable, and vehicles collide.
 HIDDEN = {
     "lin": {
         "speed_zone": 0.9,

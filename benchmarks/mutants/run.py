@@ -14,8 +14,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -71,7 +72,7 @@ def mutants() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def outcome(mutant: dict[str, str], checkout: Path) -> str:
+def outcome(mutant: dict[Hashable, Any], checkout: Path) -> str:
     """``killed``, ``survived``, ``slow`` beyond :data:`LIMIT`, or ``gone`` if the line has changed.
 
     Args:
@@ -110,7 +111,7 @@ def tests_of(module: str) -> str:
     return next(tests for pattern, tests in ROOMS.items() if Path(module).match(pattern))
 
 
-def outcomes(table: pd.DataFrame) -> Iterator[dict[str, str]]:
+def outcomes(table: pd.DataFrame) -> Iterator[dict[Hashable, Any]]:
     """The rows with their outcomes."""
     with tempfile.TemporaryDirectory() as folder:
         checkout = Path(folder) / "checkout"
@@ -135,7 +136,7 @@ def main() -> None:
         write_text(LIST, str(drawn.to_csv(index=False)))
         return
     table = pd.read_csv(LIST).iloc[given.first :].head(given.number)
-    rows = list[dict[str, str]]()
+    rows = list[dict[Hashable, Any]]()
     for row in outcomes(table):
         rows.append(row)
         write_text(given.table, str(pd.DataFrame(rows).to_csv(index=False)))
