@@ -2,7 +2,7 @@
 
 ``mutants.csv`` is a fixed list of small faults (mutants): in the laws' formulas, the solvers, the
 least squares, and the statistics. Cosmic Ray makes them. Each is put into a copy of the checkout,
-where the tests of its room run until one fails. A mutant that no test notices survives. ``--draw``
+where the module's tests run until one fails. A mutant that no test notices survives. ``--draw``
 draws a new list by ``--seed``. Cosmic Ray comes with ``pip install "nnode[bench]"``.
 """
 
@@ -107,8 +107,12 @@ def outcome(mutant: dict[Hashable, Any], checkout: Path) -> str:
 
 
 def tests_of(module: str) -> str:
-    """The tests of a module's room."""
-    return next(tests for pattern, tests in ROOMS.items() if Path(module).match(pattern))
+    """The tests of a module, ``test_MODULE.py``, or of its room if there is no such file."""
+    path = Path(module)
+    room = next(tests for pattern, tests in ROOMS.items() if path.match(pattern))
+    name = path.parent.name if path.stem == "__init__" else path.stem
+    own = Path(room) / f"test_{name}.py"
+    return own.as_posix() if (ROOT / own).exists() else room
 
 
 def outcomes(table: pd.DataFrame) -> Iterator[dict[Hashable, Any]]:
