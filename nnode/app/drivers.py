@@ -234,7 +234,7 @@ def calibrated_drivers(
     Raises:
         ConfigError: see :func:`nnode.population.drivers.fit_drivers`.
     """
-    from nnode.population.drivers import CHECKED, STEP, fit_drivers  # compiled code takes a second
+    from nnode.population.drivers import CHECKED, STEP, at_steps, fit_drivers  # takes a second
     from nnode.population.followers import APART, paths_of, without_errors
     from nnode.population.intervals import variations
 
@@ -246,7 +246,8 @@ def calibrated_drivers(
     paths, apart = paths_of(sequences, STEP), 0.0
     if without_errors(sequences):
         # a law explains positions of a simulation, and not those that were smoothed
-        part = paths_of(evenly(sequences, CHECKED), STEP)
+        thinned = at_steps(sequences)
+        part = paths_of(evenly(thinned, CHECKED), STEP)
         if not fit_drivers(double, part, first=first, pairs=0).explains_rates:
             if drivers is None:
                 return None
@@ -255,7 +256,7 @@ def calibrated_drivers(
                 "smoothed: positions that are %g s apart are used",
                 APART,
             )
-            paths, apart = paths.apart(APART), APART
+            paths, apart = paths_of(thinned, STEP).apart(APART), APART
     population = fit_drivers(double, paths, drivers or AUTO, first, seed=seed)
     if not population.estimate.converged:
         log.warning(

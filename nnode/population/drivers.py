@@ -182,6 +182,12 @@ def _simulated_finitely(model: Followers) -> bool:
     return bool(np.isfinite(initial.columns).all())
 
 
+def at_steps(sequences: list[Sequence]) -> list[Sequence]:
+    """Sequences with samples as far apart as steps of the simulations allow."""
+    stride = max(1, int(STEP / sequences[0].dt + 1e-9))
+    return [s.every(stride) for s in sequences]
+
+
 def with_smaller_errors(population: Population) -> Population:
     """The estimate in which measurement errors may be smaller than was assumed. Errors that are too
     large lengthen the pushes."""

@@ -42,6 +42,7 @@ from nnode.model.term import State
 from nnode.population.drivers import (
     STEP,
     Population,
+    at_steps,
     fit_all_random,
     fit_drivers,
     initial_variances,
@@ -119,8 +120,7 @@ class FollowersEngine(TrafficEngine):
     ) -> None:
         self.apart: float = apart if like is None else like.apart
         if self.apart:
-            stride = max(1, int(STEP / sequences[0].dt + 1e-9))
-            sequences = [s.every(stride) for s in sequences]
+            sequences = at_steps(sequences)
         super().__init__(sequences, np.inf, clusters, large)
         self.smallest_share = -np.inf
         self._paths_by_step, self._like = dict[tuple[int, int], Paths](), like
