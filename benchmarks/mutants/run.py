@@ -2,7 +2,7 @@
 
 ``mutants.csv`` is a fixed list of small faults (mutants): in the laws' formulas, the solvers, the
 least squares, and the statistics. Cosmic Ray makes them. Each is put into a copy of the checkout,
-where the module's tests run until one fails. A mutant that no test notices survives. ``--draw``
+where the tests of its room run until one fails. A mutant that no test notices survives. ``--draw``
 draws a new list by ``--seed``. Cosmic Ray comes with ``pip install "nnode[bench]"``.
 """
 
@@ -92,7 +92,7 @@ def outcome(mutant: dict[Hashable, Any], checkout: Path) -> str:
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     try:
         done = subprocess.run(
-            [*command, tests_of(mutant["module"])],
+            [*command, *tests_of(mutant["module"])],
             cwd=checkout,
             env=environment,
             capture_output=True,
@@ -106,13 +106,13 @@ def outcome(mutant: dict[Hashable, Any], checkout: Path) -> str:
     return "killed" if done.returncode else "survived"
 
 
-def tests_of(module: str) -> str:
-    """The tests of a module, ``test_MODULE.py``, or of its room if there is no such file."""
+def tests_of(module: str) -> list[str]:
+    """The tests of a module: first ``test_MODULE.py``, if it exists, then all of its room."""
     path = Path(module)
     room = next(tests for pattern, tests in ROOMS.items() if path.match(pattern))
     name = path.parent.name if path.stem == "__init__" else path.stem
     own = Path(room) / f"test_{name}.py"
-    return own.as_posix() if (ROOT / own).exists() else room
+    return [own.as_posix(), room] if (ROOT / own).exists() else [room]
 
 
 def outcomes(table: pd.DataFrame) -> Iterator[dict[Hashable, Any]]:
