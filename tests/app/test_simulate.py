@@ -70,7 +70,7 @@ def test_wrong_options_are_refused_at_once(
 
 def test_in_python_it_is_an_object(simulated: nnode.Simulated, tmp_path: Path) -> None:
     drives = table(10, 10.0)
-    run = nnode.fit(drives, "traffic", model="idm", epochs=2)
+    run = nnode.fit(drives, "traffic", model="idm", epochs=2, drivers="none")
     with pytest.raises(ConfigError, match="a table in memory; give it again, as data=TABLE"):
         nnode.simulate(run)
     found = nnode.simulate(run, drives, samples=SAMPLES, seed=3)

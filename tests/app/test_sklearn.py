@@ -110,7 +110,7 @@ def test_a_module_is_cloned_with_its_values() -> None:
 
 
 def test_cross_validation_by_clusters_is_the_same_by_hand(sequences: nnode.Sequences) -> None:
-    one = nnode.Calibrator("idm", epochs=3)
+    one = nnode.Calibrator("idm", epochs=3, drivers="none")
     folds = GroupKFold(2)
     scores = cross_val_score(one, sequences, groups=sequences.groups, cv=folds)
     assert (scores < 0).all()
@@ -132,7 +132,9 @@ def test_sequences_that_share_a_vehicle_are_one_group() -> None:
 
 def test_a_search_over_models_finds_the_law_that_was_driven(sequences: nnode.Sequences) -> None:
     search = GridSearchCV(
-        nnode.Calibrator(leader="measured", epochs=15), {"model": ["lin", "idm"]}, cv=GroupKFold(2)
+        nnode.Calibrator(leader="measured", epochs=15, drivers="none"),
+        {"model": ["lin", "idm"]},
+        cv=GroupKFold(2),
     )
     search.fit(sequences, groups=sequences.groups)
     assert search.best_params_ == {"model": "idm"}
