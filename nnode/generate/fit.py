@@ -37,6 +37,8 @@ _SPREAD, _SPREADS = 0.15, (0.05, 0.4)
 _WHO = {"traffic": "followers", "crowd": "people"}
 #: Number of bootstrap draws of the clusters.
 DRAWS = 200
+#: Tolerance of their costs. Most steps of a search reduce a spread that is practically zero.
+ROUGH = 1e-4
 #: Number of lags, from the shortest to a third of the longest sequence.
 _LAGS = 8
 #: Shortest lag, s. Reactions of people to others last half a second.
@@ -170,7 +172,7 @@ def fit_noise(
     if number < 2:
         return fitted
     weights = number * group_weights(np.arange(number), DRAWS, np.random.default_rng(seed))
-    draws = np.array([search(weight, np.array([tau]))[:3] for weight in weights])
+    draws = np.array([search(weight, np.array([tau]), ROUGH)[:3] for weight in weights])
     ends = np.quantile(draws, [0.025, 0.975], axis=0).T.tolist()
     sigma_interval, tau_interval, drivers_interval = ((low, high) for low, high in ends)
     return replace(
@@ -267,13 +269,14 @@ class _Search:
     white: np.ndarray
 
     def __call__(
-        self, weight: np.ndarray, starts: np.ndarray
+        self, weight: np.ndarray, starts: np.ndarray, tolerance: float = 1e-8
     ) -> tuple[float, float, float, np.ndarray]:
         """Size, correlation time, spread, and their moments ``(M,)``, m².
 
         Args:
             weight: ``(G,)`` weights of clusters.
             starts: start values of the correlation time, s, since there may be several minima.
+            tolerance: the search ends when the cost decreases by less than this share.
         """
         goal = np.log(np.maximum(self.measured.mean(weight), 1e-12))
         pushes = np.array([sums.mean(weight) for sums in self.pushes]) / self.unit**2
@@ -304,6 +307,7 @@ class _Search:
                 [size, start, np.log(0.05)],
                 slopes,
                 x_scale="jac",
+                ftol=tolerance,
                 bounds=([-20.0, low, -20.0], [20.0, high, 0.0]),
             )
             best = fit if best is None or fit.cost < best.cost else best
