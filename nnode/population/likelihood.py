@@ -308,16 +308,18 @@ def _add_innovations(spread: np.ndarray, forced: np.ndarray, fresh: np.ndarray) 
 def _predict_mean(
     mean: np.ndarray, forward: np.ndarray, keep: np.ndarray, before: np.ndarray
 ) -> None:
-    """Replace the mean of the state by that of one sample later. ``before`` is a work array."""
+    """Replace the mean of the state by that of one sample later. ``before`` is a work array. Loops
+    over single numbers are faster than slices here."""
     m, n = forward.shape
     width = mean.shape[1]
-    before[:] = mean[:m]
-    mean[:m] = 0.0
+    for i in range(m):
+        for c in range(width):
+            before[i, c] = mean[i, c]
+            mean[i, c] = 0.0
     for i in range(m):
         for j in range(n):
-            source = before[j] if j < m else mean[j]
             for c in range(width):
-                mean[i, c] += forward[i, j] * source[c]
+                mean[i, c] += forward[i, j] * (before[j, c] if j < m else mean[j, c])
     for i in range(m, n):
         for c in range(width):
             mean[i, c] *= keep[i - m]
@@ -332,23 +334,21 @@ def _predict_spread(
     m, n = forward.shape
     for i in range(m):
         for j in range(n):
-            half[i, j] = _dot(forward[i], spread[:, j])
+            half[i, j] = 0.0
+            for q in range(n):
+                half[i, j] += forward[i, q] * spread[q, j]
     for i in range(m):
         for j in range(i + 1):
-            spread[i, j] = spread[j, i] = _dot(half[i], forward[j])
+            total = 0.0
+            for q in range(n):
+                total += half[i, q] * forward[j, q]
+            spread[i, j] = spread[j, i] = total
     for i in range(m, n):
-        for j in range(m):
-            spread[i, j] = spread[j, i] = keep[i - m] * half[j, i]
-        for j in range(m, n):
-            spread[i, j] *= keep[i - m] * keep[j - m]
-
-
-@njit(cache=True, nogil=True)
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    total = 0.0
-    for q in range(len(a)):
-        total += a[q] * b[q]
-    return total
+        for j in range(n):
+            factor = keep[i - m]
+            spread[i, j] = factor * (half[j, i] if j < m else keep[j - m] * spread[i, j])
+            if j < m:
+                spread[j, i] = spread[i, j]
 
 
 @njit(cache=True, nogil=True)
