@@ -151,7 +151,7 @@ def _estimated_noise(model: System, drivers: Any, clusters: int) -> FittedNoise 
     law = [name for name in model.physical() if name.startswith(f"{model.term_list[0].name}.")]
     full = dict(zip(drivers["differ"], full_names(drivers["differ"], law), strict=True))
     sigma, tau = (
-        None if row["lower"] is None else (row["lower"], row["upper"])
+        None if row.get("lower") is None else (row["lower"], row.get("upper", np.inf))
         for row in (rows["push"], rows["push_time"])
     )
     noise = Noise(
