@@ -294,8 +294,12 @@ def fit(
             :func:`nnode.sequences` and ``docs/data.md``; or the sequences that it returns.
         domain: ``traffic`` or ``crowd``; None recognises it from the columns.
         walls: CSV with x1, y1, x2, y2, m.
-        model, leader, drivers, epochs, seed: see :class:`Calibrator`.
+        model: see :class:`Calibrator`, as for leader, drivers, epochs and seed.
+        leader: ``constant`` or ``measured``.
+        drivers: ``auto``, ``none``, or names of parameters that differ.
+        epochs: largest number of epochs.
         heldout: share of the sequences that are held out.
+        seed: of all random numbers.
         reading: options for reading the table, as for :func:`nnode.sequences`: ``columns={...}``,
             ``position_unit="ft"``, ``faults="keep"``, ...
 
