@@ -1,6 +1,6 @@
 """Mutants of the package against its tests: ``python -m benchmarks.mutants.run``.
 
-``mutants.csv`` is a fixed list of small faults (mutants): in the laws' formulas, the solvers, the
+``mutants.csv`` is a fixed list of small faults (mutants): in the code of laws, the solvers, the
 least squares, and the statistics. Cosmic Ray makes them. Each is put into a copy of the checkout,
 where the tests of its room run until one fails. A mutant that no test notices survives. ``--draw``
 draws a new list by ``--seed``. Cosmic Ray comes with ``pip install "nnode[bench]"``.
@@ -9,6 +9,7 @@ draws a new list by ``--seed``. Cosmic Ray comes with ``pip install "nnode[bench
 from __future__ import annotations
 
 import argparse
+import ast
 import os
 import shutil
 import subprocess
@@ -73,7 +74,8 @@ def mutants() -> pd.DataFrame:
 
 
 def outcome(mutant: dict[Hashable, Any], checkout: Path) -> str:
-    """``killed``, ``survived``, ``slow`` beyond :data:`LIMIT`, or ``gone`` if the line has changed.
+    """``killed``, ``survived``, ``slow`` beyond :data:`LIMIT`; ``gone`` if the line has changed, or
+    ``invalid`` if the mutant is no Python, such as another sign for the ``*`` before keywords.
 
     Args:
         mutant: a row of the list. checkout: a copy of the repository.
@@ -87,6 +89,10 @@ def outcome(mutant: dict[Hashable, Any], checkout: Path) -> str:
     pairs = zip(text.splitlines(), changed.splitlines(), strict=False)
     if mutant["line"] not in [before.strip() for before, after in pairs if before != after]:
         return "gone"
+    try:
+        ast.parse(changed)
+    except SyntaxError:
+        return "invalid"
     module.write_text(changed, encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
     environment = {**os.environ, "PYTHONPATH": str(checkout)}

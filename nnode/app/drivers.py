@@ -18,7 +18,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence, evenly
 from nnode.errors import CheckpointError, ConfigError, unknown_value
 from nnode.model import System
-from nnode.model.term import Term, short_names
+from nnode.model.term import short_names
 from nnode.plots.traffic import driver_figure
 
 if TYPE_CHECKING:
@@ -73,9 +73,14 @@ def planned(
         raise ConfigError(f"{asked} has no place here: {reason}; take trainer.drivers=none")
     if given == AUTO:
         return AUTO
-    law = cast(Term, model.terms[0])
-    full_names(given, [name for name in model.physical() if name.startswith(f"{law.name}.")])
+    full_names(given, law_parameters(model))
     return list(given)
+
+
+def law_parameters(model: System) -> list[str]:
+    """Names of the law's parameters, such as ``idm.T``."""
+    prefix = f"{model.term_list[0].name}."
+    return [name for name in model.physical() if name.startswith(prefix)]
 
 
 def check_drivers(given: Any) -> None:
@@ -243,7 +248,7 @@ def calibrated_drivers(
     low, high = vector.bounds
     inside = np.where(np.isfinite(high - low), INSIDE * (high - low), 0.0)
     vector.fill_(np.clip(vector.row.numpy(), low + inside, high - inside))
-    paths, apart = paths_of(sequences, STEP), 0.0
+    used, apart = sequences, 0.0
     if without_errors(sequences):
         # a law explains positions of a simulation, and not those that were smoothed
         thinned = at_steps(sequences)
@@ -256,7 +261,8 @@ def calibrated_drivers(
                 "smoothed: positions that are %g s apart are used",
                 APART,
             )
-            paths, apart = paths_of(thinned, STEP).apart(APART), APART
+            used, apart = thinned, APART
+    paths = paths_of(used, STEP).apart(apart)
     population = fit_drivers(double, paths, drivers or AUTO, first, seed=seed)
     if not population.estimate.converged:
         log.warning(

@@ -219,7 +219,7 @@ def result_of(run: str | Path) -> dict[str, Any]:
     Raises:
         CheckpointError: the file is missing or damaged.
     """
-    path = checkpoint_of(run).parent.parent / RESULT
+    path = _result_file(run)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -231,6 +231,10 @@ def result_of(run: str | Path) -> dict[str, Any]:
     return content
 
 
+def _result_file(run: str | Path) -> Path:
+    return checkpoint_of(run).parent.parent / RESULT
+
+
 def drivers_of(run: str | Path | Calibration) -> Any:
     """What :meth:`nnode.app.drivers.Drivers.plain` gave for a run; None if its drivers do not
     differ, or if it has no ``result.json``, as a diagnosis.
@@ -240,6 +244,6 @@ def drivers_of(run: str | Path | Calibration) -> Any:
     """
     if isinstance(run, Calibration):
         return None if run.drivers is None else run.drivers.plain()
-    if not (checkpoint_of(run).parent.parent / RESULT).exists():
+    if not _result_file(run).exists():
         return None
     return result_of(run).get("drivers")

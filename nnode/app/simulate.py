@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from nnode.app.calibration import Calibration
 from nnode.app.cli.saved import load_run
-from nnode.app.drivers import variances_of
+from nnode.app.drivers import law_parameters, variances_of
 from nnode.app.python.inputs import Table
 from nnode.app.saved_run import SavedRun, choose, drivers_of
 from nnode.app.training import threads_given_back
@@ -148,8 +148,7 @@ def _estimated_noise(model: System, drivers: Any, clusters: int) -> FittedNoise 
 
     values, _ = variances
     rows = drivers["variability"]
-    law = [name for name in model.physical() if name.startswith(f"{model.term_list[0].name}.")]
-    full = dict(zip(drivers["differ"], full_names(drivers["differ"], law), strict=True))
+    addresses = full_names(drivers["differ"], law_parameters(model))
     sigma, tau = (
         None if row.get("lower") is None else (row["lower"], row.get("upper", np.inf))
         for row in (rows["push"], rows["push_time"])
@@ -158,7 +157,10 @@ def _estimated_noise(model: System, drivers: Any, clusters: int) -> FittedNoise 
         values["push"],
         values["push_time"],
         values["measurement"] ** 2 + values.get("lasting_error", 0.0) ** 2,
-        parameters={full[name]: values[name] for name in drivers["differ"]},
+        parameters={
+            address: values[name]
+            for name, address in zip(drivers["differ"], addresses, strict=True)
+        },
     )
     return FittedNoise(noise, sigma, tau, None, clusters)
 

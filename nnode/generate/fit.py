@@ -53,7 +53,8 @@ class FittedNoise:
 
     Attributes:
         noise: size, correlation time and measurement error.
-        sigma, tau, drivers: 95 % intervals by a bootstrap of clusters; None for one cluster.
+        sigma, tau, drivers: 95 % intervals by a bootstrap of clusters, or of the estimate with the
+            law; None: there is none.
         clusters: number of clusters.
         lags: lags of the compared changes of the residual, s. It and the following are empty if the
             noise was estimated with the law.

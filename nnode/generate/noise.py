@@ -108,7 +108,7 @@ class DifferentDrivers(Traffic):
         super().__init__([*terms, Push(factors)], leader="measured")
 
     @cached_property
-    def _own_formula(self) -> LaneDynamics:
+    def formula(self) -> LaneDynamics:
         lane, place = lane_of(self.term_list), len(self.terms) - 1
         assert lane is not None
         own, inputs = dict[str, Expr](), dict(lane.inputs)
@@ -121,10 +121,6 @@ class DifferentDrivers(Traffic):
             for formulas in (lane.rates, lane.starts)
         )
         return replace(lane, rates=rates, starts=starts, inputs=inputs)
-
-    @property
-    def formula(self) -> LaneDynamics:
-        return self._own_formula
 
 
 def constant_speed(domain: str = "traffic") -> System:

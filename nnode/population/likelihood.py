@@ -344,11 +344,10 @@ def _predict_spread(
                 total += half[i, q] * forward[j, q]
             spread[i, j] = spread[j, i] = total
     for i in range(m, n):
-        for j in range(n):
-            factor = keep[i - m]
-            spread[i, j] = factor * (half[j, i] if j < m else keep[j - m] * spread[i, j])
-            if j < m:
-                spread[j, i] = spread[i, j]
+        for j in range(m):
+            spread[i, j] = spread[j, i] = keep[i - m] * half[j, i]
+        for j in range(m, n):
+            spread[i, j] *= keep[i - m] * keep[j - m]
 
 
 @njit(cache=True, nogil=True)

@@ -105,7 +105,7 @@ def test_in_python_it_is_an_object(simulated: nnode.Simulated, tmp_path: Path) -
     assert simulated.trajectories[0].name.rpartition("/")[2] == first.name.rpartition("/")[2]
 
 
-def test_drivers_are_drawn_as_they_were_estimated(tmp_path: Path) -> None:
+def test_drivers_are_drawn_as_they_were_estimated() -> None:
     drives = different.table(1, platoons=8, cars=3, seconds=10.0, noise=0.05, differ={"T": 0.15})[0]
     run = nnode.fit(drives, "traffic", model="idm", drivers=["T"])
     assert run.drivers is not None
