@@ -212,6 +212,8 @@ def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
         points ``(B, P, 2)``, unit normals into the walkable side ``(B, P, 2)`` and the mask
         ``(B, P)`` of real points. Padding points repeat far outside.
     """
+    if not walls.shape[1]:
+        return (*walls.new_zeros(2, len(walls), 0, 2), walls.new_zeros(len(walls), 0).bool())
     points_of: dict[bytes, tuple[Tensor, Tensor]] = {}
     rows = []
     for segments in walls.detach().cpu().double():

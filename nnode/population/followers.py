@@ -31,6 +31,8 @@ from nnode.model.term import Term
 from nnode.model.terms import LaneDynamics, parameter_values
 from nnode.population.estimate import Estimate, fit_deviations
 from nnode.population.likelihood import Linearised, Noise
+from nnode.simulation.kernels.followers import AHEAD
+from nnode.simulation.kernels.followers import simulate as simulate_compiled
 from nnode.simulation.linear import trapezoidal
 from nnode.simulation.numpy import simulated, strides
 from nnode.simulation.rhs import formula_of
@@ -246,12 +248,7 @@ def _ahead(
 
 def _ahead_symbols(ahead: np.ndarray) -> dict[str, np.ndarray]:
     """The formulas' names of the states ``(4, ..., F)`` of the vehicles ahead."""
-    x1, v1, x2, v2 = ahead
-    return {"x_1": x1, "v_1": v1, "dx_1": v1, "x_2": x2, "v_2": v2, "measured": v1}
-
-
-#: Position and speed of the vehicle ahead in formulas: their columns in :func:`_jacobian`.
-_AHEAD = {name: int(k) for name, k in _ahead_symbols(np.arange(4)).items() if k < 2}
+    return {name: ahead[column] for name, column in AHEAD.items()}
 
 
 def follower_formula(system: System) -> LaneDynamics | None:
@@ -291,7 +288,7 @@ def _jacobian(lane: LaneDynamics) -> tuple[list[tuple[int, int]], Formulas]:
     number = _n_disturbed(lane)
     states = list(lane.rates)[:number]
     column = {name: k for k, name in enumerate(states)}
-    column |= {name: number + k for name, k in _AHEAD.items()}
+    column |= {name: number + k for name, k in AHEAD.items() if k < 2}
     slopes = [
         ((row, column[name]), slope)
         for row, state in enumerate(states)
@@ -349,10 +346,10 @@ class Followers:
             "start": paths.batch.start.numpy(),
             "dt": 2 * paths.half,
             "second": paths.second,
+            "v": paths.start[1],
         }
         self._fixed |= {s: float(v.detach()) for s, v in parameter_values(terms, lane).items()}
         self._rates = Formulas(list(lane.rates.values()))
-        self._starts = Formulas(list(lane.starts.values())) if lane.starts else None
 
     @property
     def may_differ(self) -> list[str]:
@@ -375,7 +372,7 @@ class Followers:
         return np.where(self.logs, np.exp(np.where(self.logs, theta, 0.0)), theta)
 
     def simulate(
-        self, theta: np.ndarray, start: np.ndarray, pushed: Push | None = None
+        self, theta: np.ndarray, start: np.ndarray, pushed: Push | np.ndarray | None = None
     ) -> np.ndarray:
         """``(K, M, R, F)`` states of R runs.
 
@@ -383,40 +380,46 @@ class Followers:
             theta: ``(R, P, F)`` parameters.
             start: ``(R, H, F)`` deviations of the first H states at the start, from what was
                 measured and from the initial states of terms.
-            pushed: the push on the highest rate.
+            pushed: the push on the highest rate: at the times of the paths ahead, ``(H, F)``, or a
+                function, with which the simulation takes about ten times as long.
         """
         paths, order = self.paths, self.lane.order
-        fixed = self._constants(theta)
+        constants, starts = self._constants(theta), start.transpose(1, 0, 2)
+        motion = paths.start[:order, None] + starts[:order]
+        added = np.zeros((len(self.lane.rates) - order, *motion.shape[1:]))
+        added[: len(starts) - order] = starts[order:]
+        longest = 2 * paths.half + 1e-9
+        if pushed is None or isinstance(pushed, np.ndarray):
+            return simulate_compiled(
+                self.lane,
+                constants,
+                paths.ahead,
+                motion,
+                added,
+                pushed,
+                paths.dt,
+                paths.x.shape[1],
+                longest,
+            )
 
         def rate(t: float, y: np.ndarray) -> np.ndarray:
             at = round(t / paths.half)
-            values = {**fixed, **dict(zip(self.lane.rates, y, strict=True)), "t": t}
+            values = {**constants, **dict(zip(self.lane.rates, y, strict=True)), "t": t}
             rate_values = np.empty_like(y)
             rates = self._rates({**values, **_ahead_symbols(paths.ahead[at])})
             for target, part in zip(rate_values, rates, strict=True):
                 target[...] = part
-            if pushed is not None:
-                rate_values[order - 1] += pushed(at, y, rate_values)
+            rate_values[order - 1] += pushed(at, y, rate_values)
             return rate_values
 
-        shape = len(theta), len(paths.agent)
-        initial = np.stack([np.broadcast_to(part, shape) for part in paths.start[:order]])
-        initial += start.transpose(1, 0, 2)[:order]
-        if self._starts is not None:
-            initial_values = {
-                **fixed,
-                "x": initial[0],
-                "v": initial[-1],
-                "t": 0.0,
-                **_ahead_symbols(paths.ahead[0]),
-            }
-            if order == 1:
-                initial_values["v"] = np.broadcast_to(paths.start[1], shape)
-            term_states = [np.broadcast_to(part, shape) for part in self._starts(initial_values)]
-            initial = np.concatenate([initial, np.stack(term_states)])
-            initial[order : start.shape[1]] += start.transpose(1, 0, 2)[order:]
+        values = {**constants, "x": motion[0], "t": 0.0, **_ahead_symbols(paths.ahead[0])}
+        if order == 2:
+            values["v"] = motion[1]
+        for state, formula in zip(added, Formulas(self.lane.starts.values())(values), strict=True):
+            state += formula
+        initial = np.concatenate([motion, added])
         with np.errstate(all="ignore"):
-            return simulated(rate, initial, paths.dt, paths.x.shape[1], 2 * paths.half + 1e-9)
+            return simulated(rate, initial, paths.dt, paths.x.shape[1], longest)
 
     def _constants(self, theta: np.ndarray) -> dict[str, Any]:
         """The constants of runs with parameters ``(R, P, F)``."""
@@ -574,9 +577,7 @@ class Followers:
             return drawn
 
         parameters = self.spread(estimate.theta, agents)
-        x = self.simulate(parameters[None], estimate.start.T[None], lambda at, *_: pushes[at])[
-            :, 0, 0
-        ].T
+        x = self.simulate(parameters[None], estimate.start.T[None], pushes)[:, 0, 0].T
         if not np.isfinite(x[paths.observed]).all():
             raise SimulationError("followers with drawn parameters and disturbances blow up")
         return paths.remeasured(x, errors)

@@ -30,6 +30,7 @@ from scipy.optimize import lsq_linear
 
 from nnode.data.clusters import group_sums
 from nnode.errors import SimulationError
+from nnode.simulation.kernels.functions import INLINE, LOOP
 
 #: Share of the largest eigenvalue of the scaled information below which a direction is flat.
 FLAT = 1e-10
@@ -211,7 +212,7 @@ class PushNoise(Noise):
         return whitened
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, **LOOP)
 def _filtered(
     columns: np.ndarray,
     observed: np.ndarray,
@@ -262,7 +263,7 @@ def _filtered(
     return white, logdet
 
 
-@njit(cache=True, nogil=True)
+@njit(**INLINE)
 def _set_transition(
     step: np.ndarray, forced: np.ndarray, keep: np.ndarray, forward: np.ndarray
 ) -> None:
@@ -280,7 +281,7 @@ def _set_transition(
         forward[0, -1] += keep[-1]
 
 
-@njit(cache=True, nogil=True)
+@njit(**INLINE)
 def _add_error(spread: np.ndarray, variance: float) -> None:
     """Add a variance to the error that is the last state, which the first state contains."""
     last = len(spread) - 1
@@ -289,7 +290,7 @@ def _add_error(spread: np.ndarray, variance: float) -> None:
             spread[i, j] += variance
 
 
-@njit(cache=True, nogil=True)
+@njit(**INLINE)
 def _add_innovations(spread: np.ndarray, forced: np.ndarray, fresh: np.ndarray) -> None:
     """Add the covariance of the innovations of e, of variances ``fresh``, and of d by them."""
     m, processes = forced.shape
@@ -304,7 +305,7 @@ def _add_innovations(spread: np.ndarray, forced: np.ndarray, fresh: np.ndarray) 
                 spread[i, j] += change * forced[j, p]
 
 
-@njit(cache=True, nogil=True)
+@njit(**INLINE)
 def _predict_mean(
     mean: np.ndarray, forward: np.ndarray, keep: np.ndarray, before: np.ndarray
 ) -> None:
@@ -325,7 +326,7 @@ def _predict_mean(
             mean[i, c] *= keep[i - m]
 
 
-@njit(cache=True, nogil=True)
+@njit(**INLINE)
 def _predict_spread(
     spread: np.ndarray, forward: np.ndarray, keep: np.ndarray, half: np.ndarray
 ) -> None:
@@ -350,7 +351,7 @@ def _predict_spread(
             spread[i, j] *= keep[i - m] * keep[j - m]
 
 
-@njit(cache=True, nogil=True)
+@njit(**INLINE)
 def _condition(
     mean: np.ndarray,
     spread: np.ndarray,

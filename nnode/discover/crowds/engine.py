@@ -198,19 +198,22 @@ class CrowdEngine:
             return torch.stack([self._respond(rate, run) for rate in rates(run.state)])
 
     def screen_columns(
-        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+        self, system: System, row: Tensor, effect: type[Effect], *probes: Probe
     ) -> Tensor:
-        """``(S, n)``: derivatives of the residuals with respect to the strengths of a probe, in
-        the order of its ``steps``; the change by the effect as a whole where it has no strength."""
+        """``(S, n)``: derivatives of the residuals with respect to the strengths of one probe after
+        the other, in the order of ``steps``; the change by the effect as a whole where it has no
+        strength."""
 
         def rates(state: State) -> list[Tensor]:
-            base, changes = effect(**probe.options)(state), []
-            if not probe.steps:
-                return [base]
-            for name, step in probe.steps.items():
-                changed = effect(**probe.options)
-                getattr(changed, name).add_(step)
-                changes.append((changed(state) - base) / step)
+            changes = []
+            for probe in probes:
+                base = effect(**probe.options)(state)
+                for name, step in probe.steps.items():
+                    changed = effect(**probe.options)
+                    getattr(changed, name).add_(step)
+                    changes.append((changed(state) - base) / step)
+                if not probe.steps:
+                    changes.append(base)
             return changes
 
         return self.response(system, row, rates)

@@ -154,16 +154,17 @@ class TrafficEngine:
             return self._columns(response, response.parameters(ParameterVector(system).places))
 
     def screen_columns(
-        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+        self, system: System, row: Tensor, effect: type[Effect], *probes: Probe
     ) -> Tensor:
-        """``(S, n)`` derivatives of the residuals with respect to a probe's strengths, by linear
-        response; the change by the effect as a whole where it has no strength."""
+        """``(S, n)`` derivatives of the residuals with respect to the strengths of one probe after
+        the other, by linear response; the change by the effect as a whole where it has none."""
         response = self.linear(system, row)
         if effect.remembers():
-            return self._finite_change(response, effect, probe)
+            return torch.cat([self._finite_change(response, effect, probe) for probe in probes])
         base = response.rates(response.system)
         sources = [
             (response.rates(changed) - base) / step
+            for probe in probes
             for changed, step in with_each_strength(response.system, effect, probe)
         ]
         return self._columns(response, response.response(torch.stack(sources)))

@@ -67,6 +67,8 @@ from nnode.simulation.rhs import side_by_side
 #: from the model's by some centimetres, because its zones have ends of finite width and simulators
 #: integrate differently. The table in docs/discovery.md shows what other values do.
 ERROR = 0.05
+#: Largest number of values of rates that are kept at once, for memory.
+NUMBERS = 4_000_000
 #: Difference of a curve's scale for derivatives.
 SCALE = 1e-3
 
@@ -179,18 +181,25 @@ class FollowersEngine(TrafficEngine):
         return self._residual_changes(run, columns)
 
     def screen_columns(
-        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+        self, system: System, row: Tensor, effect: type[Effect], *probes: Probe
     ) -> Tensor:
-        """``(S, n)`` derivatives of the residuals with respect to a probe's strengths: by linear
-        response; of an effect with a memory, the change by it as a whole."""
+        """``(S, n)`` derivatives of the residuals with respect to the strengths of one probe after
+        the other: by linear response; of an effect with a memory, the change by it as a whole."""
         run, changes = self._run_of(system, row), []
+        at_once = max(1, NUMBERS // run.rates.size)
+        if len(probes) > at_once:
+            parts = [probes[i : i + at_once] for i in range(0, len(probes), at_once)]
+            return torch.cat([self.screen_columns(system, row, effect, *part) for part in parts])
         if effect.remembers():
-            changed, amount = with_all_strengths(run.system, effect, probe)
-            return self._residual_changes(run, self._displacement(run, changed)[..., None] / amount)
-        for changed, size in with_each_strength(run.system, effect, probe):
-            model = self._model(changed, ParameterVector(changed).row)
-            parameters = model.spread(model.start, self._deviations(model)[0])
-            changes.append((model.rates(parameters, run.states) - run.rates) / size)
+            for probe in probes:
+                changed, amount = with_all_strengths(run.system, effect, probe)
+                changes.append(self._displacement(run, changed) / amount)
+            return self._residual_changes(run, np.stack(changes, 2))
+        for probe in probes:
+            for changed, size in with_each_strength(run.system, effect, probe):
+                model = self._model(changed, ParameterVector(changed).row)
+                parameters = model.spread(model.start, self._deviations(model)[0])
+                changes.append((model.rates(parameters, run.states) - run.rates) / size)
         return self._residual_changes(run, self._propagate(run, np.stack(changes, 2)))
 
     def response(

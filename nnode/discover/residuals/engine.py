@@ -88,10 +88,10 @@ class Engine(Protocol):
         ...
 
     def screen_columns(
-        self, system: System, row: Tensor, effect: type[Effect], probe: Probe
+        self, system: System, row: Tensor, effect: type[Effect], *probes: Probe
     ) -> Tensor:
-        """``(S, n)`` derivatives of the residuals with respect to the strengths of a probe; if it
-        varies none, one row with the change by the whole effect."""
+        """``(S, n)`` derivatives of the residuals with respect to the strengths of one probe after
+        the other; for a probe that varies none, one row with the change by the whole effect."""
         ...
 
     def response(

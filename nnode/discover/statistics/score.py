@@ -109,23 +109,25 @@ class Score:
 def traces(engine: Engine, fit: Fit, effect: type[Effect]) -> list[Trace]:
     """The traces of an effect's probes in the residuals of a calibrated model."""
     probes = effect.probes(engine.batch, fit.system)
+    if not probes:
+        return []
     if not effect.consecutive:
-        return [Trace(effect, [p], _columns(engine, fit, effect, p)) for p in probes]
+        columns = _columns(engine, fit, effect, *probes)
+        ends = np.cumsum([max(len(probe.steps), 1) for probe in probes])
+        parts = np.split(columns, ends[:-1], 1)
+        return [Trace(effect, [p], part) for p, part in zip(probes, parts, strict=True)]
     # cells of one size are neighbours of each other
     sizes = dict.fromkeys(tuple(probe.steps.values()) for probe in probes)
     sized = [[p for p in probes if tuple(p.steps.values()) == size] for size in sizes]
     if effect.overlapping:
         return [_overlapping_cells(engine, fit, effect, cells) for cells in sized]
-    return [
-        Trace(effect, cells, np.concatenate([_columns(engine, fit, effect, p) for p in cells], 1))
-        for cells in sized
-    ]
+    return [Trace(effect, cells, _columns(engine, fit, effect, *cells)) for cells in sized]
 
 
-def _columns(engine: Engine, fit: Fit, effect: type[Effect], probe: Probe) -> np.ndarray:
-    """``(n, k)`` the linear response of the residuals to the strengths of a probe."""
+def _columns(engine: Engine, fit: Fit, effect: type[Effect], *probes: Probe) -> np.ndarray:
+    """``(n, k)`` the linear response of the residuals to the strengths of probes."""
     row = torch.from_numpy(fit.row)
-    columns: np.ndarray = engine.screen_columns(fit.system, row, effect, probe).numpy().T
+    columns: np.ndarray = engine.screen_columns(fit.system, row, effect, *probes).numpy().T
     return columns
 
 
@@ -141,16 +143,14 @@ def _overlapping_cells(
     """
     number = len(probes)
     low, high = probes[0].options["a"], probes[-1].options["b"]
-
-    def from_place(place: float) -> np.ndarray:
-        """The trace of an interval from a place to the end."""
-        options = {**probes[0].options, "a": place, "b": 2 * high - low}
-        return _columns(engine, fit, effect, replace(probes[0], options=options))
-
     places = np.linspace(low, high, PARTS * number + 1)
     # the effect's own ends are not within what was measured
     places[0], places[-1] = 2 * low - high, 2 * high - low
-    parts = -np.diff(np.concatenate([from_place(place) for place in places.tolist()], 1))
+    to_the_end = [
+        replace(probes[0], options={**probes[0].options, "a": place, "b": 2 * high - low})
+        for place in places.tolist()
+    ]
+    parts = -np.diff(_columns(engine, fit, effect, *to_the_end))
     padded = np.pad(parts, ((0, 0), (PARTS // 2, PARTS // 2)))
     rising = (np.arange(PARTS) + 0.5) / PARTS
     weights = np.tile(np.concatenate([rising, rising[::-1]]), (number, 1))
