@@ -34,7 +34,8 @@ exchange: setup
 	  $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$$program]" \
 	  || echo "exchange: $$program cannot be installed here, the reason is above; its tests are skipped"; \
 	done
-	$(BIN)/python -m pytest -m "not tutorial" tests/exchange
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
+	  -m "not tutorial" tests/exchange
 
 # Which lines of the package the tests run; below 90 % it fails.
 coverage: setup
@@ -46,7 +47,7 @@ coverage: setup
 
 # Runs every block of code of the tutorials.
 tutorials: setup
-	$(BIN)/python -m pytest -m tutorial tests/docs
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 -m tutorial tests/docs
 
 # The documentation as a site that works offline: runs/site/index.html
 docs: setup
