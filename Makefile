@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 DEMO   := runs/demo
+# The tests of make exchange
+EXCHANGE ?= tests/exchange
 
 .PHONY: setup demo test thorough exchange coverage tutorials docs lint study clean
 
@@ -35,7 +37,7 @@ exchange: setup
 	  || echo "exchange: $$program cannot be installed here, the reason is above; its tests are skipped"; \
 	done
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
-	  -m "not tutorial" tests/exchange
+	  -m "not tutorial" $(EXCHANGE)
 
 # Which lines of the package the tests run; below 90 % it fails.
 coverage: setup
