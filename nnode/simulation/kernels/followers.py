@@ -29,8 +29,8 @@ from nnode.simulation.numpy import strides
 WIDTH = 128
 #: Distance of rows. With powers of two, rows would compete for the same lines of the cache.
 _PITCH = WIDTH + 8
-#: Groups of rows with a row for every state: the states, their rates, and at the beginning of a
-#: step; then the weighted sum of rates.
+#: Groups of rows, with a row for every state in each: states, rates, rates and states at the
+#: beginning of the step, and the weighted sum of rates.
 _GROUPS = ("", "rate_", "rate_before_", "before_", "sum_")
 #: States of the vehicles ahead in formulas: their columns in the paths ahead.
 AHEAD = {"x_1": 0, "v_1": 1, "dx_1": 1, "measured": 1, "x_2": 2, "v_2": 3}
@@ -62,12 +62,12 @@ class FollowerSource:
         Raises:
             ConfigError: a name in the formulas is not a valid symbol.
         """
-        lane, n_grouped = self.lane, len(_GROUPS) * len(self.lane.rates)
+        lane = self.lane
         check_symbols([*lane.rates, *self.constants])
-        rows = {f"{group}{s}": i for group in _GROUPS for i, s in enumerate(lane.rates)}
-        rows = {row: i for i, row in enumerate(rows)}
-        rows |= {name: n_grouped + column for name, column in AHEAD.items()}
-        rows |= {name: n_grouped + 4 + i for i, name in enumerate(self.constants)}
+        grouped = [f"{group}{s}" for group in _GROUPS for s in lane.rates]
+        rows = {row: i for i, row in enumerate(grouped)}
+        rows |= {name: len(grouped) + column for name, column in AHEAD.items()}
+        rows |= {name: len(grouped) + 4 + i for i, name in enumerate(self.constants)}
         places = [f"_{row} = np.uint64({i * _PITCH})" for row, i in rows.items()]
         formula = "\n".join(f"d{s}/dt = {plain(rate)}" for s, rate in lane.rates.items())
         constants = "\n".join([*places, "OPTIONS = dict(LOOP, cache=True)", ""])
@@ -245,17 +245,19 @@ def _look_ahead(
     rows: np.ndarray, push: np.ndarray, ahead: np.ndarray, pushes: np.ndarray, at: int, low: int
 ) -> None:
     """The states of the vehicles ahead, and the pushes, of the block's runs."""
-    followers = ahead.shape[2]
     for c in range(4):
-        f = low % followers
-        for k in range(WIDTH):
-            rows[c, k] = ahead[at, c, f]
-            f = f + 1 if f + 1 < followers else 0
+        _repeat(rows[c], ahead[at, c], low)
     if len(pushes):
-        f = low % followers
-        for k in range(WIDTH):
-            push[k] = pushes[at, f]
-            f = f + 1 if f + 1 < followers else 0
+        _repeat(push, pushes[at], low)
+
+
+@njit(cache=True, **LOOP)
+def _repeat(row: np.ndarray, values: np.ndarray, low: int) -> None:
+    """The followers' values ``(F,)``, which are the same in all runs, for the block."""
+    f = low % len(values)
+    for k in range(WIDTH):
+        row[k] = values[f]
+        f = f + 1 if f + 1 < len(values) else 0
 
 
 @njit(cache=True, **LOOP)
