@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from scipy.linalg import solveh_banded
+from scipy.linalg.lapack import dpbsv
 
 #: Order of the differences that are kept small: the third, so that a constant acceleration is
 #: not smoothed away.
@@ -36,7 +36,7 @@ def whittaker(x: np.ndarray) -> tuple[np.ndarray, float]:
     identity = np.eye(ORDER + 1, 1)
     best, best_weight, best_score = columns, 0.0, np.inf
     for weight in WEIGHTS:
-        smoothed = solveh_banded(identity + weight * penalty, columns, lower=True)
+        _, smoothed, _ = dpbsv(identity + weight * penalty, columns, lower=True)
         kept = (1 / (1 + weight * values)).sum()
         score = ((columns - smoothed) ** 2).sum() / (len(x) - kept) ** 2
         if score < best_score:

@@ -8,12 +8,16 @@ from nnode.model.effects import Effect
 from nnode.model.system import System
 
 
-def extended(system: System, effect: Effect) -> tuple[System, int]:
+def extended(system: System, effect: Effect, *, same_terms: bool = False) -> tuple[System, int]:
     """A copy of a model with an additional effect, and the effect's index among the terms.
 
     The effect is inserted in the order of the ranks.
+
+    Args:
+        same_terms: whether the copy has the model's own terms, which is faster, and not copies.
     """
-    model = copy.deepcopy(system)
+    kept = list(system.terms) if same_terms else []
+    model = copy.deepcopy(system, {id(term): term for term in kept})
     place = len(model.terms)
     for i, term in enumerate(model.terms):
         if isinstance(term, Effect) and term.rank > effect.rank:

@@ -354,21 +354,23 @@ def fit_variances(
             slope[place] = (loglik - centre.loglik) / DIFFERENCE
         return centre.loglik, slope[free], scores[free]
 
-    loglik, _, scores = likelihood(logs_all[free])
-    scale = 1 / np.sqrt(np.maximum((scores**2).sum(1), 1.0))
+    first = likelihood(logs_all[free])
+    scale = 1 / np.sqrt(np.maximum((first[2] ** 2).sum(1), 1.0))
+    start = logs_all[free] / scale
 
     def value(scaled: np.ndarray) -> tuple[float, np.ndarray]:
-        loglik, slope, _ = likelihood(scaled * scale)
+        at_start = np.array_equal(scaled, start)
+        loglik, slope, _ = first if at_start else likelihood(scaled * scale)
         return -loglik, -slope * scale
 
     lowest, highest = np.log(variances.low[free]) / scale, np.log(variances.high[free]) / scale
     best = minimize(
         value,
-        logs_all[free] / scale,
+        start,
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(lowest, highest, strict=True)),
-        options={"ftol": tolerance / max(abs(loglik), 1.0), "gtol": tolerance},
+        options={"ftol": tolerance / max(abs(first[0]), 1.0), "gtol": tolerance},
     )
     logs_all[free] = best.x * scale
     return variances.filled(np.exp(logs_all))

@@ -331,11 +331,11 @@ def weights_of(residual: Tensor, threshold: float) -> Tensor:
 
 def with_all_strengths(system: System, effect: type[Effect], probe: Probe) -> tuple[System, float]:
     """A model with an effect whose strengths are all changed by a probe's steps, and the size of
-    the step; 1 if the probe changes none."""
+    the step; 1 if the probe changes none. Its other terms are those of the given model."""
     values, amount = dict(probe.options), 1.0
     for name, step in probe.steps.items():
         values[name], amount = effect.strengths[name].neutral + step, step
-    return extended(system, effect(**values))[0], amount
+    return extended(system, effect(**values), same_terms=True)[0], amount
 
 
 def with_each_strength(

@@ -16,6 +16,7 @@ import copy
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -94,6 +95,12 @@ class _Run:
     step: np.ndarray
     after: np.ndarray
     weight: Tensor
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The surroundings of all followers at all samples."""
+        scene = self.model.system.scene(self.model.paths.batch)
+        return side_by_side(scene, len(self.states), at_samples=True)
 
 
 class FollowersEngine(TrafficEngine):
@@ -214,8 +221,8 @@ class FollowersEngine(TrafficEngine):
         paths, (k, _, f) = run.model.paths, run.states.shape
         speed = run.rates[0]
         time = torch.arange(k, dtype=torch.float64).repeat_interleave(f) * paths.dt
-        scene = side_by_side(self._scene(run.model), k, at_samples=True)
-        state = _state_of(run.model, time, run.states[:, 0], speed, paths.ahead_at_samples, scene)
+        ahead = paths.ahead_at_samples
+        state = _state_of(run.model, time, run.states[:, 0], speed, ahead, run.scene)
         speeds = [rate[:, 0, 0].reshape(k, f).numpy() for rate in rates(state)]
         source = np.zeros((run.model.lane.order, k, len(speeds), f))
         source[-1] = np.stack(speeds, 1)
@@ -484,13 +491,10 @@ class FollowersEngine(TrafficEngine):
             return np.zeros_like(displacement)
         return displacement
 
-    def _scene(self, model: Followers) -> Scene:
-        return model.system.scene(model.paths.batch)
-
     def _curve_push(self, model: Followers, curve: Curve, scale: Tensor) -> Push:
         """The push of a curve on the highest rate, in runs with several scales."""
         paths = model.paths
-        scene = side_by_side(self._scene(model), len(scale))
+        scene = side_by_side(model.system.scene(paths.batch), len(scale))
 
         def pushed(at: int, y: np.ndarray, rates: np.ndarray) -> np.ndarray:
             time = torch.tensor(at * paths.half, dtype=torch.float64)
