@@ -1,10 +1,18 @@
-"""Linear responses of models that blow up: no number, and no error."""
+"""Linear responses: both solvers agree, and models that blow up give no number and no error."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
 
-from nnode.simulation.linear import DenseSolver, FrontToBackSolver
+from nnode.simulation.linear import (
+    Blocks,
+    DenseSolver,
+    FrontToBackSolver,
+    RungeKuttaSolver,
+    dense_jacobian,
+)
 
 
 def test_an_equation_without_a_solution_gives_no_number() -> None:
@@ -26,3 +34,52 @@ def test_what_cannot_be_inverted_is_no_number_there_alone() -> None:
     assert np.isnan(moved[1:, 0, 0, 2]).all()
     np.testing.assert_allclose(moved[:, 0, 0, :2], [[0.0, 0.0], [0.1, 0.1], [0.2, 0.2]])
     assert not moved[:, 1].any()
+
+
+@pytest.mark.parametrize("reads_speed", [False, True])
+def test_platoon_is_solved_from_its_front_as_by_dense_matrices(reads_speed: bool) -> None:
+    """Two states, four vehicles, five times, three changes, two sequences; both solvers use the
+    trapezoidal rule."""
+    rng = np.random.default_rng(4)
+    m, n, k, c, b, dt = 2, 4, 5, 3, 2, 0.2
+    keys = [(p, ahead, q) for p in range(m) for ahead in range(3) for q in range(m)]
+    keys += [(1, 1, m)] if reads_speed else []  # the acceleration by the speed of the vehicle ahead
+    blocks: Blocks = {key: rng.normal(size=(n - 1, k, b)) for key in keys}
+    source, start = rng.normal(size=(k, m, n, c, b)), rng.normal(size=(m, n, c, b))
+    matrix = dense_jacobian(blocks, (m, n, k, b)).reshape(m * n, m * n, k, b).transpose(2, 3, 0, 1)
+    dense = DenseSolver(matrix.copy(), m, dt)
+    by_vehicle = FrontToBackSolver(blocks, m, dt)
+    for first in (None, start):
+        expected = dense.response(source, first)
+        np.testing.assert_allclose(by_vehicle.response(source, first), expected, atol=1e-12)
+    assert not np.allclose(expected, dense.response(source), atol=0.1)
+
+
+def test_runge_kutta_follows_fast_accelerations() -> None:
+    """Two people whose accelerations depend on both and on time, and are pushed at 1 Hz."""
+    rng = np.random.default_rng(5)
+    n, dt, times = 2, 0.1, 0.1 * np.arange(31)
+    to_velocity = np.block([[np.zeros((n, n)), np.eye(n)]])
+    constant, growing = rng.normal(size=(2, n, 2 * n))
+
+    def matrix(t: float) -> np.ndarray:
+        return np.concatenate([to_velocity, constant + t * growing / 3])
+
+    def push(t: float | np.ndarray) -> np.ndarray:
+        return np.stack([np.sin(2 * np.pi * np.asarray(t)), np.cos(2 * np.pi * np.asarray(t))])
+
+    first = rng.normal(size=2 * n)
+    exact = solve_ivp(
+        lambda t, y: matrix(t) @ y + np.concatenate([np.zeros(n), push(t)]),
+        (0.0, times[-1]),
+        first,
+        t_eval=times,
+        rtol=1e-10,
+        atol=1e-12,
+    ).y[:n]
+    solver = RungeKuttaSolver(np.stack([matrix(t) for t in times])[:, None], dt)
+    source = np.zeros((len(times), 2, n, 1, 1))
+    source[:, 1, :, 0, 0] = push(times).T
+    moved = solver.response(source, first.reshape(2, n, 1, 1))[..., 0, 0].T
+    # the first step has no parabola yet: dt^3 / 12 of the second derivative of the push, 0.0033 m/s
+    np.testing.assert_allclose(moved, exact, atol=0.004)
