@@ -212,7 +212,7 @@ def fit_all_random(system: System, paths: Paths, steps: int = RANKING_STEPS) -> 
     plain = Followers(system, paths)
     if not _simulated_finitely(plain):
         raise SimulationError("the followers' paths diverge")
-    model = Followers(system, paths, plain.may_differ)
+    model = plain.with_random(plain.may_differ)
     return _estimated(model, model.start, initial_variances(model), steps=steps)
 
 
@@ -250,7 +250,7 @@ def refit(before: Population, system: System, paths: Paths, *, fixed: bool) -> P
         system, paths: the model and the followers.
         fixed: only estimate deviations, with the system's parameters and the earlier variances.
     """
-    model, previous = Followers(system, paths, before.random), before.estimate
+    model, previous = Followers(system, paths).with_random(before.random), before.estimate
     variances = _with_starts(previous.variances, model)
     same_followers = before.model.paths.names == paths.names
     same_followers &= previous.start.shape == (len(paths.agent), model.starts)
@@ -397,7 +397,7 @@ def _with_random_effects(best: Population) -> Population:
 
 def _with_named_effects(alike: Population, names: list[str]) -> Population:
     """The estimate in which parameters differ between drivers, from that of drivers alike."""
-    model, before = Followers(alike.model.system, alike.model.paths, names), alike.estimate
+    model, before = alike.model.with_random(names), alike.estimate
     variances = before.variances
     for _ in names:
         variances = _with_random_effect(variances)
@@ -412,8 +412,7 @@ def _next_random_effect(best: Population, price: float) -> Population | None:
     candidates = [name for value, name in sorted(ranked, reverse=True) if value > limit]
     improved: list[Population] = []
     for name in candidates:
-        system, paths = best.model.system, best.model.paths
-        model, before = Followers(system, paths, [*best.random, name]), best.estimate
+        model, before = best.model.with_random([*best.random, name]), best.estimate
         variances = _with_random_effect(before.variances)
         try:
             fit = _estimated(model, before.theta, variances, steps=RANKING_STEPS)

@@ -163,29 +163,31 @@ def estimate(
     n_agents = int(data.agent.max()) + 1
     agents = np.zeros((n_agents, len(data.random))) if agents is None else agents
     start = np.zeros(data.start.shape[::2]) if start is None else start
+    point = _Point(theta, agents, start, data)
     relaxation, previous_change = 1.0, np.zeros(len(theta))
-    best, logliks = (theta, agents, start, data, variances), list[float]()
+    best, logliks = (point, variances), list[float]()
     region = float(stats.chi2.ppf(REGION, max(len(theta), 1))) / 2
     for _ in range(steps):
         before = variances
+        to_low, to_high = low - point.theta, high - point.theta
         try:
             variances = fit_variances(
-                data,
+                point.data,
                 noise,
                 variances,
-                low=low - theta,
-                high=high - theta,
+                low=to_low,
+                high=to_high,
                 restricted=restricted,
                 tolerance=tolerance,
             )
-            products = noise.products(data, variances.noise)
+            products = noise.products(point.data, variances.noise)
             current = marginal(
-                data,
+                point.data,
                 products,
                 variances.spread,
                 variances.start,
-                low=np.maximum(low - theta, -longest),
-                high=np.minimum(high - theta, longest),
+                low=np.maximum(to_low, -longest),
+                high=np.minimum(to_high, longest),
                 restricted=restricted,
             )
         except SimulationError:
@@ -194,34 +196,36 @@ def estimate(
             break  # the last step led to a model without a likelihood
         logliks.append(current.unchanged)
         if logliks[-1] == max(logliks):
-            best = theta, agents, start, data, variances
+            best = point, variances
         change = current.change
         reversed_step = previous_change @ current.information @ change < 0
         relaxation = max(relaxation / 2, LEAST) if reversed_step else min(1.25 * relaxation, 1.0)
         previous_change = change
-        largest_change = _largest_change(current, agents, variances, before)
-        point = _Point(theta, agents, start, data)
+        largest_change = _largest_change(current, point.agents, variances, before)
         accepted, tried = _step(response, noise, point, products, variances, current, relaxation)
         n_linearisations += tried
-        if accepted is not None:
-            theta, agents, start, data = accepted
+        point = point if accepted is None else accepted
         converged = largest_change < tolerance
         stalled = max(logliks[-PATIENCE:]) < max(logliks)
         if converged or accepted is None or stalled:
             break
     if not converged:
-        theta, agents, start, data, variances = best
+        point, variances = best
         converged = stalled and max(logliks) - min(logliks[-PATIENCE:]) < region
-    bounds: dict[str, Any] = {"low": low - theta, "high": high - theta, "restricted": restricted}
-    variances = fit_variances(data, noise, variances, tolerance=tolerance, **bounds)
-    products = noise.products(data, variances.noise)
-    final = marginal(data, products, variances.spread, variances.start, **bounds)
+    bounds: dict[str, Any] = {
+        "low": low - point.theta,
+        "high": high - point.theta,
+        "restricted": restricted,
+    }
+    variances = fit_variances(point.data, noise, variances, tolerance=tolerance, **bounds)
+    products = noise.products(point.data, variances.noise)
+    final = marginal(point.data, products, variances.spread, variances.start, **bounds)
     return Estimate(
-        theta=theta,
-        agents=agents,
-        start=start,
+        theta=point.theta,
+        agents=point.agents,
+        start=point.start,
         variances=variances,
-        data=data,
+        data=point.data,
         marginal=final,
         steps=n_linearisations,
         converged=converged,

@@ -305,19 +305,18 @@ class Followers:
     Args:
         system: the model; only its parameters that need a gradient are varied.
         paths: the followers.
-        random: names of the parameters that differ between drivers, as ``idm.T``.
 
     Attributes:
         names: P names of the parameters.
         law: ``(P,)`` True for those of the law; logs: for those that are varied in logarithms.
         starts: number H of states whose start is estimated.
-        random: ``(Q,)`` numbers of those that differ between drivers.
+        random: ``(Q,)`` numbers of those that differ between drivers; none at first.
 
     Raises:
         ConfigError: a model that is no formula, or that reads states of other vehicles.
     """
 
-    def __init__(self, system: System, paths: Paths, random: list[str] | None = None) -> None:
+    def __init__(self, system: System, paths: Paths) -> None:
         self.system, self.paths = system, paths
         terms, lane = cast(list[Term], list(system.terms)), follower_formula(system)
         if lane is None:
@@ -336,7 +335,7 @@ class Followers:
         self.law = np.array([name.startswith(law_prefix) for name in self.names], dtype=bool)
         # a positive quantity of a law without a bound has a sign
         self.logs = ((low >= 0) | (self.law & np.isinf(low))) & (row > 0)
-        self.random = np.array([self.names.index(name) for name in random or []], dtype=int)
+        self.random = np.zeros(0, dtype=int)
         self.start = self.at(row)
         smallest = 1e-3 * np.abs(row)
         self.low, self.high = self.at(np.maximum(low, smallest * self.logs)), self.at(high)
@@ -356,6 +355,12 @@ class Followers:
         """Names of the law's parameters that are varied in logarithms."""
         flags = zip(self.names, self.logs & self.law, strict=True)
         return [name for name, differs in flags if differs]
+
+    def with_random(self, names: Iterable[str]) -> Followers:
+        """The same model, in which other parameters, such as ``idm.T``, differ between drivers."""
+        model = copy.copy(self)
+        model.random = np.array([self.names.index(name) for name in names], dtype=int)
+        return model
 
     def with_paths(self, paths: Paths) -> Followers:
         """The same model with other paths of the same followers."""

@@ -64,13 +64,13 @@ def predict(
     times = paths.dt * np.arange(paths.x.shape[1])
     given = (times <= seconds + 1e-9) | (np.arange(len(times)) < 2)
     names = [name for name in variances if name not in NOISE]
-    law = Followers(system, paths)
     past = replace(
         paths.starting_from(given),
         observed=paths.observed & given,
         agent=np.arange(len(paths.agent)),
     )
-    model = Followers(system, past, full_names(names, law.may_differ))
+    alike = Followers(system, past)
+    model = alike.with_random(full_names(names, alike.may_differ))
     initial = initial_variances(model)
     fixed = replace(
         initial,

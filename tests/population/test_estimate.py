@@ -60,7 +60,7 @@ def test_further_steps_never_make_an_estimate_less_likely() -> None:
     # far from the zone that slows the vehicles, steps raise the pushes in place of the likelihood
     zone = {"name": "speed_zone", "alpha": 0.8, "a": 200.0, "b": 380.0}
     system = build_model(model_options("idm", "measured", effects=[zone])).double()
-    model = Followers(system, paths_of(list(sequences), 0.2), ["idm.T"])
+    model = Followers(system, paths_of(list(sequences), 0.2)).with_random(["idm.T"])
 
     def loglik(steps: int) -> float:
         result = estimate(

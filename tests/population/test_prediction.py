@@ -44,7 +44,7 @@ def test_the_next_sample_has_the_density_of_the_marginal_likelihood(seconds: flo
     known = replace(
         paths.starting_from(prediction.given), observed=paths.observed & prediction.given
     )
-    model, noise = Followers(lin().double(), known, ["lin.v0"]), PushNoise()
+    model, noise = Followers(lin().double(), known).with_random(["lin.v0"]), PushNoise()
     variances = replace(
         initial_variances(model),
         noise=np.array(list(NOISE.values())),

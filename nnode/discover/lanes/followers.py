@@ -308,7 +308,8 @@ class FollowersEngine(TrafficEngine):
         effect attribute it to pushes, and would hide where it acts."""
         row = ParameterVector(system).row
         paths = self._paths_for(system, row)
-        model = Followers(system, paths, Followers(system, paths).may_differ)
+        alike = Followers(system, paths)
+        model = alike.with_random(alike.may_differ)
         variances = initial_variances(model)
         deviations = fit_deviations(model, PushNoise(), model.start, variances)
         bias, engine = np.zeros(len(model.start)), copy.copy(self)
@@ -368,9 +369,7 @@ class FollowersEngine(TrafficEngine):
         random = [] if self.population is None else self.population.random
         paths = self._paths_for(system, row)
         model = Followers(system, paths)
-        if set(random) <= set(model.names):
-            model.random = np.array([model.names.index(name) for name in random], dtype=int)
-        return model
+        return model.with_random(random) if set(random) <= set(model.names) else model
 
     def _deviations(self, model: Followers) -> tuple[np.ndarray, np.ndarray]:
         """Estimated deviations of drivers ``(D, Q)`` and of starts ``(F, H)``; none for another
