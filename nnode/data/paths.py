@@ -28,11 +28,15 @@ def whittaker(x: np.ndarray) -> tuple[np.ndarray, float]:
     The weight is the one with the least generalised cross-validation error over all columns. Fewer
     than six samples are returned as they are, with weight 0.
 
+    Raises:
+        ValueError: a position is not finite.
+
     Source: Eilers 2003, Analytical Chemistry 75.
     """
     if len(x) < 6:
         return x.copy(), 0.0
-    columns, values, penalty = x.reshape(len(x), -1), _sizes(len(x)), _penalty(len(x))
+    columns = np.asarray_chkfinite(x).reshape(len(x), -1)
+    values, penalty = _sizes(len(x)), _penalty(len(x))
     identity = np.eye(ORDER + 1, 1)
     best, best_weight, best_score = columns, 0.0, np.inf
     for weight in WEIGHTS:

@@ -359,7 +359,8 @@ def fit_variances(
         return centre.loglik, slope[free], scores[free]
 
     first = likelihood(logs_all[free])
-    scale = 1 / np.sqrt(np.maximum((first[2] ** 2).sum(1), 1.0))
+    loglik_at_start, _, scores = first
+    scale = 1 / np.sqrt(np.maximum((scores**2).sum(1), 1.0))
     start = logs_all[free] / scale
 
     def value(scaled: np.ndarray) -> tuple[float, np.ndarray]:
@@ -374,7 +375,7 @@ def fit_variances(
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(lowest, highest, strict=True)),
-        options={"ftol": tolerance / max(abs(first[0]), 1.0), "gtol": tolerance},
+        options={"ftol": tolerance / max(abs(loglik_at_start), 1.0), "gtol": tolerance},
     )
     logs_all[free] = best.x * scale
     return variances.filled(np.exp(logs_all))
