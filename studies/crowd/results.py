@@ -112,17 +112,12 @@ class Crowd:
 
     def fits(self, kind: str, scope: str, horizon: float) -> Any:
         """Calibrations from all starts, least training cost first."""
-        found = self.take("fit", horizon)
-        return found.query("kind == @kind and scope == @scope").sort_values("J")
+        found = self.take("fit", horizon).query("kind == @kind and scope == @scope")
+        return found.astype({"seed": int, "evaluations": int}).sort_values("J")
 
-    def best(self, model: str, scope: str, horizon: float) -> Any:
-        """The calibration of least training cost.
-
-        The network of the walls alone is the model with people's network at zero: where that
-        trains better, the search among both networks stopped at worse minima.
-        """
-        kinds = ("nn", "wall") if model == "nn" else (model,)
-        return pd.concat(self.fits(k, scope, horizon) for k in kinds).sort_values("J").iloc[0]
+    def best(self, kind: str, scope: str, horizon: float) -> Any:
+        """The calibration of lowest training cost."""
+        return self.fits(kind, scope, horizon).iloc[0]
 
     def system(self, model: str, horizon: float) -> System:
         """A model as calibrated to all sequences."""
@@ -256,7 +251,7 @@ class Crowd:
 
     def _every_parameter(self) -> pd.DataFrame:
         """All calibrations, one row per number: what is needed to compute their costs again."""
-        fits = self.found.query("task == 'fit'")
+        fits = self.found.query("task == 'fit'").astype({"seed": int})
         values = [named(KINDS[k], row) for k, row in zip(fits["kind"], fits["row"], strict=True)]
         names = {
             "kind": "model",

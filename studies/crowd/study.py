@@ -43,7 +43,11 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
     named = {f"{kind}-{horizon:g}": store for (kind, horizon), store in stores.items()}
     study = Crowd(options, stores)
     for number, horizon in enumerate(options.horizons):
-        for what, make in (("calibration", calibrations), ("intervals, other runs", evaluations)):
+        for what, make in (
+            ("calibration", calibrations),
+            ("networks that begin at the one of the walls", from_walls),
+            ("intervals, other runs", evaluations),
+        ):
             title = f"crowd study, {horizon:g} s: {what}"
             study.add(horizon, computed(make(study, number), folder, options, named, title))
     return page("crowd", study.tables(), study.figures(), stores.values(), **study.values())
@@ -60,9 +64,8 @@ def starts(restarts: int, kind: str, scope: str, first: bool) -> int:
 def calibrations(study: Crowd, number: int) -> list[Task]:
     """Model × part that trains × start at horizon ``number``, and what needs no calibration."""
     options, horizon = study.options, study.options.horizons[number]
-    where: dict[str, Any] = {"folder": study.folder("main", horizon)}
+    where = {"folder": study.folder("main", horizon)}
     found = [Task(f"baselines-{horizon:g}s", tasks.baselines, where)]
-    fit = where | {"folds": options.folds, "span": list(study.span), "steps": options.steps}
     for kind in tasks.KINDS:
         for scope in study.scopes:
             count = starts(options.restarts, kind, scope, number == 0)
@@ -71,19 +74,58 @@ def calibrations(study: Crowd, number: int) -> list[Task]:
             if number:
                 before = study.fits(kind, scope, options.horizons[number - 1])
                 begin = list(zip(before["seed"], before["row"], strict=True))[:count]
-            for seed, row in begin:
-                how = {"kind": kind, "scope": scope, "seed": int(seed), "start": row}
-                key = f"fit-{kind}-{scope}-{horizon:g}s-{seed}"
-                cost = _COSTS[kind] * (0.4 if number else 1.0)
-                found.append(Task(key, tasks.fit, fit | how, cost=cost))
+            found += [_fit(study, number, kind, scope, int(seed), row) for seed, row in begin]
     return found
+
+
+def from_walls(study: Crowd, number: int) -> list[Task]:
+    """Both networks, from the best network of the walls alone and no force between people.
+
+    The walls' network alone is a special case of both networks. A search that begins at it cannot
+    end at a higher training cost, which searches from random starts do. These starts are numbered
+    after the random ones.
+    """
+    horizon, seed = study.options.horizons[number], study.options.seed
+    return [
+        _fit(
+            study,
+            number,
+            "nn",
+            scope,
+            seed + study.options.restarts + number,
+            study.best("wall", scope, horizon)["row"],
+        )
+        for scope in study.scopes
+    ]
+
+
+def _fit(
+    study: Crowd, number: int, kind: str, scope: str, seed: int, start: list[float] | None
+) -> Task:
+    """The calibration of one model from one start at horizon ``number``."""
+    options, horizon = study.options, study.options.horizons[number]
+    return Task(
+        f"fit-{kind}-{scope}-{horizon:g}s-{seed}",
+        tasks.fit,
+        {
+            "folder": study.folder("main", horizon),
+            "folds": options.folds,
+            "span": list(study.span),
+            "steps": options.steps,
+            "kind": kind,
+            "scope": scope,
+            "seed": seed,
+            "start": start,
+        },
+        cost=_COSTS[kind] * (0.4 if number else 1.0),
+    )
 
 
 def evaluations(study: Crowd, number: int) -> list[Task]:
     """Refits to resampled stretches of time, and costs in other runs."""
     options, horizon = study.options, study.options.horizons[number]
-    rows = {kind: study.fits(kind, ALL, horizon)["row"].iloc[0] for kind in tasks.KINDS}
-    where = {"folder": study.folder("main", horizon), "row": rows["sf"]}
+    rows = {kind: study.best(kind, ALL, horizon)["row"] for kind in tasks.KINDS}
+    where: dict[str, Any] = {"folder": study.folder("main", horizon), "row": rows["sf"]}
     where |= {"draws": options.bootstrap, "seed": options.seed}
     found = [
         Task(
@@ -94,6 +136,5 @@ def evaluations(study: Crowd, number: int) -> list[Task]:
         )
         for first in range(0, options.bootstrap, CHUNK)
     ]
-    rows["nn"] = study.best("nn", ALL, horizon)["row"]
     other = {"folder": study.folder("others", horizon), "rows": rows}
     return [*found, Task(f"transfer-{horizon:g}s", tasks.transfer, other, cost=8.0)]

@@ -98,6 +98,15 @@ def test_starts_are_set_side_by_side(tables: dict[str, pd.DataFrame]) -> None:
     assert list(table.loc["SF", "J (m² s)"]) == pytest.approx([2.0, 2.2])
     assert table.loc[("NN", 0), "likeness, sum"] == pytest.approx(1.0)
     assert table.loc[("NN, walls alone", 0), "size, pair"] == 0.0
+    # the start after the random ones is the best network of the walls alone
+    assert list(table.loc["NN"].index) == [0, 1, 2]
+    assert table.loc[("NN", 2), "size, pair"] == 0.0
+    assert table.loc[("NN", 1), "size, pair"] > 0.0
+    parameters = tables["parameters"]["value"]
+    for horizon, start in ((1.0, 2), (2.0, 3)):
+        for scope in ("all", "fold-0"):
+            continued = parameters.loc[("nn", scope, horizon, start)]
+            assert list(continued) == list(parameters.loc[("wall", scope, horizon, 0)])
 
 
 def test_all_parameters_are_named(tables: dict[str, pd.DataFrame]) -> None:
