@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 
 import torch
@@ -91,8 +92,8 @@ def sequence_costs(
     mean = deviation.square().sum((0, -1)) / counted.sum((0, -1)).clamp(min=1)
     if convention is not Convention.spacing:
         return mean
-    # the root has no derivative at 0
-    return torch.where(mean > 0, mean, 1.0).sqrt() * (mean > 0)
+    # the root has no derivative at 0; NaN, of simulations that blow up, stays NaN
+    return torch.where(mean == 0, 1.0, mean).sqrt() * (mean != 0)
 
 
 def net_gaps(x: Tensor, batch: Batch) -> Tensor:
@@ -144,7 +145,9 @@ def errors(
 def changed_gap(gap: Tensor, measured: Tensor, convention: Convention) -> Tensor:
     """Error of a gap (m) by the convention of a cost."""
     if convention is Convention.log_gap:
-        return gap.clamp(min=LEAST_GAP).log() - measured.clamp(min=LEAST_GAP).log()
+        # without this, a vehicle that blows up to infinity would have the smallest gap
+        finite = torch.where(gap.isfinite(), gap, math.nan)
+        return finite.clamp(min=LEAST_GAP).log() - measured.clamp(min=LEAST_GAP).log()
     deviation = gap - measured
     return (
         deviation / measured.clamp(min=LEAST_GAP)

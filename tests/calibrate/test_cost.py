@@ -51,6 +51,19 @@ def test_both_conventions(convention: Convention, costs: list[float]) -> None:
     np.testing.assert_allclose(found, costs, rtol=1e-14)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("convention", list(Convention))
+def test_a_simulation_that_blows_up_has_no_finite_cost(
+    convention: Convention, value: float
+) -> None:
+    batch = two_sequences()
+    x, v = batch.x.clone(), batch.v.clone()
+    x[2, 0, 0, 0] = v[2, 0, 0, 0] = value
+    costs = sequence_costs(Trajectory(x, v), batch, convention)
+    assert not costs[0].isfinite()
+    assert costs[1] == 0.0
+
+
 def test_two_dimensions_count_together() -> None:
     x = np.zeros((2, 1, 2))
     batch = collate([Sequence(name="p", recording="r", time=np.array([0.0, 0.04]), x=x)])
