@@ -17,6 +17,7 @@ from typing import Any, cast
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from nnode.calibrate.cost import LEAST_GAP
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.paths import smooth, whittaker
 from nnode.data.sequence import Batch, Sequence, collate
@@ -562,6 +563,8 @@ class Followers:
     def simulated_paths(self, estimate: Estimate, draw: Draw) -> Paths:
         """Simulated measurements of the estimated model (parametric bootstrap).
 
+        Starts move with the drawn drivers, see :meth:`_longer_distance`.
+
         Args:
             estimate: of this model.
             draw: of deviations of drivers, pushes and errors.
@@ -582,10 +585,29 @@ class Followers:
             return drawn
 
         parameters = self.spread(estimate.theta, agents)
-        x = self.simulate(parameters[None], estimate.start.T[None], pushes)[:, 0, 0].T
+        start = estimate.start.copy()
+        start[:, 0] -= self._longer_distance(estimate, agents - estimate.agents)
+        x = self.simulate(parameters[None], start.T[None], pushes)[:, 0, 0].T
         if not np.isfinite(x[paths.observed]).all():
             raise SimulationError("followers with drawn parameters and disturbances blow up")
         return paths.remeasured(x, errors)
+
+    def _longer_distance(self, estimate: Estimate, change: np.ndarray) -> np.ndarray:
+        """``(F,)`` by how much the first distance to the vehicle ahead (m) is longer, if drivers'
+        deviations differ by ``change`` ``(D, Q)`` from the estimated ones.
+
+        A driver who keeps a longer gap has kept it before the record. Simulated drivers whose
+        starts did not depend on them would first approach their own gaps, and this motion would
+        change the bias of the parameters. The dependence is a linear regression of the logarithm of
+        the distance on deviations and, in laws of second order, the speed.
+        """
+        paths, order = self.paths, self.lane.order
+        start = paths.start[:order].T + estimate.start[:, :order]
+        distance = np.maximum(paths.ahead_at_samples[0, 0] - start[:, 0], LEAST_GAP)
+        regressors = [np.ones(len(start)), *start[:, 1:].T, *estimate.agents[paths.agent].T]
+        coefficients = np.linalg.lstsq(np.column_stack(regressors), np.log(distance))[0]
+        longer: np.ndarray = distance * np.expm1(change[paths.agent] @ coefficients[order:])
+        return longer
 
 
 def _ornstein_uhlenbeck(normal: np.ndarray, step: float) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import nnode
-from benchmarks.drivers import LASTS, PUSH
+from benchmarks.drivers import LASTS, PUSH, T
 from benchmarks.drivers import platoons as benchmark_platoons
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
@@ -103,6 +103,24 @@ def test_errors_of_leaders_are_neither_pushes_nor_errors_that_last() -> None:
     push, lasts = deviation_intervals(found)[:2]
     assert push[0] < PUSH["lin"] < push[1]
     assert lasts[0] < LASTS < lasts[1]
+
+
+def test_simulated_drivers_start_at_the_gaps_that_they_keep() -> None:
+    table = benchmark_platoons("idm", "none", 0.15, 7606, 16)
+    system = Traffic([make_law("idm")], leader="measured").double()
+    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), ["T"], pairs=0)
+    deviations = found.estimate.agents.shape
+
+    def mean_gap(sign: float) -> float:
+        """At the start, of drivers whose T deviates by one standard deviation."""
+        paths = found.model.simulated_paths(
+            found.estimate, lambda shape: np.full(shape, sign * (shape == deviations))
+        )
+        return float((paths.ahead_at_samples[0, 0] - paths.x[:, 0]).mean())
+
+    change = (mean_gap(1.0) - mean_gap(-1.0)) / (2 * found.estimate.variances.spread[0])
+    # a gap contains v T, and benchmark drivers start at the gaps that they keep
+    assert change == pytest.approx(T * found.model.paths.start[1].mean(), rel=0.2)
 
 
 def test_paths_that_are_too_short_to_show_errors_have_no_errors_of_leaders() -> None:
