@@ -102,18 +102,18 @@ def _line(text: str) -> str:
 
 
 def _blocks(text: str, placed: list[Block]) -> list[Block]:
-    found: list[Block] = []
+    blocks: list[Block] = []
     end = 0
     for match in [*_BLOCK.finditer(text), None]:
         between = text[end : match.start() if match else None].strip()
         if between:
-            found.append(Text(between))
+            blocks.append(Text(between))
         if match and match["heading"]:
-            found.append(Heading(match["heading"], len(match["level"])))
+            blocks.append(Heading(match["heading"], len(match["level"])))
         elif match:
-            found.append(placed[int(match["place"])])
+            blocks.append(placed[int(match["place"])])
         end = match.end() if match else end
-    return found
+    return blocks
 
 
 def least_cells(

@@ -62,6 +62,6 @@ def pooled_fit(
         for row in rows[:BEST]
     ]
     best = min(minima, key=lambda one: float(one.cost[0]))
-    found = dict(zip(starts[0], best.row[0].tolist(), strict=True))
-    filled(system, found)
-    return found, float(best.cost[0])
+    values = dict(zip(starts[0], best.row[0].tolist(), strict=True))
+    filled(system, values)
+    return values, float(best.cost[0])

@@ -175,15 +175,15 @@ def kept_results(
         function: of the tasks.
         fingerprint: as in :func:`run_tasks`.
     """
-    found = {}
+    results = {}
     for path in sorted((folder / KEPT).glob("*.json")):
         with suppress(OSError, ValueError, KeyError, TypeError):
             arguments = json.loads(path.read_text(encoding="utf-8"))["identity"]["arguments"]
             task = Task(path.stem, function, arguments)
             result = _kept(path, task.identity(fingerprint))
             if result is not None:
-                found[task.key] = result
-    return found
+                results[task.key] = result
+    return results
 
 
 def _kept(path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:

@@ -67,8 +67,8 @@ def attempt(call: Callable[[], Call]) -> Outcome:
     except NNodeError as error:
         return Outcome(error=str(error))
     except Exception as error:
-        found = traceback.format_exc()
-        return Outcome(error=f"{type(error).__name__}: {error}", trace=found)
+        lines = traceback.format_exc()
+        return Outcome(error=f"{type(error).__name__}: {error}", trace=lines)
 
 
 def calls_here(

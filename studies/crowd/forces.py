@@ -48,11 +48,11 @@ class Measured:
         near = torch.linalg.vector_norm(dx, dim=-1) < FAR
         near &= real[:, :, None] & real[:, None] & ~torch.eye(x.shape[1], dtype=torch.bool)
         facing = (v[:, :, None, 0] * v[:, None, :, 0])[near].numpy() < 0
-        found = dx[near].numpy(), dv[near].numpy(), facing
+        near_pairs = dx[near].numpy(), dv[near].numpy(), facing
         if len(facing) > MOST_PAIRS:
             take = np.random.default_rng(seed).choice(len(facing), MOST_PAIRS, replace=False)
-            return cls(middle, *(part[take] for part in found))
-        return cls(middle, *found)
+            return cls(middle, *(part[take] for part in near_pairs))
+        return cls(middle, *near_pairs)
 
 
 @torch.no_grad()
@@ -62,8 +62,12 @@ def accelerations(system: System, measured: Measured) -> dict[str, np.ndarray]:
     batch = measured.scenes
     state = State(torch.zeros(()), batch.x[0], batch.v[0], system.scene(batch))
     parts = interaction(system).components(state)
-    found = {name: part[batch.agent].numpy() for name, part in parts.items()}
-    return {**found, "sum": sum(found.values(), np.zeros(1)), "v": batch.v[0][batch.agent].numpy()}
+    forces = {name: part[batch.agent].numpy() for name, part in parts.items()}
+    return {
+        **forces,
+        "sum": sum(forces.values(), np.zeros(1)),
+        "v": batch.v[0][batch.agent].numpy(),
+    }
 
 
 def along_by_speed(parts: dict[str, np.ndarray]) -> pd.DataFrame:
@@ -77,9 +81,9 @@ def along_by_speed(parts: dict[str, np.ndarray]) -> pd.DataFrame:
     speed = np.abs(parts["v"][:, 0])
     table["speed"] = (np.floor(speed / SPEED_BIN) + 0.5) * SPEED_BIN
     table = table[speed < FASTEST]
-    found = table.groupby("speed").mean()
-    found["n"] = table.groupby("speed").size()
-    return found[found["n"] >= LEAST]
+    by_speed = table.groupby("speed").mean()
+    by_speed["n"] = table.groupby("speed").size()
+    return by_speed[by_speed["n"] >= LEAST]
 
 
 def slope(parts: dict[str, np.ndarray]) -> tuple[float, float]:

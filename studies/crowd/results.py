@@ -79,12 +79,12 @@ class Crowd:
 
     options: CrowdStudyOptions
     stores: dict[tuple[str, float], Store]
-    found: Any = field(default_factory=pd.DataFrame)
+    results: Any = field(default_factory=pd.DataFrame)
 
     def add(self, horizon: float, results: pd.DataFrame) -> None:
         """The results of tasks at a horizon."""
         more = results.assign(horizon=horizon)
-        self.found = pd.concat([self.found, more], ignore_index=True)
+        self.results = pd.concat([self.results, more], ignore_index=True)
 
     @property
     def scopes(self) -> list[str]:
@@ -108,12 +108,12 @@ class Crowd:
 
     def take(self, task: str, horizon: float) -> Any:
         """The rows of one function at a horizon."""
-        return self.found.query("task == @task and horizon == @horizon")
+        return self.results.query("task == @task and horizon == @horizon")
 
     def fits(self, kind: str, scope: str, horizon: float) -> Any:
         """Calibrations from all starts, least training cost first."""
-        found = self.take("fit", horizon).query("kind == @kind and scope == @scope")
-        return found.astype({"seed": int, "evaluations": int}).sort_values("J")
+        rows = self.take("fit", horizon).query("kind == @kind and scope == @scope")
+        return rows.astype({"seed": int, "evaluations": int}).sort_values("J")
 
     def best(self, kind: str, scope: str, horizon: float) -> Any:
         """The calibration of lowest training cost."""
@@ -189,15 +189,15 @@ class Crowd:
         return pd.DataFrame(rows, index=list(row)).T
 
     def _costs(self) -> pd.DataFrame:
-        found = means(self.costs(self.options.horizons[0], heldout=False), self.options.seed)
+        costs = means(self.costs(self.options.horizons[0], heldout=False), self.options.seed)
         told = pd.Series({LABELS[m]: cost for m, cost in printed.costs.items()})
         return pd.DataFrame(
             {
-                "printed (m²)": told.reindex(found.index),
-                "here (m²)": found["mean"] / self.step,
-                "here (m² s)": found["mean"],
-                "from": found["low"],
-                "to": found["high"],
+                "printed (m²)": told.reindex(costs.index),
+                "here (m²)": costs["mean"] / self.step,
+                "here (m² s)": costs["mean"],
+                "from": costs["low"],
+                "to": costs["high"],
             }
         )
 
@@ -251,7 +251,7 @@ class Crowd:
 
     def _every_parameter(self) -> pd.DataFrame:
         """All calibrations, one row per number: what is needed to compute their costs again."""
-        fits = self.found.query("task == 'fit'").astype({"seed": int})
+        fits = self.results.query("task == 'fit'").astype({"seed": int})
         values = [named(KINDS[k], row) for k, row in zip(fits["kind"], fits["row"], strict=True)]
         names = {
             "kind": "model",
@@ -336,7 +336,7 @@ class Crowd:
             for kind, every in (("sf", systems["sf"][:1]), ("nn", systems["nn"]))
         }
         speeds = {LABELS[k]: forces.along_by_speed(parts) for k, parts in self.best_parts.items()}
-        found: dict[str, Figure | ReplayBlock] = {
+        drawings: dict[str, Figure | ReplayBlock] = {
             "crowd_horizons": self._by_horizon(),
             "crowd_range": figures.forces_by_distance(curves),
             "crowd_speed": figures.acceleration_by_speed(speeds),
@@ -344,21 +344,21 @@ class Crowd:
             "replay": self._replay(),
         }
         for model, parts in PARTS.items():
-            found[f"settings_{model}"] = self._settings(model)[0]
+            drawings[f"settings_{model}"] = self._settings(model)[0]
             for part in parts:
                 for i, letter in enumerate("xy"):
                     drawn = force_contours(self.system(model, first), i, part=part)  # type: ignore[arg-type]
-                    found[f"{model}_{part}_{letter}"] = drawn
-        return found
+                    drawings[f"{model}_{part}_{letter}"] = drawn
+        return drawings
 
     def _by_horizon(self) -> Figure:
         shown = [LABELS[m] for m in ("relaxation", *MODELS, "constant_velocity", "even_pace")]
-        found = {
+        tables = {
             f"{h:g} s": means(self.costs(h, heldout=True), self.options.seed).loc[shown]
             for h in self.options.horizons
         }
         mean, low, high = (
-            pd.DataFrame({h: table[what] for h, table in found.items()})
+            pd.DataFrame({h: table[what] for h, table in tables.items()})
             for what in ("mean", "low", "high")
         )
         return horizon_costs(self.options.horizons, mean, low, high)

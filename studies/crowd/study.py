@@ -65,7 +65,7 @@ def calibrations(study: Crowd, number: int) -> list[Task]:
     """Model × part that trains × start at horizon ``number``, and what needs no calibration."""
     options, horizon = study.options, study.options.horizons[number]
     where = {"folder": study.folder("main", horizon)}
-    found = [Task(f"baselines-{horizon:g}s", tasks.baselines, where)]
+    fits = [Task(f"baselines-{horizon:g}s", tasks.baselines, where)]
     for kind in tasks.KINDS:
         for scope in study.scopes:
             count = starts(options.restarts, kind, scope, number == 0)
@@ -74,8 +74,8 @@ def calibrations(study: Crowd, number: int) -> list[Task]:
             if number:
                 before = study.fits(kind, scope, options.horizons[number - 1])
                 begin = list(zip(before["seed"], before["row"], strict=True))[:count]
-            found += [_fit(study, number, kind, scope, int(seed), row) for seed, row in begin]
-    return found
+            fits += [_fit(study, number, kind, scope, int(seed), row) for seed, row in begin]
+    return fits
 
 
 def from_walls(study: Crowd, number: int) -> list[Task]:
@@ -127,7 +127,7 @@ def evaluations(study: Crowd, number: int) -> list[Task]:
     rows = {kind: study.best(kind, ALL, horizon)["row"] for kind in tasks.KINDS}
     where: dict[str, Any] = {"folder": study.folder("main", horizon), "row": rows["sf"]}
     where |= {"draws": options.bootstrap, "seed": options.seed}
-    found = [
+    refits = [
         Task(
             f"resample-{horizon:g}s-{first}",
             tasks.resample,
@@ -137,4 +137,4 @@ def evaluations(study: Crowd, number: int) -> list[Task]:
         for first in range(0, options.bootstrap, CHUNK)
     ]
     other = {"folder": study.folder("others", horizon), "rows": rows}
-    return [*found, Task(f"transfer-{horizon:g}s", tasks.transfer, other, cost=8.0)]
+    return [*refits, Task(f"transfer-{horizon:g}s", tasks.transfer, other, cost=8.0)]

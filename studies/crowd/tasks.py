@@ -101,17 +101,17 @@ def transfer(folder: str, rows: dict[str, list[float]]) -> Result:
         rows: parameters by kind.
     """
     every = [turned(s) for s in sequences(folder)]
-    found: Result = {}
+    by_recording: Result = {}
     for recording in dict.fromkeys(s.recording for s in every):
         batch = collate(s for s in every if s.recording == recording)
-        found[recording] = {
+        by_recording[recording] = {
             "people": batch.agent.sum(1).tolist(),
             "costs": {
                 **{kind: _of(KINDS[kind], row, batch) for kind, row in rows.items()},
                 **_simple(batch),
             },
         }
-    return {"runs": found}
+    return {"runs": by_recording}
 
 
 def even_pace(batch: Batch) -> Trajectory:
@@ -133,10 +133,10 @@ def _simple(batch: Batch) -> dict[str, dict[str, float]]:
         "even_pace": even_pace,
     }
     with torch.no_grad():
-        found = {
+        costs_by_name = {
             name: _by_name(batch, sequence_costs(s(batch), batch)) for name, s in simple.items()
         }
-    return {**found, "printed": _of("sf", list(printed.parameters.values()), batch)}
+    return {**costs_by_name, "printed": _of("sf", list(printed.parameters.values()), batch)}
 
 
 def _of(model: str, row: Any, batch: Batch) -> dict[str, float]:

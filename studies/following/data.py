@@ -78,9 +78,9 @@ def batch(folder: str, test: bool = False) -> Batch:
     return collate(pairs(folder, test))
 
 
-def labels(found: Iterable[Sequence]) -> np.ndarray:
+def labels(items: Iterable[Sequence]) -> np.ndarray:
     """``(B,)`` the cluster of each sequence: those that share a vehicle."""
-    return clusters(index_of(found))
+    return clusters(index_of(items))
 
 
 def behind(platoon: Sequence) -> list[Sequence]:
@@ -90,7 +90,7 @@ def behind(platoon: Sequence) -> list[Sequence]:
     further back, as the published calibrations have it: over a quarter of an hour gaps and
     speeds of one vehicle differ by metres.
     """
-    found = []
+    followers = []
     for i in reversed(range(platoon.n_agents - 1)):
         keep = np.zeros(platoon.n_agents, dtype=bool)
         keep[[i, i + 1]] = True
@@ -98,8 +98,8 @@ def behind(platoon: Sequence) -> list[Sequence]:
         v = pair.velocity()[:, 1]
         lead = np.concatenate([v[:1] * 0, np.cumsum((v[1:] + v[:-1]) / 2 * pair.dt, axis=0)])
         x = np.stack([lead - (pair.x[:, 1] - pair.x[:, 0]), lead], 1)
-        found.append(replace(pair, name=f"{platoon.name}/{pair.agents[0]}", x=x))
-    return found
+        followers.append(replace(pair, name=f"{platoon.name}/{pair.agents[0]}", x=x))
+    return followers
 
 
 def gap_of(pair: Sequence) -> np.ndarray:

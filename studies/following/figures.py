@@ -76,18 +76,18 @@ def sides(pairs: pd.DataFrame) -> Figure:
 
 
 def profiles(
-    found: Mapping[str, Mapping[str, Sequence[float]]],
+    points: Mapping[str, Mapping[str, Sequence[float]]],
     best: Mapping[str, float],
     units: Mapping[str, str],
 ) -> Figure:
     """The rise of the cost where one parameter is held and all others are calibrated again.
 
     Args:
-        found: parameter to ``values``, ``rise``, ``low`` and ``high`` (m).
+        points: parameter to ``values``, ``rise``, ``low`` and ``high`` (m).
     """
-    figure = new_figure(2.1 * len(found), 2.5)
-    axes = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
-    for ax, (name, one) in zip(axes, found.items(), strict=True):
+    figure = new_figure(2.1 * len(points), 2.5)
+    axes = figure.subplots(1, len(points), sharey=True, squeeze=False)[0]
+    for ax, (name, one) in zip(axes, points.items(), strict=True):
         ax.fill_between(one["values"], one["low"], one["high"], color=_BLUE, alpha=0.15, lw=0)
         ax.plot(one["values"], one["rise"], "o-", color=_BLUE, markersize=3, linewidth=1.2)
         ax.axhline(0, color=GREY, linewidth=0.8)

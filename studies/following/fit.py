@@ -42,17 +42,17 @@ def calibrated(
         pooled(cost, row, weights, penalty=decay(cost), steps=STEPS, tolerance=TOLERANCE)
         for row in starts(candidate, cost, restarts, seed)
     ]
-    found = [float(fit.cost) for fit in fits]
-    return fits[int(np.argmin(found))], found
+    all_costs = [float(fit.cost) for fit in fits]
+    return fits[int(np.argmin(all_costs))], all_costs
 
 
 def named(cost: ResidualProblem, row: np.ndarray) -> dict[str, float]:
     """Parameters by name; one that a term before has as well bears its own term's before it."""
-    found: dict[str, float] = {}
+    parameters: dict[str, float] = {}
     for address, value in zip(cost.names, row, strict=True):
         name = address.split(".", 1)[1]
-        found[address if name in found else name] = float(value)
-    return found
+        parameters[address if name in parameters else name] = float(value)
+    return parameters
 
 
 def at_limits(cost: ResidualProblem, row: np.ndarray) -> list[str]:
@@ -72,7 +72,7 @@ def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int)
     fold = by_cluster(label, folds, seed)
     cost = costs_of(candidate, batch)
     others = {one: costs_of(candidate, batch, one) for one in OBJECTIVES}
-    whole, found = calibrated(candidate, cost, restarts, seed)
+    whole, start_costs = calibrated(candidate, cost, restarts, seed)
     held = {one: np.zeros(len(batch)) for one in OBJECTIVES}
     for k in range(folds):
         weights = (fold != k) / (fold != k).sum()
@@ -83,7 +83,7 @@ def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int)
         "parameters": named(cost, whole.row),
         "row": whole.row.tolist(),
         "limits": at_limits(cost, whole.row),
-        "starts": found,
+        "starts": start_costs,
         "train": {one: others[one].costs(whole.row).tolist() for one in OBJECTIVES},
         "heldout": {one: values.tolist() for one, values in held.items()},
         "clusters": label.tolist(),
@@ -108,15 +108,15 @@ def objectives(folder: str, name: str, restarts: int, seed: int) -> Result:
     """All objectives on the training pairs, whichever is minimised."""
     candidate, batch = EVERY[name], data.batch(folder)
     costs = {one: costs_of(candidate, batch, one) for one in OBJECTIVES}
-    found: Result = {}
+    by_objective: Result = {}
     for one, cost in costs.items():
         row = calibrated(candidate, cost, restarts, seed)[0].row
-        found[one] = {
+        by_objective[one] = {
             "reached": {other: float(costs[other].costs(row).mean()) for other in OBJECTIVES},
             "parameters": named(cost, row),
             "limits": at_limits(cost, row),
         }
-    return found
+    return by_objective
 
 
 def tested(folder: str, name: str, row: list[float]) -> Result:
@@ -132,10 +132,10 @@ def reproduced(folder: str) -> Result:
     batch = data.batch(folder, test=True)
     seen = batch.valid[:, :, 0].sum(0).numpy()
     first = np.sqrt((seen - 1) / seen)
-    found: Result = {}
+    errors: Result = {}
     for law, parameters in printed.parameters.items():
         for k, objective in enumerate(printed.objectives):
             values = {name: each[k] for name, each in parameters.items()}
             cost = costs_of(Candidate(law, given=published_law(law, values)), batch)
-            found[f"{law} {objective}"] = (cost.costs(cost.start) * first).tolist()
-    return found
+            errors[f"{law} {objective}"] = (cost.costs(cost.start) * first).tolist()
+    return errors

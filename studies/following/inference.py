@@ -29,9 +29,9 @@ def precision(folder: str, name: str, row: list[float]) -> Result:
     cost = costs_of(EVERY[name], batch)
     best = np.array(row)
     free = np.array([n not in at_limits(cost, best) for n in named(cost, best)])
-    found = influence(cost, best, label, free)
+    influences = influence(cost, best, label, free)
     covariance, half = np.zeros((len(best), len(best))), np.zeros(len(best))
-    covariance[np.ix_(free, free)], half[free] = found.covariance(), found.half_widths()
+    covariance[np.ix_(free, free)], half[free] = influences.covariance(), influences.half_widths()
     scale = np.sqrt(np.diag(covariance))
     scale = np.where(scale > 0, scale, 1.0)
     return {
@@ -52,7 +52,7 @@ def profile(cost: ResidualProblem, best: np.ndarray, place: int, label: np.ndarr
     """
     low, high = cost.low.copy(), cost.high.copy()
     before = cost.costs(best)
-    found: Result = {"values": [], "rise": [], "low": [], "high": []}
+    points: Result = {"values": [], "rise": [], "low": [], "high": []}
     try:
         for values in (PROFILE[: len(PROFILE) // 2][::-1], PROFILE[len(PROFILE) // 2 :]):
             start = best
@@ -64,13 +64,13 @@ def profile(cost: ResidualProblem, best: np.ndarray, place: int, label: np.ndarr
                 start = pooled(cost, row).row
                 rise = paired(cost.costs(start), before, label, seed=0)
                 for key, x in zip(
-                    found, (value, rise.difference, rise.low, rise.high), strict=True
+                    points, (value, rise.difference, rise.low, rise.high), strict=True
                 ):
-                    found[key].append(x)
+                    points[key].append(x)
     finally:
         cost.low[:], cost.high[:] = low, high
-    order = np.argsort(found["values"], kind="stable")
-    return {key: [x[i] for i in order] for key, x in found.items()}
+    order = np.argsort(points["values"], kind="stable")
+    return {key: [x[i] for i in order] for key, x in points.items()}
 
 
 def halves(
@@ -88,9 +88,9 @@ def halves(
     label = data.labels(both)
     fold = by_cluster(label, folds, seed)
     others = starts(EVERY[name], first, restarts, seed)
-    found = pooling.halves(first, second, np.array(row), others, fold)
+    results = pooling.halves(first, second, np.array(row), others, fold)
     return {
-        "names": list(named(first, found.centre)),
-        **{field: np.array(values).tolist() for field, values in vars(found).items()},
+        "names": list(named(first, results.centre)),
+        **{field: np.array(values).tolist() for field, values in vars(results).items()},
         "clusters": label.tolist(),
     }

@@ -55,16 +55,16 @@ def own_rows(
 def reproduced(folder: str) -> Result:
     """By make, the error (m) of the published parameters on the last part: ``law`` as it is
     simulated here, ``stopped`` with the published rule for collisions."""
-    found: Result = {"law": {}, "stopped": {}}
+    by_make: Result = {"law": {}, "stopped": {}}
     for pair in followers(folder, printed.platoon):
         make = pair.agents[0]
         values = printed.platoon_parameters[make]
         law = Candidate("ovm", given=published_law("ovm", values))
         last_part = pair.part(printed.first, 1.0)
         cost = costs_of(law, collate([last_part]))
-        found["law"][make] = float(cost.costs(cost.start)[0])
-        found["stopped"][make] = collided(last_part, values)
-    return found
+        by_make["law"][make] = float(cost.costs(cost.start)[0])
+        by_make["stopped"][make] = collided(last_part, values)
+    return by_make
 
 
 def collided(pair: Sequence, values: dict[str, float]) -> float:
@@ -77,7 +77,7 @@ def collided(pair: Sequence, values: dict[str, float]) -> float:
     least, (low, high) = 0.1, printed.clipped["ovm"]
     kappa, v0, s_c, w = (values[name] for name in ("kappa", "v0", "s_c", "w"))
     measured, (own, lead) = gap_of(pair), pair.velocity()[..., 0].T
-    gap, v, found = float(measured[0]), float(own[0]), [float(measured[0])]
+    gap, v, gaps = float(measured[0]), float(own[0]), [float(measured[0])]
     shift = math.tanh(s_c / w)
     for now, then in pairwise(lead):
         wish = v0 * (math.tanh((max(gap, least) - s_c) / w) + shift) / (1 + shift)
@@ -87,8 +87,8 @@ def collided(pair: Sequence, values: dict[str, float]) -> float:
         gap, v = gap + (now + then) / 2 * pair.dt - way, max(after, 0.0)
         if gap < least:
             gap, v = least, min(v, then)
-        found.append(gap)
-    return float(np.sqrt(np.mean((np.array(found) - measured) ** 2)))
+        gaps.append(gap)
+    return float(np.sqrt(np.mean((np.array(gaps) - measured) ** 2)))
 
 
 def compare(folder: str, name: str, restarts: int, seed: int) -> Result:

@@ -53,11 +53,11 @@ class Study:
 
     options: FollowingStudyOptions
     stores: dict[str, Store]
-    found: Any
+    results: Any
 
     def of(self, task: str) -> Any:
         """The results of a function that many candidates are given to, a row per candidate."""
-        return self.found.query("task == @task").set_index("name")
+        return self.results.query("task == @task").set_index("name")
 
     @property
     def names(self) -> list[str]:
@@ -103,7 +103,7 @@ class Study:
     def tables(self) -> dict[str, pd.DataFrame]:
         """By their names in the template."""
         objectives = {label: self.heldout(o).mean() for o, label in WITH_UNITS.items()}
-        found = {
+        by_name = {
             "published": self._published(),
             "candidates": self._candidates(),
             "objectives_heldout": pd.DataFrame(objectives).loc[self.order].rename_axis("candidate"),
@@ -122,12 +122,12 @@ class Study:
             "parameters": self._parameters(),
         }
         for name in self.chosen:
-            found[f"objectives_{key(name)}"] = self._objectives(name)
-            found[f"precision_{key(name)}"] = self._precision(name)
-        return found
+            by_name[f"objectives_{key(name)}"] = self._objectives(name)
+            by_name[f"precision_{key(name)}"] = self._precision(name)
+        return by_name
 
     def _published(self) -> pd.DataFrame:
-        here = self.found.loc["reproduced-pairs"]
+        here = self.results.loc["reproduced-pairs"]
         rows = {
             (law, objective): {"printed": told, "here": float(np.mean(here[f"{law} {objective}"]))}
             for law, errors in printed.errors.items()
@@ -197,16 +197,16 @@ class Study:
 
     def _equilibrium_gaps(self) -> pd.DataFrame:
         v, s = self._even_driving
-        found = {
+        gaps = {
             n: stability.equilibrium(self.systems[n], np.array(SPEEDS), self.length)
             for n in self.figured
         }
         measured = [pd.Series(s[np.abs(v - x) < 0.5]) for x in SPEEDS]
         quarters = {"measured, median": 0.5, "quarter below": 0.25, "quarter above": 0.75}
-        found |= {
+        gaps |= {
             name: np.array([each.quantile(q) for each in measured]) for name, q in quarters.items()
         }
-        return pd.DataFrame(found, index=pd.Index(SPEEDS, name="speed (m/s)"))
+        return pd.DataFrame(gaps, index=pd.Index(SPEEDS, name="speed (m/s)"))
 
     def _stability(self) -> pd.DataFrame:
         rows: dict[str, dict[str, float]] = {name: {} for name in self.systems}
@@ -220,14 +220,14 @@ class Study:
         return pd.DataFrame(rows, index=columns, dtype=float).T.rename_axis("candidate")
 
     def _drivers(self) -> pd.DataFrame:
-        one = self.found.loc["halves"]
+        one = self.results.loc["halves"]
         costs = by_unit(one[["pooled", "alone", "shrunk"]], one["clusters"])
         table = versus(costs, "pooled", self.options.seed).drop(columns=["low", "high", "p"])
         table.insert(1, "median (m)", costs.median())
         return table.rename(columns={"mean": "second half (m)"}).rename_axis("calibrated")
 
     def _spread(self) -> pd.DataFrame:
-        one = self.found.loc["halves"]
+        one = self.results.loc["halves"]
         return _by_parameter(
             one["names"],
             {
@@ -239,7 +239,7 @@ class Study:
         )
 
     def _platoon_published(self) -> pd.DataFrame:
-        again = self.found.loc["reproduced-platoon"]
+        again = self.results.loc["reproduced-platoon"]
         table = pd.DataFrame({"printed": printed.platoon_errors, "here": again["stopped"]})
         table["difference"] = table["here"] - table["printed"]
         table["the law alone"] = pd.Series(again["law"])
@@ -248,21 +248,21 @@ class Study:
 
     def _platoon(self) -> pd.DataFrame:
         """Laws by the error inside the first 70 %, and the best law of each follower."""
-        found = self.of("compare")
-        makes = found["makes"].iloc[0]
+        compared = self.of("compare")
+        makes = compared["makes"].iloc[0]
         fold: Any
         held: Any
         fold, held = (
-            pd.DataFrame(found[part].to_list(), found.index, makes)
+            pd.DataFrame(compared[part].to_list(), compared.index, makes)
             for part in ("chosen", "heldout")
         )
         table = pd.DataFrame(
             {
                 "fold": fold.mean(axis=1),
-                "first 70 %": found["train"].map(np.mean),
+                "first 70 %": compared["train"].map(np.mean),
                 "last 30 %": held.mean(axis=1),
                 **held,
-                "at a limit": found["limits"].map(lambda each: sum(map(len, each))),
+                "at a limit": compared["limits"].map(lambda each: sum(map(len, each))),
             }
         )
         best = pd.Series({make: held.loc[law, make] for make, law in fold.idxmin().items()})
@@ -276,7 +276,7 @@ class Study:
 
     def _runs(self) -> pd.DataFrame:
         """Every follower of every run by itself."""
-        one = self.found.loc["runs"]
+        one = self.results.loc["runs"]
         frame = pd.DataFrame({"run": one["runs"], "make": one["makes"]})
         frame["setting"] = [SETTINGS.get(s, s) for s in one["settings"]]
         frame["error (m)"] = one["costs"]
@@ -294,7 +294,7 @@ class Study:
         return [setting for setting in SETTINGS.values() if setting in measured]
 
     def _leaders(self) -> pd.DataFrame:
-        one = self.found.loc["leaders"]
+        one = self.results.loc["leaders"]
         rows, without = (
             {kind: np.array(one[part][kind]) for kind in leaders.KINDS}
             for part in ("rows", "without")
@@ -308,7 +308,7 @@ class Study:
         return _by_parameter(one["names"], columns)
 
     def _leaders_heldout(self) -> pd.DataFrame:
-        one = self.found.loc["leaders"]
+        one = self.results.loc["leaders"]
         costs = by_unit(one["heldout"], one["clusters"])
         parts = {}
         for kind in leaders.KINDS:
@@ -323,8 +323,8 @@ class Study:
 
     def _parameters(self) -> pd.DataFrame:
         order = list(dict.fromkeys((*self.chosen, *self.names)))
-        found = self.of("cross_validate").loc[order, ["parameters"]].rename_axis("candidate")
-        return by_number(found.reset_index(), "parameters").drop(columns="index")
+        fits = self.of("cross_validate").loc[order, ["parameters"]].rename_axis("candidate")
+        return by_number(fits.reset_index(), "parameters").drop(columns="index")
 
     # -- equilibria ----------------------------------------------------------------------------
 
@@ -377,7 +377,7 @@ class Study:
         curves = {
             n: stability.equilibrium(self.systems[n], speeds, self.length) for n in self.figured
         }
-        found: dict[str, Figure | ReplayBlock] = {
+        drawings: dict[str, Figure | ReplayBlock] = {
             "candidates": figures.errors(self.order, away, REFERENCE),
             "sides": figures.sides(self._sides()),
             "equilibria": figures.equilibria(speeds, curves, self._even_driving, self.length),
@@ -388,8 +388,10 @@ class Study:
         for name in self.profiled:
             one = self.of("precision").loc[name]
             best = dict(zip(one["names"], one["row"], strict=True))
-            found[f"profiles_{key(name)}"] = figures.profiles(one["profiles"], best, printed.units)
-        return found
+            drawings[f"profiles_{key(name)}"] = figures.profiles(
+                one["profiles"], best, printed.units
+            )
+        return drawings
 
     @property
     def profiled(self) -> list[str]:
@@ -423,7 +425,7 @@ class Study:
         """What else the template refers to."""
         train, test = self.pairs(), self.pairs(test=True)
         label = data.labels((*train, *test))
-        floor = self.found.loc["floor"]
+        floor = self.results.loc["floor"]
         tested = self.tested()
         paired = (tested[self.order[0]] - tested[REFERENCE]).std() / np.sqrt(len(tested))
         return {
@@ -442,7 +444,7 @@ class Study:
             "decay": DECAY,
             "floor": float(np.mean(floor["costs"])),
             "touched": sum(map(bool, floor["limits"])),
-            "strengths": sorted(set(self.found.loc["halves", "strengths"])),
+            "strengths": sorted(set(self.results.loc["halves", "strengths"])),
             "even": EVEN,
             "length": self.length,
             "swing": SWING,

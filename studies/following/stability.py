@@ -70,14 +70,14 @@ def equilibrium(system: System, speeds: np.ndarray, length: float) -> np.ndarray
 
     Where there are several it is the least at which the acceleration rises through 0.
     """
-    found = np.full(len(speeds), math.nan)
+    gaps = np.full(len(speeds), math.nan)
     for k, v in enumerate(speeds):
         rate = acceleration(system, GAPS, np.array(v), np.array(0.0), length)
         up = np.flatnonzero((rate[:-1] < 0) & (rate[1:] >= 0))
         if up.size:
             i = int(up[0])
-            found[k] = np.interp(0.0, rate[i : i + 2], GAPS[i : i + 2])
-    return found
+            gaps[k] = np.interp(0.0, rate[i : i + 2], GAPS[i : i + 2])
+    return gaps
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,8 @@ def slopes(system: System, gap: float, v: float, length: float) -> Slopes:
     """By central differences."""
     at = np.array([gap, v, 0.0]) + STEP * np.concatenate([np.eye(3), -np.eye(3)])
     rate = acceleration(system, at[:, 0], at[:, 1], at[:, 2], length)
-    found = (rate[:3] - rate[3:]) / (2 * STEP)
-    return Slopes(*map(float, found))
+    slope = (rate[:3] - rate[3:]) / (2 * STEP)
+    return Slopes(*map(float, slope))
 
 
 def passed(
@@ -114,19 +114,19 @@ def passed(
     z = 1j * np.asarray(frequency)
     late = (1 - z * delay / 2 + (z * delay) ** 2 / 12) / (1 + z * delay / 2 + (z * delay) ** 2 / 12)
     h = late / (1 + lag * z)
-    found = h * (slope.s - slope.dv * z) / (z**2 - h * (slope.v + slope.dv) * z + h * slope.s)
-    return np.asarray(np.abs(found))
+    gain = h * (slope.s - slope.dv * z) / (z**2 - h * (slope.v + slope.dv) * z + h * slope.s)
+    return np.asarray(np.abs(gain))
 
 
 def lateness(system: System) -> dict[str, float]:
     """``lag`` and ``delay`` of a model's effects, s."""
-    found = {"lag": 0.0, "delay": 0.0}
+    late = {"lag": 0.0, "delay": 0.0}
     for term in system.terms:
         if term.name == "inertia":
-            found["lag"] = float(term.get_parameter("tau_v").detach())
+            late["lag"] = float(term.get_parameter("tau_v").detach())
         elif term.name == "reaction_delay":
-            found["delay"] = float(term.get_parameter("T").detach())
-    return found
+            late["delay"] = float(term.get_parameter("T").detach())
+    return late
 
 
 def platoon(
@@ -161,10 +161,10 @@ def platoon(
         v=speed[..., None],
         length=np.full(followers + 1, length),
     )
-    found = FusedSolver()(system, collate([sequence]))
-    assert found.v is not None
+    simulated = FusedSolver()(system, collate([sequence]))
+    assert simulated.v is not None
     last = slice(3 * len(time) // 4, None)
-    swing = found.v[last, 0, :, 0].detach().numpy()[:, ::-1]
+    swing = simulated.v[last, 0, :, 0].detach().numpy()[:, ::-1]
     wave = np.exp(-1j * frequency * time[last])
     # the part at the leader's frequency, by least squares on sine and cosine
     basis = np.stack([wave.real, wave.imag, np.ones(len(wave))], -1)

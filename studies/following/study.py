@@ -44,7 +44,7 @@ def run(options: FollowingStudyOptions, folder: Path) -> list[Block]:
 
     study = Study(options, prepared, run_all(training(options, prepared), "cross-validation"))
     more = run_all(after(study), "test, precision, platoons")
-    study.found = pd.concat([study.found, more])
+    study.results = pd.concat([study.results, more])
     return page("following", study.tables(), study.figures(), prepared.values(), **study.values())
 
 

@@ -60,19 +60,19 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
         for law in list(PEOPLE)[: 1 if options.quick else None]:
             one = {"law": law, "desired": "direction", **where}
             every.append(Task(f"{law}-{name}", walking.fit, one, cost=10.0))
-    found = computed(every, folder, options, prepared, "prediction study")
-    distances = errors_by_run(found.query("task != 'follow'"), SIMPLE | PEOPLE)
-    tables = {"following": _following(found, options.seed)}
+    results = computed(every, folder, options, prepared, "prediction study")
+    distances = errors_by_run(results.query("task != 'follow'"), SIMPLE | PEOPLE)
+    tables = {"following": _following(results, options.seed)}
     tables |= {what: _by_scene(distances, what) for what in ("ade", "fde")}
     people = distances.groupby("run", sort=False)["people"].first().to_dict()
     times = {"people": people, "seen": SEEN, "ahead": AHEAD, "step": STEP}
     return page("prediction", tables, {}, prepared.values(), **times)
 
 
-def _following(found: pd.DataFrame, seed: int) -> pd.DataFrame:
+def _following(results: pd.DataFrame, seed: int) -> pd.DataFrame:
     """Errors of spacings by law, published ones last."""
     rows: dict[str, dict[str, Any]] = {}
-    for one in found.query("task == 'follow'").to_dict("records"):
+    for one in results.query("task == 'follow'").to_dict("records"):
         test = one["test"]
         clusters = np.arange(len(test["error"]))
         weights = group_weights(clusters, DRAWS, np.random.default_rng(seed))

@@ -106,10 +106,10 @@ class Problem:
         """
         coarse, fine = self.cost(COARSE, torch.float32), self.cost(dt, torch.float32)
         low, high = coarse.low, coarse.high
-        found = minimise(coarse, starts, low, high, iterations=iterations)
-        judged = fine.costs(found.rows).mean(1)
+        coarse_minima = minimise(coarse, starts, low, high, iterations=iterations)
+        judged = fine.costs(coarse_minima.rows).mean(1)
         best = judged.argsort()[:FOLLOWED]
-        near = minimise(fine, found.rows[best], low, high, iterations=iterations // 2)
+        near = minimise(fine, coarse_minima.rows[best], low, high, iterations=iterations // 2)
         exact = self.cost(dt, torch.float64)
         last = near.rows[[near.best]]
         return minimise(exact, last, low, high, iterations=iterations // 2), judged
@@ -126,21 +126,21 @@ class Problem:
         weights = (kept / kept.sum(1, keepdim=True)).repeat_interleave(len(starts), 0)
         coarse, fine = self.cost(COARSE, torch.float32), self.cost(dt, torch.float32)
         low, high = coarse.low, coarse.high
-        found = minimise(
+        coarse_minima = minimise(
             lambda r: coarse(r, weights),
             starts.repeat(number, 1),
             low,
             high,
             iterations=iterations,
         )
-        each = fine.costs(found.rows)
+        each = fine.costs(coarse_minima.rows)
         judged = torch.where(weights > 0, each * weights, 0.0).sum(1).reshape(number, -1)
         few = min(FOLLOWED // 2, len(starts))
         best = judged.argsort(1)[:, :few] + len(starts) * torch.arange(number)[:, None]
         chosen = best.flatten()
         near = minimise(
             lambda r: fine(r, weights[chosen]),
-            found.rows[chosen],
+            coarse_minima.rows[chosen],
             low,
             high,
             iterations=iterations // 2,

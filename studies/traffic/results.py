@@ -46,14 +46,14 @@ def side_by_side(ours: Any, theirs: Any) -> Any:
     """Our rows, the printed ones and the differences, one under the other by model."""
     theirs = theirs.loc[ours.index, ours.columns]
     parts = {"here": ours, "printed": theirs, "difference": ours - theirs}
-    found = pd.concat(parts, names=["", "model"]).swaplevel()
-    return found.reindex([(model, part) for model in ours.index for part in parts])
+    stacked = pd.concat(parts, names=["", "model"]).swaplevel()
+    return stacked.reindex([(model, part) for model in ours.index for part in parts])
 
 
 def as_printed(table: dict[str, Any], averages: dict[str, float]) -> Any:
     """A table of the paper: a row per model, a column per recording, the averages as printed."""
-    found = pd.DataFrame(table, index=list(printed.recordings)).T
-    return found.assign(**{AVERAGE: pd.Series(averages)})
+    rows = pd.DataFrame(table, index=list(printed.recordings)).T
+    return rows.assign(**{AVERAGE: pd.Series(averages)})
 
 
 @dataclass
@@ -62,24 +62,24 @@ class Study:
 
     options: TrafficStudyOptions
     stores: dict[str, Store]
-    found: Any
+    results: Any
 
     def __post_init__(self) -> None:
         policy = {str(store.folder): name for name, store in self.stores.items()}
-        boxed = self.found["box"].notna()
-        self.found = self.found.assign(
-            faults=self.found["folder"].map(policy),
-            recording=self.found["recording_name"],
+        boxed = self.results["box"].notna()
+        self.results = self.results.assign(
+            faults=self.results["folder"].map(policy),
+            recording=self.results["recording_name"],
             boxed=boxed,
-            law=self.found["model"] + np.where(boxed, "-box", ""),
+            law=self.results["model"] + np.where(boxed, "-box", ""),
         )
 
     def take(self, value: str, task: str = "fit", faults: str = "keep", box: bool = False) -> Any:
         """One result of every task of a kind: a row per model, a column per recording."""
-        chosen = self.found.query("task == @task and faults == @faults and boxed == @box")
-        found = chosen.pivot(index="model", columns="recording", values=value)
-        rows = [m for m in MODELS if m in found.index]
-        return found.loc[rows, [r for r in printed.recordings if r in found.columns]]
+        chosen = self.results.query("task == @task and faults == @faults and boxed == @box")
+        pivoted = chosen.pivot(index="model", columns="recording", values=value)
+        rows = [m for m in MODELS if m in pivoted.index]
+        return pivoted.loc[rows, [r for r in printed.recordings if r in pivoted.columns]]
 
     def costs(self, task: str = "fit", faults: str = "keep", box: bool = False) -> Any:
         """Calibrated cost (m² s), and the average over recordings."""
@@ -94,15 +94,17 @@ class Study:
     @cached_property
     def heldout(self) -> dict[str, pd.DataFrame]:
         """By treatment of faults, a column of held-out costs (m² s) per model and baseline."""
-        every = self.found.query("task == 'cross_validate'").dropna(subset="groups")
+        every = self.results.query("task == 'cross_validate'").dropna(subset="groups")
         every = every.explode(["costs", "groups", *tasks.BASELINES])
-        found = {}
+        by_faults = {}
         for faults, part in every.groupby("faults"):
             columns = {str(law): rows["costs"] for law, rows in part.groupby("law", sort=False)}
             lin = part[part["law"] == "lin"]
             columns |= {name: lin[name] for name in tasks.BASELINES}
-            found[str(faults)] = by_unit(columns, lin["recording"] + " " + lin["groups"].map(str))
-        return found
+            by_faults[str(faults)] = by_unit(
+                columns, lin["recording"] + " " + lin["groups"].map(str)
+            )
+        return by_faults
 
     # -- tables ------------------------------------------------------------------------------
 
@@ -176,10 +178,10 @@ class Study:
         here = ours.drop(columns=AVERAGE).stack()
         table = pd.DataFrame({"printed": theirs.stack().reindex(here.index), "here": here})
         table = table[table["printed"] <= table["here"] - 0.005]
-        again = "before" in self.found
+        again = "before" in self.results
         table["first search"] = self.take("before").stack() if again else np.nan
         table["best tenth of starts"] = self.take("starts").stack().map(itemgetter(1))
-        scans = self.found.query("task == 'scan'").set_index(["model", "recording"])
+        scans = self.results.query("task == 'scan'").set_index(["model", "recording"])
         table["grid"] = scans["cost"]
         table["grid, printed L"] = pd.Series(
             {
@@ -193,15 +195,18 @@ class Study:
 
     def _speeds_by_gap(self, box: bool) -> dict[str, pd.DataFrame]:
         """By recording, a column of speeds (m/s) per model."""
-        found = self.take("speeds")
+        by_recording = self.take("speeds")
         if box:
-            found.update(self.take("speeds", box=True))
-        return {str(n): pd.DataFrame(dict(found[n]), index=list(GAPS)) for n in found.columns}
+            by_recording.update(self.take("speeds", box=True))
+        return {
+            str(n): pd.DataFrame(dict(by_recording[n]), index=list(GAPS))
+            for n in by_recording.columns
+        }
 
     def _laws(self) -> pd.DataFrame:
-        found = pd.concat(self._speeds_by_gap(False), names=["recording", "gap"])
-        shown = found.index.get_level_values("gap") == 20.0
-        return pd.concat([found[shown], found[~shown]])
+        speeds = pd.concat(self._speeds_by_gap(False), names=["recording", "gap"])
+        shown = speeds.index.get_level_values("gap") == 20.0
+        return pd.concat([speeds[shown], speeds[~shown]])
 
     def _heldout(self) -> pd.DataFrame:
         parts = {
@@ -215,17 +220,17 @@ class Study:
             )
             for faults, costs in self.heldout.items()
         }
-        found = pd.concat(parts, names=["faults", "model"])
+        stacked = pd.concat(parts, names=["faults", "model"])
         order = [*tasks.BASELINES, *LAWS, *(m + s for m in NETWORKS for s in ("-box", ""))]
-        return found.reindex([(f, m) for f in ("keep", "drop") for m in order])
+        return stacked.reindex([(f, m) for f in ("keep", "drop") for m in order])
 
     def _significance(self) -> pd.DataFrame:
         models = [*LAWS, *(m + "-box" for m in NETWORKS), "no_interaction"]
-        found = differences(self.heldout["keep"], combinations(models, 2), self.options.seed)
-        found = found.assign(**{"first is better (%)": 100 * found.pop("better")})
-        found.index = pd.Index([" − ".join(pair) for pair in found.index], name="pair")
-        corrected = holm(dict(zip(map(str, found.index), found["p"], strict=True)))
-        return found.assign(**{"p, Holm": list(corrected.values())})
+        pairs = differences(self.heldout["keep"], combinations(models, 2), self.options.seed)
+        pairs = pairs.assign(**{"first is better (%)": 100 * pairs.pop("better")})
+        pairs.index = pd.Index([" − ".join(pair) for pair in pairs.index], name="pair")
+        corrected = holm(dict(zip(map(str, pairs.index), pairs["p"], strict=True)))
+        return pairs.assign(**{"p, Holm": list(corrected.values())})
 
     def _optimizers(self) -> pd.DataFrame:
         start = self.take("history", "descend").map(lambda h: h[0][1]).mean(axis=1)
@@ -238,11 +243,11 @@ class Study:
 
     def _steps(self) -> pd.DataFrame:
         steps, costs = self.take("steps_costs"), self.take("cost")
-        found = {}
+        changes = {}
         for step in sorted(map(float, steps.iloc[0, 0]), reverse=True):
             ratio = steps.map(lambda s, h=step: s[f"{h:g}"]) / costs
-            found[f"{step:g} s"] = 100 * (ratio.astype(float).median(axis=1) - 1)
-        return pd.DataFrame(found)
+            changes[f"{step:g} s"] = 100 * (ratio.astype(float).median(axis=1) - 1)
+        return pd.DataFrame(changes)
 
     @cached_property
     def by_sequence(self) -> pd.DataFrame:
@@ -291,7 +296,7 @@ class Study:
 
     def _parameters(self) -> pd.DataFrame:
         optimizers = {"fit": "bfgs", "descend": "adadelta"}
-        fits = self.found.dropna(subset="parameters")
+        fits = self.results.dropna(subset="parameters")
         fits = fits.assign(optimizer=fits["task"].map(optimizers), J=fits["cost"])
         names = ["optimizer", "faults", "recording", "model", "box"]
         table = by_number(fits[[*names, "parameters", "J"]], "parameters")
@@ -320,7 +325,7 @@ class Study:
         """Simulations, and the average cost above the least known, of the better run."""
         history, costs = self.take("history", "descend"), self.costs()
         least = np.minimum(costs, self.costs("descend")).drop(columns=AVERAGE)
-        found = {}
+        curves = {}
         for model in MODELS:
             each = [
                 np.array(h)[:, 1] - c
@@ -328,8 +333,8 @@ class Study:
             ]
             count = np.array(history.loc[model].iloc[0])[:, 0] * GRADIENT * 2
             above = np.mean(each, axis=0).clip(min=1e-6)
-            found[model] = np.stack([np.maximum(count, 1), above], 1)
-        return found
+            curves[model] = np.stack([np.maximum(count, 1), above], 1)
+        return curves
 
     @property
     def dominating(self) -> str:
@@ -344,8 +349,8 @@ class Study:
         for model in SPLIT:
             system = system_of(model, self.take("parameters").loc[model, name])
             with torch.no_grad():
-                found = FusedSolver(self.options.dt)(system, collate([sequence]))
-            simulated[model] = found.x[:, 0, :, 0].numpy()
+                run = FusedSolver(self.options.dt)(system, collate([sequence]))
+            simulated[model] = run.x[:, 0, :, 0].numpy()
         marked = [
             (int(agent), float(fault["time"]))
             for fault in self.stores["keep"].manifest["faults"]

@@ -53,14 +53,14 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
             )
     stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
     every = list(_tasks(options, stores))
-    found = computed(every, folder, options, stores, "traffic study")
-    again = {} if options.quick else wider(every, found["cost"])
+    results = computed(every, folder, options, stores, "traffic study")
+    again = {} if options.quick else wider(every, results["cost"])
     if again:
         more = computed(list(again.values()), folder, options, stores, "wider search")
-        more = more.set_axis(list(again)).assign(before=found["cost"])
+        more = more.set_axis(list(again)).assign(before=results["cost"])
         more = more[more["cost"] < more["before"]]
-        found = pd.concat([found.drop(more.index), more]).loc[found.index]
-    study = Study(options, stores, found)
+        results = pd.concat([results.drop(more.index), more]).loc[results.index]
+    study = Study(options, stores, results)
     return page("traffic", study.tables(), study.figures(), [stores["keep"]], **study.values())
 
 

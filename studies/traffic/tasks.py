@@ -46,14 +46,14 @@ def fit(
     """
     sequences = recording(folder, recording_name)
     problem = Problem(sequences, model, box)
-    found, judged = problem.search(problem.starts(restarts, seed), dt, iterations)
+    minima, judged = problem.search(problem.starts(restarts, seed), dt, iterations)
     cost = problem.cost(dt, torch.float64)
-    best = found.rows[found.best]
-    residual = optimality_residual(found.rows, found.costs, found.gradients, cost.low, cost.high)[
-        found.best
-    ]
+    best = minima.rows[minima.best]
+    residual = optimality_residual(
+        minima.rows, minima.costs, minima.gradients, cost.low, cost.high
+    )[minima.best]
     result: Result = {
-        "cost": float(found.costs[found.best]),
+        "cost": float(minima.costs[minima.best]),
         "costs": cost.costs(best[None])[0].tolist(),
         "groups": groups(folder, recording_name).tolist(),
         "parameters": named(cost, best),
@@ -69,7 +69,7 @@ def fit(
         rng = np.random.default_rng(seed)
         weights = torch.from_numpy(group_weights(groups(folder, recording_name), bootstrap, rng))
         result["bootstrap"] = _bootstrap(
-            problem, best, found.inverses[found.best], weights, dt, iterations // 3
+            problem, best, minima.inverses[minima.best], weights, dt, iterations // 3
         )
     return result
 

@@ -37,7 +37,7 @@ def measured_before(folder: str) -> list[Sequence]:
 
 def chosen(folders: Iterable[str], held: Iterable[str], *, test: bool) -> list[Batch]:
     """The sequences of some runs, or of all others, as one batch of each experiment."""
-    found, runs = [], set(held)
+    batches, runs = [], set(held)
     for folder in folders:
         mine = [s for s in measured_before(folder) if (s.recording in runs) == test]
         if mine:
@@ -46,5 +46,5 @@ def chosen(folders: Iterable[str], held: Iterable[str], *, test: bool) -> list[B
             # people who were not measured before are there for the others, but nothing is
             # asked of them
             known = batch.preferred.isfinite().all(-1)
-            found.append(replace(batch, valid=batch.valid & known))
-    return found
+            batches.append(replace(batch, valid=batch.valid & known))
+    return batches

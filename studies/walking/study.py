@@ -59,8 +59,8 @@ def run(options: WalkingStudyOptions, folder: Path) -> list[Block]:
         }
         folders = [str(store.folder) for store in stores.values()]
         every, title = _tasks(options, horizon, folders), f"walking study, {horizon:g} s"
-        found = computed(every, folder, options, stores, title)
-        parts.append(found.assign(horizon=horizon))
+        results = computed(every, folder, options, stores, title)
+        parts.append(results.assign(horizon=horizon))
     study = Walking(options, pd.concat(parts))
     figures = {f"walking_{desired}": study.figure(desired) for desired in DESIRED}
     return page(
@@ -86,18 +86,18 @@ def _tasks(options: WalkingStudyOptions, horizon: float, folders: list[str]) -> 
     return every
 
 
-def errors_by_run(found: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
+def errors_by_run(task_results: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
     """A row per law and held-out run in which somebody is predicted.
 
     Args:
-        found: results of :mod:`studies.walking.tasks`.
+        task_results: results of :mod:`studies.walking.tasks`.
         labels: of the laws.
 
     Returns:
         ``law``, ``run``, ``people``, and their mean errors, see :func:`studies.walking.tasks.fit`.
     """
     rows = []
-    for one in found.to_dict("records"):
+    for one in task_results.to_dict("records"):
         fitted = one["task"] == "fit"
         laws = {one["law"]: one["errors"]} if fitted else {name: one[name] for name in SIMPLE}
         rows += [
@@ -114,14 +114,14 @@ class Walking:
     """Options, and a row of results per task."""
 
     options: WalkingStudyOptions
-    found: Any
+    results: Any
 
     def costs(self, desired: str, horizon: float, what: str = "mean") -> pd.DataFrame:
         """A row per person of every run, a column per law: m²."""
-        found = self.found.query("horizon == @horizon")
-        chosen = found.query("desired == @desired")
+        at_horizon = self.results.query("horizon == @horizon")
+        chosen = at_horizon.query("desired == @desired")
         if desired == DESIRED[0]:
-            chosen = pd.concat([chosen, found.query("task == 'baselines'")])
+            chosen = pd.concat([chosen, at_horizon.query("task == 'baselines'")])
         table: Any = errors_by_run(chosen, LABELS).pivot(index="run", columns="law")
         table = table.loc[table.index.repeat(table["people"].iloc[:, 0])][what]
         order = [label for label in LABELS.values() if label in table]
@@ -130,17 +130,17 @@ class Walking:
     def means(self, desired: str, what: str = "mean") -> pd.DataFrame:
         """Mean cost (m²) by law and horizon."""
         horizons = self.options.horizons
-        found = {f"{h:g} s": self.costs(desired, h, what).mean() for h in horizons}
-        return pd.DataFrame(found).rename_axis(None)
+        by_horizon = {f"{h:g} s": self.costs(desired, h, what).mean() for h in horizons}
+        return pd.DataFrame(by_horizon).rename_axis(None)
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """By their names in the template."""
-        found = {"walking_parameters": self._parameters()}
+        by_name = {"walking_parameters": self._parameters()}
         for desired in DESIRED:
-            found[f"walking_{desired}"] = self.means(desired)
-            found[f"walking_{desired}_end"] = self.means(desired, "end")
-            found[f"walking_{desired}_differences"] = self.differences(desired)
-        return found
+            by_name[f"walking_{desired}"] = self.means(desired)
+            by_name[f"walking_{desired}_end"] = self.means(desired, "end")
+            by_name[f"walking_{desired}_differences"] = self.differences(desired)
+        return by_name
 
     def differences(self, desired: str) -> Any:
         """Of every model from no interaction, by horizon; runs are what is resampled."""
@@ -149,8 +149,8 @@ class Walking:
             costs, alone = self.costs(desired, h), LABELS["alone"]
             pairs = [(str(law), alone) for law in costs if law != alone]
             parts[h] = differences(costs, pairs, self.options.seed).droplevel("second")
-        found: Any = pd.concat(parts, names=["horizon (s)", "model"]).drop(columns="better")
-        return found.reset_index("horizon (s)").sort_index(
+        stacked: Any = pd.concat(parts, names=["horizon (s)", "model"]).drop(columns="better")
+        return stacked.reset_index("horizon (s)").sort_index(
             kind="stable", key=lambda laws: [list(LABELS.values()).index(law) for law in laws]
         )
 
@@ -166,7 +166,7 @@ class Walking:
         return horizon_costs(horizons, mean, low, high)
 
     def _parameters(self) -> pd.DataFrame:
-        fits = self.found.query("task == 'fit'")
+        fits = self.results.query("task == 'fit'")
         table = pd.DataFrame(
             {
                 "model": fits["law"].map(LABELS),
@@ -189,7 +189,7 @@ class Walking:
         complete = [s for s in seen if np.isfinite(np.array(s.preferred)).all()]
         mean = self.costs(desired, horizon).mean()
         best = min(list(LAWS)[1:], key=lambda law: mean[LABELS[law]])
-        rows = self.found["row"]
+        rows = self.results["row"]
         systems = {
             LABELS[law]: filled(new_system(law, desired), rows[f"{law}-{desired}-{horizon:g}s-0"])
             for law in ("alone", best)

@@ -77,16 +77,16 @@ def straight(batch: Batch, velocity: Tensor) -> Tensor:
 def _errors(x: Predict, batches: list[Batch]) -> Result:
     """Means over people, over a sequence and at its end: of squared distances (m²) as ``mean`` and
     ``end``, of distances (m) as ``ade`` and ``fde``."""
-    found: dict[str, list[Tensor]] = {name: [] for name in ("mean", "end", "ade", "fde")}
+    errors: dict[str, list[Tensor]] = {name: [] for name in ("mean", "end", "ade", "fde")}
     for batch in batches:
         square = (x(batch) - batch.x).square().sum(-1)
         people = batch.valid[0]
         samples = batch.valid[1:].sum(0).clamp(min=1)
         last = batch.valid.sum(0).clamp(min=1) - 1
         for of, at_end, values in (("mean", "end", square), ("ade", "fde", square.sqrt())):
-            found[of].append(((values[1:] * batch.valid[1:]).sum(0) / samples)[people])
-            found[at_end].append(values.gather(0, last[None])[0][people])
+            errors[of].append(((values[1:] * batch.valid[1:]).sum(0) / samples)[people])
+            errors[at_end].append(values.gather(0, last[None])[0][people])
     if not batches:
-        return {"people": 0, **dict.fromkeys(found, 0.0)}
-    means = {name: float(torch.cat(parts).mean()) for name, parts in found.items()}
-    return {"people": sum(map(len, found["mean"])), **means}
+        return {"people": 0, **dict.fromkeys(errors, 0.0)}
+    means = {name: float(torch.cat(parts).mean()) for name, parts in errors.items()}
+    return {"people": sum(map(len, errors["mean"])), **means}

@@ -223,6 +223,7 @@ def test_people_are_trained(copy: Script, law: str, tmp_path: Path) -> None:
     assert ("waves.c" in result["summary"]) is (law == "polite")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("effect", "strength", "value", "given"),
     [

@@ -181,6 +181,7 @@ def test_resume_refuses_another_problem(script: Script, traffic: Path, tmp_path:
     assert os.path.exists(last)
 
 
+@pytest.mark.thorough
 def test_resuming_and_evaluating_can_be_swept(
     script: Script, traffic: Path, tmp_path: Path
 ) -> None:

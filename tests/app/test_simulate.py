@@ -68,6 +68,7 @@ def test_wrong_options_are_refused_at_once(
     assert "noise of idm" not in done.stdout
 
 
+@pytest.mark.thorough
 def test_in_python_it_is_an_object(simulated: nnode.Simulated, tmp_path: Path) -> None:
     drives = table(10, 10.0)
     run = nnode.fit(drives, "traffic", model="idm", epochs=2, drivers="none")

@@ -127,6 +127,7 @@ def python(printed: str) -> str:
     return "\n".join(one.removeprefix("  ") for one in rest if not one.startswith("page: "))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("form", "number"), CASES)
 def test_commands_and_python_that_are_printed_run(
     script: Script, tmp_path: Path, form: Form, number: int | None

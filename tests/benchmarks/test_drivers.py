@@ -60,6 +60,7 @@ def test_laws_are_compared_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert row["p second"] < row["p true"] == 1.0
 
 
+@pytest.mark.thorough
 def test_calibrations_are_scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     size = ["--laws", "lin", "--cases", "1", "--platoons", "8", "--vehicles", "3"]
     (row,) = run(monkeypatch, tmp_path / "table.csv", "--calibrate", *size).to_dict("records")

@@ -54,6 +54,7 @@ def test_the_true_law_comes_first(true: str) -> None:
     assert first[name] == pytest.approx(parameters[name], rel=0.15)
 
 
+@pytest.mark.thorough
 def test_laws_are_compared_with_drivers_who_differ() -> None:
     """With one parameter for all drivers, laws that imitate differences came first."""
     sequences = list(nnode.sequences(drivers.platoons("idm", "none", 0.15, 6011, number=10)))

@@ -153,9 +153,8 @@ def test_a_model_with_a_memory_starts_where_it_is(sequences: list[Sequence]) -> 
     assert ParameterVector(found).row.tolist() == ParameterVector(system).row.tolist()
 
 
-@pytest.mark.parametrize(
-    "leader", ["measured", pytest.param("constant", marks=pytest.mark.thorough)]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("leader", ["measured", "constant"])
 def test_curves(sequences: list[Sequence], leader: str) -> None:
     system = model(LIN, leader, ("relative_speed",))
     for variable in TrafficEngine(sequences).variables():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 
 import numpy as np
+import pytest
 import torch
 
 import nnode
@@ -18,6 +19,7 @@ from nnode.model.build import build_model
 from nnode.population.followers import PAIRS
 
 
+@pytest.mark.thorough
 def test_bias_is_that_of_calibrations_to_paths_simulated_by_the_model() -> None:
     table = platoons("lin", "multi_anticipation", 0.15, 4, number=20)
     engine = FollowersEngine(list(nnode.sequences(table)))

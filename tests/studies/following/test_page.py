@@ -138,7 +138,7 @@ def study(monkeypatch: pytest.MonkeyPatch) -> Study:
         return tidy([task for task in tasks if task.key in results], results)
 
     found = Study(options, stores, done(training(options, stores)))
-    found.found = pd.concat([found.found, done(after(found))])
+    found.results = pd.concat([found.results, done(after(found))])
     return found
 
 
