@@ -4,11 +4,11 @@ Every case is ``--platoons`` platoons of ``--vehicles`` vehicles for 30 s at 5 H
 ``idm`` or ``fvdm``, in which one effect is hidden or none, or two with ``--pairs``. Drivers'
 parameters are log-normal (``lin``: v0; ``idm``: T and v0; ``fvdm``: s_c and v0) with a standard
 deviation of ``--spread`` %, pushes last 4 s, and positions are measured with errors of ``--error``
-m. ``--nature`` departs from this. Paths are integrated here by Euler's method; everything else is
-the package's public interface. The cases of a run are fixed by its seed. The table has a row per
-case; the last lines count right and false answers, with exact intervals of 95 %. ``--compare`` only
-compares laws. ``--calibrate`` only calibrates, with nothing hidden; the last lines count intervals
-that contain the true value.
+m. ``--nature`` departs from this. With ``--nothing``, nothing is hidden in any case. Paths are
+integrated here by Euler's method; everything else is the package's public interface. The cases of a
+run are fixed by its seed. The table has a row per case; the last lines count right and false
+answers, with exact intervals of 95 %. ``--compare`` only compares laws. ``--calibrate`` only
+calibrates, with nothing hidden; the last lines count intervals that contain the true value.
 """
 
 from __future__ import annotations
@@ -362,6 +362,7 @@ def main() -> None:
     parser.add_argument("--pairs", action="store_true", help="two effects at once")
     parser.add_argument("--compare", action="store_true", help="only compare laws")
     parser.add_argument("--calibrate", action="store_true", help="only calibrate, nothing hidden")
+    parser.add_argument("--nothing", action="store_true", help="nothing hidden in any case")
     parser.add_argument("--nature", default="plain", choices=NATURES)
     parser.add_argument("--laws", nargs="+", default=["lin", "idm"], choices=list(HIDDEN))
     parser.add_argument("--processes", type=int, default=2)
@@ -379,7 +380,7 @@ def main() -> None:
         nature=given.nature,
     )
     work = calibrated if given.calibrate else compared if given.compare else diagnosed
-    if given.calibrate:
+    if given.calibrate or given.nothing:
         chosen = [case | {"effect": "none"} for case in chosen]
     tasks = [Task(f"{case['law']}-{case['effect']}-s{case['seed']}", work, case) for case in chosen]
     folder = given.table.with_suffix("")

@@ -48,6 +48,10 @@ def test_rows_are_scored_and_kept(
     assert rows["speed_zone"].tolist()[1:] == [0.88]
     assert rows["speed_zone covered"].tolist()[1:] == [covered]
     assert rows["v0 covered"].isna().all()
+    assert run(monkeypatch, tmp_path / "nothing.csv", "--nothing", *size)["effect"].tolist() == [
+        "none",
+        "none",
+    ]
 
 
 def test_laws_are_compared_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
