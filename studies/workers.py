@@ -67,8 +67,8 @@ def attempt(call: Callable[[], Call]) -> Outcome:
     except NNodeError as error:
         return Outcome(error=str(error))
     except Exception as error:
-        lines = traceback.format_exc()
-        return Outcome(error=f"{type(error).__name__}: {error}", trace=lines)
+        text = f"{type(error).__name__}: {error}"
+        return Outcome(error=text, trace=traceback.format_exc())
 
 
 def calls_here(

@@ -110,10 +110,16 @@ class Crowd:
         """The rows of one function at a horizon."""
         return self.results.query("task == @task and horizon == @horizon")
 
+    @property
+    def every_fit(self) -> Any:
+        """All calibrations. Beside rows of other tasks, pandas keeps whole numbers as floats."""
+        fits = self.results.query("task == 'fit'")
+        return fits.astype({"seed": int, "evaluations": int})
+
     def fits(self, kind: str, scope: str, horizon: float) -> Any:
-        """Calibrations from all starts, least training cost first."""
-        rows = self.take("fit", horizon).query("kind == @kind and scope == @scope")
-        return rows.astype({"seed": int, "evaluations": int}).sort_values("J")
+        """Calibrations from all starts, lowest training cost first."""
+        chosen = "kind == @kind and scope == @scope and horizon == @horizon"
+        return self.every_fit.query(chosen).sort_values("J")
 
     def best(self, kind: str, scope: str, horizon: float) -> Any:
         """The calibration of lowest training cost."""
@@ -251,7 +257,7 @@ class Crowd:
 
     def _every_parameter(self) -> pd.DataFrame:
         """All calibrations, one row per number: what is needed to compute their costs again."""
-        fits = self.results.query("task == 'fit'").astype({"seed": int})
+        fits = self.every_fit
         values = [named(KINDS[k], row) for k, row in zip(fits["kind"], fits["row"], strict=True)]
         names = {
             "kind": "model",

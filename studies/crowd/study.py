@@ -45,7 +45,7 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
     for number, horizon in enumerate(options.horizons):
         for what, make in (
             ("calibration", calibrations),
-            ("networks that begin at the one of the walls", from_walls),
+            ("both networks from the one of the walls", from_walls),
             ("intervals, other runs", evaluations),
         ):
             title = f"crowd study, {horizon:g} s: {what}"
@@ -65,7 +65,7 @@ def calibrations(study: Crowd, number: int) -> list[Task]:
     """Model × part that trains × start at horizon ``number``, and what needs no calibration."""
     options, horizon = study.options, study.options.horizons[number]
     where = {"folder": study.folder("main", horizon)}
-    fits = [Task(f"baselines-{horizon:g}s", tasks.baselines, where)]
+    every = [Task(f"baselines-{horizon:g}s", tasks.baselines, where)]
     for kind in tasks.KINDS:
         for scope in study.scopes:
             count = starts(options.restarts, kind, scope, number == 0)
@@ -74,8 +74,8 @@ def calibrations(study: Crowd, number: int) -> list[Task]:
             if number:
                 before = study.fits(kind, scope, options.horizons[number - 1])
                 begin = list(zip(before["seed"], before["row"], strict=True))[:count]
-            fits += [_fit(study, number, kind, scope, int(seed), row) for seed, row in begin]
-    return fits
+            every += [_fit(study, number, kind, scope, seed, row) for seed, row in begin]
+    return every
 
 
 def from_walls(study: Crowd, number: int) -> list[Task]:

@@ -17,7 +17,9 @@ from tests.studies.crowd.corridor import DT
 
 @pytest.fixture(scope="module")
 def blocks(tmp_path_factory: pytest.TempPathFactory) -> list[Block]:
-    options = CrowdStudyOptions(workers=1, restarts=2, horizons=[2.0, 1.0], bootstrap=20)
+    options = CrowdStudyOptions(
+        workers=1, restarts=invented.RESTARTS, horizons=[2.0, 1.0], bootstrap=20
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(crowd, "prepared", invented.store)
         for name in ("fit", "resample", "baselines", "transfer"):
