@@ -38,10 +38,14 @@ from studies.runner import Task, run_tasks
 #: s, step and sampling interval, s. Steps of 0.02 s delay reactions by 0.01 s, which lowers kappa
 #: of ``lin`` by 0.008. The delay of these steps lowers it by 0.001, a tenth of its standard error.
 SECONDS, STEP, DT = 30.0, 0.002, 0.2
+#: s between the starts of two platoons.
+START = 100.0
 #: s that pushes last; their standard deviation by law, m/s and m/s².
 LASTS, PUSH = 4.0, {"lin": 0.3, "idm": 0.06, "fvdm": 0.06}
-#: Hidden effects by law, with their sizes: a factor of v0 on 170 m of road; a share; s. Platoons of
-#: ``fvdm`` with a delay of 0.6 s are unstable, and vehicles collide.
+#: Hidden effects by law, with their sizes: factors of v0 in :data:`ZONE`, in :data:`PERIOD` and of
+#: trucks (``idm``: of their T); shares; s; of ``asymmetric_response`` kappa_open, beside a
+#: kappa_close of 0; m/s of ``free_flow_speed``. Platoons of ``fvdm`` with a delay of 0.6 s are
+#: unstable, and vehicles collide.
 HIDDEN = {
     "lin": {
         "speed_zone": 0.9,
@@ -49,12 +53,23 @@ HIDDEN = {
         "multi_anticipation": 0.2,
         "inertia": 0.3,
         "reaction_delay": 0.3,
+        "speed_period": 0.9,
+        "vehicle_class": 0.85,
+        "leader_length": 0.5,
+        "time_gap": 0.3,
+        "asymmetric_response": 0.4,
+        "free_flow_speed": 17.0,
     },
     "idm": {
         "speed_zone": 0.6,
         "relative_speed": 0.2,
         "multi_anticipation": 0.2,
         "reaction_delay": 0.6,
+        "speed_period": 0.6,
+        "vehicle_class": 1.3,
+        "leader_length": 0.5,
+        "asymmetric_response": 0.4,
+        "inertia": 0.5,
     },
     "fvdm": {"speed_zone": 0.8, "multi_anticipation": 0.2, "reaction_delay": 0.3},
 }
@@ -68,7 +83,10 @@ PAIRS = {
 #: distribution (gamma), pushes with heavy tails (Student's t of four degrees of freedom), errors of
 #: measurement that last for 1 s.
 NATURES = ("plain", "moods", "skewed", "heavy", "lasting")
-ZONE = (250.0, 420.0)
+#: Ends of the zone, m, and of the period, s.
+ZONE, PERIOD = (250.0, 420.0), (1010.0, 2020.0)
+#: Share of trucks, and their length, m, where an effect depends on the vehicle.
+TRUCKS, TRUCK = 0.25, 12.0
 V0, LENGTH, T, S0, A, B, CAR = 29.0, 6.0, 1.25, 2.0, 1.25, 1.8, 4.5
 #: Parameters of ``fvdm`` besides v0: m, m, 1/s, 1/s.
 S_C, W, KAPPA, LAM = 15.0, 12.0, 0.5, 0.5
@@ -104,7 +122,11 @@ def platoons(
     mean, phase = rng.uniform(11, 17, (number, 1)), rng.random((number, 4))
     height, period = rng.normal(0, 1.3, (number, 4)), np.array([7.0, 13.0, 21.0, 34.0])
     v0 = V0 * own_v0
+    truck, length, longer = _vehicles(rng, (number, vehicles), sizes)
+    factor = np.where(truck[:, 1:], sizes.get("vehicle_class", 1.0), 1.0)
+    v0, own_gap = (v0 * factor, own_gap) if law == "lin" else (v0, own_gap * factor)
     gap = _equilibrium_gap(law, mean, v0, own_gap) * rng.uniform(0.9, 1.2, shape)
+    gap += longer + (0.0 if law == "lin" else length[:, :-1] - CAR)
     x = rng.uniform(0, 300, (number, 1)) - np.insert(gap.cumsum(1), 0, 0.0, 1)
     v, push = np.repeat(mean, vehicles, 1), PUSH[law] * rng.normal(size=shape)
     late = round(sizes.get("reaction_delay", 0.0) / STEP)
@@ -120,33 +142,60 @@ def platoons(
         v[:, 0] = lead
         past = [*past, (x, v.copy())][-late - 1 :]
         at, speed = past[0] if late else (x, v)
-        wish = v0.copy()
         if nature == "moods":
             mood = _next(mood, rng.normal(size=shape), STEP, 30.0)
-            wish = v0 * np.exp(0.08 * mood)
-        if "speed_zone" in sizes:
-            wish[(x[:, 1:] > ZONE[0]) & (x[:, 1:] < ZONE[1])] *= sizes["speed_zone"]
+        clock = START * np.arange(number)[:, None] + k * STEP
+        wish = v0 * np.exp(0.08 * mood) * _slowed(x[:, 1:], clock, sizes)
+        late_by = sizes.get("inertia", STEP)
         if law == "lin":
-            wanted, late_by = _wanted(at, wish, sizes), sizes.get("inertia", STEP)
+            wanted = _wanted(at, speed, wish, longer, sizes)
             slow = slow + STEP / late_by * (wanted - slow)
             after = np.maximum(slow + push, 0.0)
-            if "relative_speed" in sizes:
-                ahead = lead
-                for i in range(vehicles - 1):
-                    more = sizes["relative_speed"] * (ahead - slow[:, i])
-                    ahead = after[:, i] = after[:, i] + more
+            for i, ahead in enumerate([lead, *after.T[:-1]]):  # views, which have their responses
+                after[:, i] += _response(ahead - slow[:, i], sizes)
             v = np.column_stack([lead, after])
             x = x + STEP * v
         else:
-            rate = _rate(law, at, speed, wish, own_gap, sizes) + push
+            wanted = _rate(law, at, speed, wish, own_gap, length[:, :-1] + longer, sizes)
+            slow = wanted if k == 0 else slow + STEP / late_by * (wanted - slow)
+            rate = slow + push
             after = np.maximum(v[:, 1:] + STEP * np.clip(rate, -8.0, 5.0), 0.0)
             x = x + STEP * np.column_stack([lead, (v[:, 1:] + after) / 2])
             v = np.column_stack([lead, after])
-        shock = rng.normal(size=shape)
-        if nature == "heavy":
-            shock = rng.standard_t(4, size=shape) / np.sqrt(2.0)
-        push = _next(push, shock, STEP, LASTS, PUSH[law])
-    return _table(law, np.array(rows))
+        push = _next(push, _shock(rng, shape, nature), STEP, LASTS, PUSH[law])
+    columns = {"length": length} if law != "lin" or "leader_length" in sizes else {}
+    if "vehicle_class" in sizes:
+        columns["kind"] = np.where(truck, "truck", "car")
+    return _table(np.array(rows), columns)
+
+
+def _vehicles(
+    rng: np.random.Generator, shape: tuple[int, int], sizes: dict[str, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which vehicles are trucks, lengths, m, and by how much longer vehicles ahead count, m.
+
+    There are trucks only where an effect depends on them.
+    """
+    truck, length = np.zeros(shape, bool), np.full(shape, CAR)
+    if {"vehicle_class", "leader_length"} & set(sizes):
+        truck = rng.random(shape) < TRUCKS
+    if "leader_length" in sizes:
+        length[truck] = TRUCK
+    return truck, length, sizes.get("leader_length", 0.0) * (length - length.mean())[:, :-1]
+
+
+def _slowed(x: np.ndarray, clock: np.ndarray, sizes: dict[str, float]) -> np.ndarray:
+    """Factors on desired speeds at places and times."""
+    zone = (x > ZONE[0]) & (x < ZONE[1])
+    period = (clock > PERIOD[0]) & (clock < PERIOD[1])
+    factor = np.where(zone, sizes.get("speed_zone", 1.0), 1.0)
+    return np.asarray(factor * np.where(period, sizes.get("speed_period", 1.0), 1.0))
+
+
+def _shock(rng: np.random.Generator, shape: tuple[int, int], nature: str) -> np.ndarray:
+    """Random numbers of standard deviation 1."""
+    shock = rng.normal(size=shape)
+    return rng.standard_t(4, size=shape) / np.sqrt(2.0) if nature == "heavy" else shock
 
 
 def _sizes(law: str, effect: str) -> dict[str, float]:
@@ -198,12 +247,25 @@ def _equilibrium_gap(
     return np.asarray(LENGTH / np.maximum(1 - share, 0.15))
 
 
-def _wanted(x: np.ndarray, v0: np.ndarray, sizes: dict[str, float]) -> np.ndarray:
-    gap = np.maximum(x[:, :-1] - x[:, 1:], 0.6 * LENGTH)
-    found = v0 * (1 - LENGTH / gap)
+def _wanted(
+    x: np.ndarray, v: np.ndarray, v0: np.ndarray, longer: np.ndarray, sizes: dict[str, float]
+) -> np.ndarray:
+    """Speeds by ``lin``, m/s.
+
+    Args:
+        v: of the step before. longer: by how much a distance counts as shorter, m.
+    """
+    gap = np.maximum(x[:, :-1] - x[:, 1:] - longer, 0.6 * LENGTH)
+    wanted = v0 * (1 - (LENGTH + sizes.get("time_gap", 0.0) * v[:, :-1]) / gap)
     if size := sizes.get("multi_anticipation"):
-        found[:, 1:] += size * (v0[:, 1:] * (1 - LENGTH / gap[:, :-1]) - found[:, 1:])
-    return found
+        wanted[:, 1:] += size * (v0[:, 1:] * (1 - LENGTH / gap[:, :-1]) - wanted[:, 1:])
+    return np.minimum(wanted, sizes.get("free_flow_speed", np.inf))
+
+
+def _response(faster: np.ndarray, sizes: dict[str, float]) -> np.ndarray:
+    """To the vehicle ahead, which is faster by some m/s."""
+    opening = sizes.get("asymmetric_response", 0.0) * np.maximum(faster, 0.0)
+    return np.asarray(sizes.get("relative_speed", 0.0) * faster + opening)
 
 
 def _rate(
@@ -212,14 +274,15 @@ def _rate(
     v: np.ndarray,
     v0: np.ndarray,
     own_gap: np.ndarray,
+    length: np.ndarray,
     sizes: dict[str, float],
 ) -> np.ndarray:
     """Accelerations by ``idm`` or ``fvdm``, m/s².
 
     Args:
-        own_gap: factors of T or of s_c.
+        own_gap: factors of T or of s_c. length: that counts of the vehicle ahead, m.
     """
-    own, ahead, gap = v[:, 1:], v[:, :-1], np.maximum(x[:, :-1] - x[:, 1:] - CAR, 0.3)
+    own, ahead, gap = v[:, 1:], v[:, :-1], np.maximum(x[:, :-1] - x[:, 1:] - length, 0.3)
 
     def rate(gap: np.ndarray, ahead: np.ndarray, at: slice) -> np.ndarray:
         if law == "fvdm":
@@ -231,42 +294,48 @@ def _rate(
         wish = S0 + np.maximum(own[:, at] * T * own_gap[:, at] + away, 0.0)
         return np.asarray(A * (1 - (own[:, at] / v0[:, at]) ** 4 - (wish / gap) ** 2))
 
-    total = rate(gap, ahead, slice(None))
-    if size := sizes.get("relative_speed"):
-        total += size * (ahead - own)
+    total = rate(gap, ahead, slice(None)) + _response(ahead - own, sizes)
     if size := sizes.get("multi_anticipation"):
         second = np.maximum((x[:, :-2] - x[:, 2:]) / 2 - CAR, 0.3)
         total[:, 1:] += size * (rate(second, v[:, :-2], slice(1, None)) - total[:, 1:])
     return total
 
 
-def _table(law: str, x: np.ndarray) -> pd.DataFrame:
+def _table(x: np.ndarray, columns: dict[str, np.ndarray]) -> pd.DataFrame:
+    """A row per sample; ``columns`` are those of vehicles."""
     samples, number, agents = x.shape
     run = np.arange(number)[:, None]
-    clock = DT * np.arange(samples)[:, None, None] + 100.0 * run
-    columns = {"sequence": run, "time": clock.round(6), "x": x}
-    columns["agent"] = agents * run + np.arange(agents)
-    if law != "lin":
-        columns["length"] = np.array(CAR)
+    clock = DT * np.arange(samples)[:, None, None] + START * run
+    agent = agents * run + np.arange(agents)
+    columns = {"sequence": run, "time": clock.round(6), "x": x, "agent": agent, **columns}
     return pd.DataFrame({k: np.broadcast_to(v, x.shape).ravel() for k, v in columns.items()})
 
 
 def cases(
-    seed: int, total: int, spread: float, laws: list[str], pairs: bool = False, **given: Any
+    seed: int,
+    total: int,
+    spread: float,
+    laws: list[str],
+    pairs: bool = False,
+    effects: list[str] | None = None,
+    **given: Any,
 ) -> list[dict[str, Any]]:
     """Half of them with nothing hidden; laws and effects take turns.
 
     Args:
         pairs: two effects are hidden at once.
+        effects: hidden in all cases, of every law those that it can have; None: half of the cases.
         given: ``number``, ``vehicles``, ``error`` and ``nature`` of :func:`platoons`.
     """
-    found = []
+    chosen = []
     for k in range(total):
-        law = laws[k // 2 % len(laws)]
+        turn, hides = (k // 2, k % 2 == 1) if effects is None else (k, True)
+        law = laws[turn % len(laws)]
         names = PAIRS[law] if pairs else list(HIDDEN[law])
-        effect = "none" if k % 2 == 0 else names[k // (2 * len(laws)) % len(names)]
-        found.append({"law": law, "effect": effect, "spread": spread, "seed": seed + k} | given)
-    return found
+        names = [name for name in names if effects is None or name in effects]
+        effect = names[turn // len(laws) % len(names)] if hides else "none"
+        chosen.append({"law": law, "effect": effect, "spread": spread, "seed": seed + k} | given)
+    return chosen
 
 
 def diagnosed(**case: Any) -> dict[str, Any]:
@@ -360,6 +429,9 @@ def main() -> None:
     parser.add_argument("--vehicles", type=int, default=6, help="in a platoon, its leader included")
     parser.add_argument("--error", type=float, default=0.06, help="of measured positions, m")
     parser.add_argument("--pairs", action="store_true", help="two effects at once")
+    parser.add_argument(
+        "--effects", nargs="+", help="hidden in all cases, instead of in half of them"
+    )
     parser.add_argument("--compare", action="store_true", help="only compare laws")
     parser.add_argument("--calibrate", action="store_true", help="only calibrate, nothing hidden")
     parser.add_argument("--nothing", action="store_true", help="nothing hidden in any case")
@@ -377,6 +449,7 @@ def main() -> None:
         vehicles=given.vehicles,
         error=given.error,
         pairs=given.pairs,
+        effects=given.effects,
         nature=given.nature,
     )
     work = calibrated if given.calibrate else compared if given.compare else diagnosed
