@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pandas as pd
 import torch
-from matplotlib.figure import Figure
-from scipy.stats import t as students_t
+from scipy.special import stdtrit
 
 from nnode.app.drivers import AUTO, EXACT, NONE, Drivers, calibrated_drivers
 from nnode.app.training import batches, positions
@@ -35,10 +34,10 @@ from nnode.exchange.trajectories import simulated
 from nnode.files import xarray
 from nnode.model import System
 from nnode.model.term import physical_bounds, short_names
-from nnode.plots import force_figure
 from nnode.simulation import Solver
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from xarray import Dataset
 
     from nnode.calibrate.pooling import SequenceParameters
@@ -331,7 +330,7 @@ class Calibration:
             raise ConfigError(f"alpha={alpha}: expected a number between 0 and 1, such as 0.05")
         table = self.parameters
         value, error = (table[key].to_numpy(dtype=float) for key in ("estimate", "std_error"))
-        half = students_t.ppf(1 - alpha / 2, table["df"].to_numpy(dtype=float)) * error
+        half = stdtrit(table["df"].to_numpy(dtype=float), 1 - alpha / 2) * error
         in_logs = (table["scale"] == "log").to_numpy()
         relative = np.where(in_logs, half / value, 0.0)
         limits = [physical_bounds(self.model)[str(name)] for name in table.index]
@@ -414,6 +413,8 @@ class Calibration:
         others. For laws of second order, the curve is the speed at which a platoon is in
         equilibrium.
         """
+        from nnode.plots import force_figure  # loads Matplotlib, which takes a second
+
         return force_figure(self.model, self._sequences("train"))
 
     def to_dataframe(self) -> pd.DataFrame:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from nnode.calibrate.options import Pooling, TrainerOptions
 from nnode.calibrate.parameters import ParameterVector
@@ -19,9 +18,10 @@ from nnode.data.sequence import Sequence, evenly
 from nnode.errors import CheckpointError, ConfigError, unknown_value
 from nnode.model import System
 from nnode.model.term import short_names
-from nnode.plots.traffic import driver_figure
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from nnode.population.drivers import Population
 
 log = logging.getLogger(__name__)
@@ -136,6 +136,8 @@ class Drivers:
         """The drivers in the order of each parameter that differs, with their standard errors."""
         if not self.differ:
             raise ConfigError("no parameter differs between the drivers, so there is no plot")
+        from nnode.plots.traffic import driver_figure  # loads Matplotlib, which takes a second
+
         return driver_figure(self.table, self.differ, self.variability, self.units)
 
     @property

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 from omegaconf import DictConfig
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from nnode.app.calibration import Calibration
 from nnode.app.cli.saved import load_run
@@ -199,7 +199,7 @@ def _predicted(
     alike = {name: value for name, value in variances.items() if name in NOISE}
     typical = predict_paths(model, paths, alike, seconds).mean
     error = np.hypot(variances["measurement"], variances.get("lasting_error", 0.0))
-    half = norm.ppf(0.5 + LEVEL / 2) * np.hypot(prediction.deviation, error)
+    half = ndtri(0.5 + LEVEL / 2) * np.hypot(prediction.deviation, error)
     rows = []
     for f, (b, place) in enumerate(zip(paths.sequence, paths.place, strict=True)):
         s, k = sequences[b], slice(sequences[b].n_samples)

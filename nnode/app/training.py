@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from omegaconf import DictConfig
@@ -33,8 +33,10 @@ from nnode.data.sequence import Batch
 from nnode.data.split import Split, split
 from nnode.errors import ConfigError
 from nnode.model import InteractionForce, System, build_model
-from nnode.plots import force_figure
 from nnode.simulation import Solver, TorchdiffeqSolver, substeps
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
@@ -235,9 +237,16 @@ def trainer_of(
             free_speed=free_speed,
         ),
         # only forces between people can be drawn
-        None if model.domain == "crowd" and model.find(InteractionForce) is None else force_figure,
+        None if model.domain == "crowd" and model.find(InteractionForce) is None else _forces,
         world,
     )
+
+
+def _forces(model: System) -> Figure:
+    """The force plot of a run's TensorBoard."""
+    from nnode.plots import force_figure  # loads Matplotlib, which takes a second
+
+    return force_figure(model)
 
 
 def brief(manifest: dict[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as students_t
+from scipy.special import stdtrit
 
 from nnode.calibrate.problem import ResidualProblem
 
@@ -110,9 +110,7 @@ class ClusterInfluence:
     def half_widths(self) -> np.ndarray:
         """``(P,)`` half the width of confidence intervals of :data:`LEVEL` by Student's quantiles;
         infinite for flat parameters."""
-        widths: np.ndarray = (
-            students_t.ppf(0.5 + LEVEL / 2, self.degrees()) * self.standard_errors()
-        )
+        widths: np.ndarray = stdtrit(self.degrees(), 0.5 + LEVEL / 2) * self.standard_errors()
         return widths
 
     def _weighted(self, power: float, vectors: np.ndarray, min_share: float) -> np.ndarray:

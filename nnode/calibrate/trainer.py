@@ -11,10 +11,9 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
@@ -35,6 +34,9 @@ from nnode.errors import CheckpointError, ConfigError, SimulationError
 from nnode.files import replacing
 from nnode.model import System
 from nnode.simulation.base import Solver
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 

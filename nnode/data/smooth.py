@@ -12,7 +12,6 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy.signal import savgol_coeffs, savgol_filter
 
 from nnode.data.limits import BEARABLE
 from nnode.data.sequence import Sequence
@@ -111,6 +110,8 @@ def suggested_window(noise: Noise, dt: float) -> float:
 
     It is at most 4 s: longer ones flatten what a driver does.
     """
+    from scipy.signal import savgol_coeffs  # loads scipy.stats, which takes a second
+
     for window in WINDOWS:
         samples = 2 * round(window / dt / 2) + 1
         if samples >= DEGREE + 2:
@@ -189,6 +190,8 @@ def smooth(time: np.ndarray, x: np.ndarray, window: float) -> tuple[np.ndarray, 
         return x, np.gradient(x, time)
     even = np.interp(grid, time, x)
     samples = min(samples, len(grid) - 1 + len(grid) % 2)
+    from scipy.signal import savgol_filter
+
     smoothed = savgol_filter(even, samples, DEGREE)
     speed = savgol_filter(even, samples, DEGREE, deriv=1, delta=step)
     return np.interp(time, grid, smoothed), np.interp(time, grid, speed)

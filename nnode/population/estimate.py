@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from scipy import stats
 from scipy.optimize import minimize
+from scipy.special import gammaincinv
 
 from nnode.errors import SimulationError
 from nnode.population.likelihood import (
@@ -166,7 +166,8 @@ def estimate(
     point = _Point(theta, agents, start, data)
     relaxation, previous_change = 1.0, np.zeros(len(theta))
     best, logliks = (point, variances), list[float]()
-    region = float(stats.chi2.ppf(REGION, max(len(theta), 1))) / 2
+    # half of the quantile of chi squared
+    region = float(gammaincinv(max(len(theta), 1) / 2, REGION))
     for _ in range(steps):
         before = variances
         to_low, to_high = low - point.theta, high - point.theta

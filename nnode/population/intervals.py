@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from nnode.calibrate.intervals import LEVEL, ClusterInfluence, at_bounds
 from nnode.model.term import short_names
@@ -84,7 +84,7 @@ def deviation_intervals(population: Population) -> np.ndarray:
             curvature[i, j] = curvature[j, i] = -cross / (4 * DIFFERENCE**2)
     half = np.full(len(logs), np.nan)
     if size and np.linalg.eigvalsh(curvature).min() > 0:
-        half[free] = norm.ppf(0.5 + LEVEL / 2) * np.sqrt(np.diag(np.linalg.inv(curvature)))
+        half[free] = ndtri(0.5 + LEVEL / 2) * np.sqrt(np.diag(np.linalg.inv(curvature)))
     return np.exp(logs[:, None] + half[:, None] * np.array([-1.0, 1.0]))
 
 

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.signal import find_peaks
 
 from nnode.data.cut import Reading, sequence_of, whole_steps, windows
 from nnode.data.options import DataOptions, chosen, one_of, positive
@@ -483,6 +482,8 @@ def find_laps(driven: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.nda
     Returns:
         ``(L,)`` m per lap by integrated speed, and along the measured coordinates.
     """
+    from scipy.signal import find_peaks  # loads scipy.stats, which takes a second
+
     located = np.flatnonzero(np.isfinite(place).all(axis=1) & np.isfinite(driven))
     if not len(located):
         return np.empty(0), np.empty(0)
