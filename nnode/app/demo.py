@@ -11,8 +11,12 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import redirect_stdout
 from functools import partial
+from io import StringIO
 from itertools import pairwise
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -79,14 +83,20 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
     checked = _checked(raw["table"], folder)
     _step("3/6 Calibration without a hidden effect: truth and estimate")
     calibration = _calibration(raw["nothing_hidden"], truth, folder)
-    _step("4/6 Diagnosis with a hidden slow zone")
-    report = _diagnosed(raw["table"], folder / "diagnosis")
-    lacking = _lacking(report, truth)
-    _step("5/6 Diagnosis without a hidden effect")
-    nothing = _diagnosed(raw["nothing_hidden"], None)
-    absent = _absent(nothing)
-    _step("6/6 Forces between people, learned by networks")
-    crowd = _crowd(raw["juelich"], folder / "crowd", epochs)
+    # a second process works on the last two steps, but not while calibrations are timed
+    with ProcessPoolExecutor(1, get_context("spawn")) as second:
+        diagnosed = second.submit(_printed, _diagnosed, raw["nothing_hidden"], None)
+        trained = second.submit(_printed, _trained, raw["juelich"], folder / "crowd", epochs)
+        _step("4/6 Diagnosis with a hidden slow zone")
+        report = _diagnosed(raw["table"], folder / "diagnosis")
+        lacking = _lacking(report, truth)
+        _step("5/6 Diagnosis without a hidden effect")
+        nothing, printed = diagnosed.result()
+        print(printed, end="")
+        absent = _absent(nothing)
+        _step("6/6 Forces between people, learned by networks")
+        print(trained.result()[1], end="")
+    crowd = _crowd(raw["juelich"], folder / "crowd")
     seconds = time.monotonic() - start
     facts = how_made(("torch", "numpy", "scipy", "matplotlib"))
     page, *_ = write_page(
@@ -120,6 +130,13 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
     }.items():
         print(f"{what + ':':<19}{path}")
     return page
+
+
+def _printed(work: Callable[..., Any], *arguments: Any) -> tuple[Any, str]:
+    """The result of a function, and what it prints, which is not shown."""
+    with redirect_stdout(StringIO()) as text:
+        result = work(*arguments)
+    return result, text.getvalue()
 
 
 def _step(title: str) -> None:
@@ -443,7 +460,7 @@ def _missed(report: Report) -> str:
 # -- crowd -----------------------------------------------------------------------------------------
 
 
-def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
+def _trained(path: Path, folder: Path, epochs: int) -> None:
     register()
     source, options = path.parents[1], ["experiment=demo_crowd", f"trainer.max_epochs={epochs}"]
     config = composed("train", [*options, f"data.source={source.absolute()}"])
@@ -451,11 +468,14 @@ def _crowd(path: Path, folder: Path, epochs: int) -> list[Block]:
         groups = config.pop("hydra").runtime.choices
         config.groups = {name: groups[name] for name in GROUPS}
     train(config, folder)
+
+
+def _crowd(path: Path, folder: Path) -> list[Block]:
     costs = json.loads((folder / RESULT).read_text(encoding="utf-8"))["summary"]
     checkpoint = folder / "checkpoints" / "best.pt"
     model, store, forces = nnode.load(checkpoint), Store(folder / "data"), Forces()
     reach = 2 * forces.r + forces.B * np.log(forces.A / _WEAK)
-    command = f"nnode train experiment=demo_crowd data.source={source}"
+    command = f"nnode train experiment=demo_crowd data.source={path.parents[1]}"
     return [
         Heading("Forces in a crowd"),
         Text(
