@@ -37,6 +37,9 @@ from nnode.simulation.rhs import RightHandSide, formula_of, rates_along
 STEP = {1: 0.4, 2: 0.2}
 #: Longest step of laws that are maps from step to step, s: SUMO's default.
 MAPPED = 0.1
+#: Longest step of models with zones or periods, s: vehicles pass the end of a zone within 0.1 to
+#: 0.3 s. Longer steps make errors that are attributed to pushes.
+ENDS = 0.1
 #: Length of the windows in which sequences are compared, s; the preceding time in which the
 #: influence of the start decays, s, and its largest share of the sequence.
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
@@ -126,6 +129,8 @@ class TrafficEngine:
         lane = formula_of(system)
         if lane is not None and "dt" in symbols([lane.law or lane.rates[lane.top]]):
             longest = min(longest, MAPPED)
+        if any(effect.consecutive for effect in effects_of(system)):
+            longest = min(longest, ENDS)
         return longest
 
     def _step(self, longest: float) -> float:

@@ -28,10 +28,9 @@ from nnode.model.terms import Rule
 
 #: Widths of the edges of a zone, m, and of a period, s. They make errors differentiable in the
 #: ends. At a zone's edge the time per metre changes linearly, so that passing it takes as long as
-#: passing a sharp edge. For a true zone with sharp edges at 350 and 450 m and alpha 0.65, platoons
-#: of :mod:`nnode.data.synthetic.platoons` gave 350.2, 449.8 and 0.648 with edges of 12 m; 350.0,
-#: 450.0 and 0.650 with 6 m and with 3 m.
-EDGE = {"m": 6.0, "s": 1.0}
+#: passing a sharp edge. Wider edges bias the factor of a sharp zone, see the table in
+#: docs/discovery.md.
+EDGE = {"m": 3.0, "s": 1.0}
 #: Number of the cells of a road or a time that are tested one by one.
 CELLS = 32
 #: Quantiles of the measured speeds that are tested as desired speeds.
