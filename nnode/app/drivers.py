@@ -242,7 +242,7 @@ def calibrated_drivers(
         ConfigError: see :func:`nnode.population.drivers.fit_drivers`.
     """
     from nnode.population.drivers import CHECKED, STEP, at_steps, fit_drivers  # takes a second
-    from nnode.population.followers import APART, paths_of, without_errors
+    from nnode.population.followers import APART, longest_step, paths_of, without_errors
     from nnode.population.intervals import variations
 
     double = copy.deepcopy(model).double()
@@ -250,11 +250,12 @@ def calibrated_drivers(
     low, high = vector.bounds
     inside = np.where(np.isfinite(high - low), INSIDE * (high - low), 0.0)
     vector.fill_(np.clip(vector.row.numpy(), low + inside, high - inside))
+    step = longest_step(double, vector.row[None], STEP)
     used, apart = sequences, 0.0
     if without_errors(sequences):
         # a law explains positions of a simulation, and not those that were smoothed
         thinned = at_steps(sequences)
-        part = paths_of(evenly(thinned, CHECKED), STEP)
+        part = paths_of(evenly(thinned, CHECKED), step)
         if not fit_drivers(double, part, first=first, pairs=0).explains_rates:
             if drivers is None:
                 return None
@@ -264,7 +265,7 @@ def calibrated_drivers(
                 APART,
             )
             used, apart = thinned, APART
-    paths = paths_of(used, STEP).apart(apart)
+    paths = paths_of(used, step).apart(apart)
     population = fit_drivers(double, paths, drivers or AUTO, first, seed=seed)
     if not population.estimate.converged:
         log.warning(

@@ -18,6 +18,7 @@ from nnode.app.drivers import variances_of
 from nnode.app.python.inputs import Table
 from nnode.app.saved_run import SavedRun, drivers_of
 from nnode.app.training import threads_given_back
+from nnode.calibrate.parameters import ParameterVector
 from nnode.calibrate.resampling import Paired, paired
 from nnode.data.clusters import clusters
 from nnode.data.sequences import Sequences
@@ -175,7 +176,7 @@ def _predicted(
     run: SavedRun, variances: Mapping[str, float], apart: float, seconds: float
 ) -> Predictions:
     from nnode.population.drivers import STEP, obstacle  # compiled code takes a second
-    from nnode.population.followers import paths_of
+    from nnode.population.followers import longest_step, paths_of
     from nnode.population.likelihood import NOISE
     from nnode.population.prediction import predict as predict_paths
 
@@ -194,7 +195,8 @@ def _predicted(
         )
     if reason := obstacle(model, sequences, needed=1):
         raise ConfigError(f"followers cannot be predicted: {reason}")
-    paths = paths_of(sequences, STEP).apart(apart)
+    step = longest_step(model, ParameterVector(model).row[None], STEP)
+    paths = paths_of(sequences, step).apart(apart)
     prediction = predict_paths(model, paths, variances, seconds)
     alike = {name: value for name, value in variances.items() if name in NOISE}
     typical = predict_paths(model, paths, alike, seconds).mean

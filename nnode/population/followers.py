@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from torch import Tensor
 
 from nnode.calibrate.cost import LEAST_GAP
 from nnode.calibrate.parameters import ParameterVector
@@ -25,6 +26,8 @@ from nnode.data.smooth import measured_noise
 from nnode.errors import ConfigError, SimulationError
 from nnode.model.arrays import Formulas
 from nnode.model.differentiate import derivatives
+from nnode.model.expression import symbols
+from nnode.model.extend import effects_of
 from nnode.model.formula import inputs_of
 from nnode.model.lane_rates import SAFE
 from nnode.model.system import System
@@ -34,7 +37,7 @@ from nnode.population.estimate import Estimate, fit_deviations
 from nnode.population.likelihood import Linearised, Noise
 from nnode.simulation.kernels.followers import AHEAD
 from nnode.simulation.kernels.followers import simulate as simulate_compiled
-from nnode.simulation.linear import trapezoidal
+from nnode.simulation.linear import subdivided, trapezoidal
 from nnode.simulation.numpy import simulated, strides
 from nnode.simulation.rhs import formula_of
 
@@ -47,6 +50,15 @@ FLOOR = 0.01
 #: ESIMAS's errors of 0.57 m are attributed to pushes. Tables in docs/discovery.md compare both
 #: approaches.
 NOISE = (0.015, 0.45)
+#: Longest step of laws that are maps from step to step, s: SUMO's default.
+MAPPED = 0.1
+#: Longest step of models with zones or periods, s: vehicles pass the end of a zone within 0.1 to
+#: 0.3 s. Longer steps make errors that are attributed to pushes.
+ENDS = 0.1
+#: Linear responses of models with a memory take 2**DOUBLINGS steps in a sampling interval, because
+#: rates of a memory are larger than 5 per second: 12 / T of a delay T. The table in docs/method.md
+#: has what single steps lead to.
+DOUBLINGS = 4
 #: Positions that were smoothed are used at times that are at least so many seconds apart, because
 #: their errors are autocorrelated. The table in docs/method.md has the autocorrelations.
 APART = 1.0
@@ -190,6 +202,36 @@ def paths_of(sequences: list[Sequence], step: float, floor: float = FLOOR) -> Pa
     )
 
 
+def longest_step(system: System, rows: Tensor, longest: float) -> float:
+    """The longest step with which a model is simulated, s.
+
+    It is at most the shortest time constant of the states of terms, :data:`MAPPED` for maps from
+    step to step, and :data:`ENDS` for zones and periods.
+
+    Args:
+        rows: ``(R, P)`` parameters, as of a
+            :class:`~nnode.calibrate.parameters.ParameterVector`.
+        longest: of all models, s.
+    """
+    factors = {
+        f"terms.{i}.{name}": factor
+        for i, term in enumerate(system.terms)
+        for name, factor in cast(Term, term).fast.items()
+    }
+    steps = [longest]
+    steps += [
+        factors[name] * float(rows[:, j].min())
+        for j, name in enumerate(ParameterVector(system).names)
+        if name in factors
+    ]
+    lane = formula_of(system)
+    if lane is not None and "dt" in symbols([lane.law or lane.rates[lane.top]]):
+        steps.append(MAPPED)
+    if any(effect.consecutive for effect in effects_of(system)):
+        steps.append(ENDS)
+    return min(steps)
+
+
 def _smoothed_error(weights: list[float], dt: float, noise: float) -> tuple[float, float]:
     """The error of smoothed paths, as an Ornstein-Uhlenbeck process.
 
@@ -326,6 +368,7 @@ class Followers:
                 "the positions and speeds of the vehicles ahead; take drivers=none"
             )
         self.lane, self.starts = lane, _n_disturbed(lane)
+        self._doublings = DOUBLINGS if self.starts > lane.order else 0
         self.vector = ParameterVector(system)
         symbols = {(name, place): symbol for symbol, (name, place, _) in lane.owned.items()}
         self._symbols = [symbols[place] for place in self.vector.places]
@@ -529,9 +572,12 @@ class Followers:
             ``(F, K - 1, M, 2)``: by the sums at both ends of pushes on the highest rate and of e.
         """
         by_states, by_position, by_speed = self._slopes(parameters, states)
-        step, after = (
-            matrices.numpy().swapaxes(0, 1) for matrices in trapezoidal(by_states, self.paths.dt)
+        matrices = (
+            subdivided(by_states, self.paths.dt, self._doublings)
+            if self._doublings
+            else trapezoidal(by_states, self.paths.dt)
         )
+        step, after = (matrix.numpy().swapaxes(0, 1) for matrix in matrices)
         after = self.paths.dt / 2 * after
         source = (by_position + by_states @ by_speed).swapaxes(0, 1)
         by_push = after[..., self.lane.order - 1, None]
@@ -556,7 +602,8 @@ class Followers:
         for (row, column), value in zip(entries, values, strict=True):
             matrix[..., row, column] += value
         # the linearisation is only valid while it does not diverge
-        matrix = np.clip(np.nan_to_num(matrix), -1 / self.paths.dt, 1 / self.paths.dt)
+        largest = 2**self._doublings / self.paths.dt
+        matrix = np.clip(np.nan_to_num(matrix), -largest, largest)
         by_states, by_position, by_speed = np.split(matrix, [disturbed, disturbed + 1], -1)
         return by_states, by_position, by_speed
 

@@ -2,7 +2,9 @@
 
 The intervals of parameters are cluster-robust (CR2, weighted by the marginal covariance): they are
 valid even if the model of drivers or pushes is wrong. The intervals of standard deviations are Wald
-intervals from the curvature of the marginal likelihood over their logarithms.
+intervals from the curvature of the marginal likelihood over their logarithms. If a standard
+deviation may be 0, its logarithm has no normal distribution, and the interval is that of the
+likelihood ratio, from 0 on.
 """
 
 from __future__ import annotations
@@ -10,7 +12,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.optimize import brentq
+from scipy.special import gammaincinv, ndtri
 
 from nnode.calibrate.intervals import LEVEL, ClusterInfluence, at_bounds
 from nnode.model.term import short_names
@@ -21,6 +24,8 @@ from nnode.population.likelihood import NOISE, Products, PushNoise, marginal
 NEAR = 1e-3
 #: Difference of logarithms of standard deviations for second derivatives.
 DIFFERENCE = 1e-2
+#: Difference of log-likelihoods at the ends of an interval: half of the quantile of chi squared.
+DROP = float(gammaincinv(0.5, LEVEL))
 
 
 def bounds_reached(population: Population) -> np.ndarray:
@@ -46,17 +51,17 @@ def influence(population: Population, cluster: np.ndarray) -> tuple[ClusterInflu
 
 def deviation_intervals(population: Population) -> np.ndarray:
     """``(V, 2)`` intervals of 95 % of the standard deviations and times, in the order of
-    :attr:`nnode.population.estimate.Variances.row`; NaN at a bound, or if the likelihood is not
-    concave."""
+    :attr:`nnode.population.estimate.Variances.row`; NaN at a bound, if the likelihood is not
+    concave, or of the time of a process whose standard deviation may be 0."""
     variances, data = population.estimate.variances, population.estimate.data
     logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
     free = np.flatnonzero(at_bounds(logs, low, high, NEAR) == "")
     theta, model = population.estimate.theta, population.model
     products: dict[tuple[float, ...], Products] = {}
 
-    def loglik(move: np.ndarray) -> float:
+    def loglik(places: Any, values: Any) -> float:
         row = logs.copy()
-        row[free] += move
+        row[places] = values
         shifted = variances.filled(np.exp(row))
         key = tuple(shifted.noise)
         if key not in products:
@@ -75,17 +80,30 @@ def deviation_intervals(population: Population) -> np.ndarray:
     for i in range(size):
         for j in range(i + 1):
             sum_step, difference_step = steps[i] + steps[j], steps[i] - steps[j]
-            cross = (
-                loglik(sum_step)
-                + loglik(-sum_step)
-                - loglik(difference_step)
-                - loglik(-difference_step)
+            cross = sum(
+                sign * loglik(free, logs[free] + move)
+                for sign, step in ((1, sum_step), (-1, difference_step))
+                for move in (step, -step)
             )
             curvature[i, j] = curvature[j, i] = -cross / (4 * DIFFERENCE**2)
     half = np.full(len(logs), np.nan)
     if size and np.linalg.eigvalsh(curvature).min() > 0:
         half[free] = ndtri(0.5 + LEVEL / 2) * np.sqrt(np.diag(np.linalg.inv(curvature)))
-    return np.exp(logs[:, None] + half[:, None] * np.array([-1.0, 1.0]))
+    ends: np.ndarray = np.exp(logs[:, None] + half[:, None] * np.array([-1.0, 1.0]))
+    peak, noise = loglik(free, logs[free]), NOISE[: len(variances.noise)]
+    for k in map(int, np.flatnonzero((low < high)[: len(noise) + len(variances.spread)])):
+        name = noise[k] if k < len(noise) else ""
+        if name.endswith("_time") or peak - loglik(k, low[k]) >= DROP:
+            continue
+
+        def difference(value: float, k: int = k) -> float:
+            return peak - loglik(k, value) - DROP
+
+        upper = brentq(difference, logs[k], high[k]) if difference(high[k]) > 0 else high[k]
+        ends[k] = 0.0, np.exp(upper)
+        if f"{name}_time" in noise:
+            ends[noise.index(f"{name}_time")] = np.nan
+    return ends
 
 
 def variations(population: Population) -> dict[str, dict[str, Any]]:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,22 +24,17 @@ from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects import Effect, IndividualEffect, Probe
-from nnode.model.expression import symbols
 from nnode.model.extend import effects_of, extended, without
 from nnode.model.system import System
-from nnode.model.term import State, Term
+from nnode.model.term import State
+from nnode.population.followers import longest_step
 from nnode.simulation.linear import LinearResponse
 from nnode.simulation.numpy import simulated, strides
-from nnode.simulation.rhs import RightHandSide, formula_of, rates_along
+from nnode.simulation.rhs import RightHandSide, rates_along
 
 #: Longest step of the simulation, s, by the law's order. Steps are no longer than the shortest time
 #: constant of the states that terms own.
 STEP = {1: 0.4, 2: 0.2}
-#: Longest step of laws that are maps from step to step, s: SUMO's default.
-MAPPED = 0.1
-#: Longest step of models with zones or periods, s: vehicles pass the end of a zone within 0.1 to
-#: 0.3 s. Longer steps make errors that are attributed to pushes.
-ENDS = 0.1
 #: Length of the windows in which sequences are compared, s; the preceding time in which the
 #: influence of the start decays, s, and its largest share of the sequence.
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
@@ -125,13 +120,7 @@ class TrafficEngine:
 
     def _longest(self, system: System, rows: Tensor) -> float:
         """Longest step, s."""
-        longest = min(STEP[system.order], fastest(system, rows))
-        lane = formula_of(system)
-        if lane is not None and "dt" in symbols([lane.law or lane.rates[lane.top]]):
-            longest = min(longest, MAPPED)
-        if any(effect.consecutive for effect in effects_of(system)):
-            longest = min(longest, ENDS)
-        return longest
+        return longest_step(system, rows, STEP[system.order])
 
     def _step(self, longest: float) -> float:
         stride, steps = strides(self.batch.dt, longest)
@@ -352,21 +341,6 @@ def with_each_strength(
         return [with_all_strengths(system, effect, probe)]
     probes = [replace(probe, steps={name: step}) for name, step in probe.steps.items()]
     return [with_all_strengths(system, effect, single) for single in probes]
-
-
-def fastest(system: System, rows: Tensor) -> float:
-    """The shortest time constant of the states of terms, s; infinite without such states."""
-    factors = {
-        f"terms.{i}.{name}": factor
-        for i, term in enumerate(system.terms)
-        for name, factor in cast(Term, term).fast.items()
-    }
-    constants = [
-        factors[name] * float(rows[:, j].min())
-        for j, name in enumerate(ParameterVector(system).names)
-        if name in factors
-    ]
-    return min(constants, default=math.inf)
 
 
 def _windows(sequence: Sequence, length: float) -> list[tuple[Sequence, int]]:
