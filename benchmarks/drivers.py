@@ -351,7 +351,11 @@ def diagnosed(**case: Any) -> dict[str, Any]:
     intervals = {
         effect["name"]: next(iter(effect["coefficients"].values())) for effect in report["effects"]
     } | {
-        each["name"]: {"value": each["estimate"], "low": each["lower"], "high": each["upper"]}
+        each["name"].removeprefix(f"{case['law']}."): {
+            "value": each["estimate"],
+            "low": each["lower"],
+            "high": each["upper"],
+        }
         for each in report["drivers"]
     }
     row = {**case, "hidden": bool(sizes), **judged(report, list(sizes))}

@@ -8,12 +8,15 @@ import pytest
 import nnode
 from benchmarks.drivers import LASTS, PUSH, T
 from benchmarks.drivers import platoons as benchmark_platoons
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.model import Traffic, make_law
+from nnode.model.effects import Effect
+from nnode.model.effects.lane import Inertia, ReactionDelay, SpeedZone
 from nnode.model.term import Interval
 from nnode.population.drivers import fit_drivers
-from nnode.population.followers import paths_of
+from nnode.population.followers import longest_step, paths_of
 from nnode.population.intervals import deviation_intervals, influence
 from nnode.population.likelihood import NOISE
 from tests.discover.platoons import DT, LENGTH, V0
@@ -103,6 +106,37 @@ def test_errors_of_leaders_are_neither_pushes_nor_errors_that_last() -> None:
     push, lasts = deviation_intervals(found)[:2]
     assert push[0] < PUSH["lin"] < push[1]
     assert lasts[0] < LASTS < lasts[1]
+
+
+def test_a_memory_is_no_error_that_lasts() -> None:
+    table = benchmark_platoons("lin", "inertia", 0.15, 9101, 16)
+    system = Traffic([make_law("lin"), Inertia(tau_v=0.3)], leader="measured").double()
+    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), ["v0"], pairs=0)
+    assert len(found.estimate.variances.noise) == 3
+    push = deviation_intervals(found)[0]
+    assert push[0] < PUSH["lin"] < push[1]
+
+
+def test_steps_are_as_short_as_the_model_needs() -> None:
+    def longest(name: str, *effects: Effect) -> float:
+        system = Traffic([make_law(name), *effects], leader="measured")
+        return longest_step(system, ParameterVector(system).row[None], 0.2)
+
+    assert longest("idm") == 0.2
+    assert longest("krauss") == 0.1
+    assert longest("idm", SpeedZone(alpha=0.8, a=0.0, b=50.0)) == 0.1
+    # a response of Pade's delay has poles at 3.46 / T
+    delayed = longest("idm", ReactionDelay(T=0.3))
+    assert 0.2 * 0.3 < delayed < 0.3 / 3.4
+
+
+def test_pushes_that_do_not_exist_have_an_interval_from_zero() -> None:
+    sequences = following(lambda x, law, lead: law, number=8, seconds=30.0, noise=ERROR, seed=5)
+    found = fit_drivers(law(), paths_of(sequences, 0.2), "none", pairs=0)
+    push, lasting, *_ = deviation_intervals(found)
+    assert push[0] == 0.0
+    assert found.estimate.variances.noise[0] < push[1] < 0.1
+    assert np.isnan(lasting).all()
 
 
 def test_simulated_drivers_start_at_the_gaps_that_they_keep() -> None:

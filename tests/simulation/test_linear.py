@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from nnode.simulation.linear import (
     Blocks,
@@ -12,6 +13,7 @@ from nnode.simulation.linear import (
     FrontToBackSolver,
     RungeKuttaSolver,
     dense_jacobian,
+    subdivided,
 )
 
 
@@ -53,6 +55,24 @@ def test_platoon_is_solved_from_its_front_as_by_dense_matrices(reads_speed: bool
         expected = dense.response(source, first)
         np.testing.assert_allclose(by_vehicle.response(source, first), expected, atol=1e-12)
     assert not np.allclose(expected, dense.response(source), atol=0.1)
+
+
+def test_short_steps_follow_states_that_are_faster_than_samples() -> None:
+    """States of rates up to 20 per second, constant over an interval, against the exponential."""
+    dt, rng = 0.2, np.random.default_rng(6)
+    matrix = np.array([[0.0, 1.0, 0.0], [-3.0, -2.0, 0.5], [12.0, 0.0, -20.0]])
+    push = rng.normal(size=3)
+    both = np.zeros((4, 4))
+    both[:3, :3], both[:3, 3] = matrix, push
+    exact = expm(dt * both)
+    errors = []
+    for doublings in (0, 4):
+        step, after = subdivided(np.stack([matrix, matrix])[:, None], dt, doublings)
+        forced = after[0, 0].numpy() @ (dt / 2 * (push + push))
+        moved = np.abs(step[0, 0].numpy() - exact[:3, :3]).max()
+        errors.append((moved, np.abs(forced - exact[:3, 3]).max()))
+    assert min(errors[0]) > 0.01
+    assert max(errors[1]) < 5e-3
 
 
 def test_runge_kutta_follows_fast_accelerations() -> None:
