@@ -39,5 +39,5 @@ def test_the_catalogue_is_printed_whole() -> None:
         "of an acceleration, the same",
     ):
         assert acceleration in done.stdout
-    assert done.stdout.count("edge = 3 m") == 2  # speed_zone and slope, once each
+    assert done.stdout.count("edge = 2 m") == 2  # speed_zone and slope, once each
     assert "\\" not in done.stdout

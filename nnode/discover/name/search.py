@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from nnode.calibrate.parameters import ParameterVector
+from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.discover import thresholds
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.locate.curves import curves
@@ -26,7 +26,7 @@ from nnode.discover.statistics.profile import refined_edges
 from nnode.discover.statistics.score import Score, Screen, Trace, traces
 from nnode.errors import SimulationError
 from nnode.model.effects import Effect
-from nnode.model.extend import effects_of, without
+from nnode.model.extend import effects_of, place_of, without
 from nnode.model.system import System
 from nnode.population.drivers import Population
 
@@ -174,13 +174,52 @@ def search(
             doubtful = None
         selection.steps.append(step)
         selection.fit = converged_fit(engine, step.chosen.fit.system, rounds=1)
-        if step.chosen.score.effect.consecutive:
-            selection.fit = refined_edges(engine, selection.fit, step.chosen.name)
+        selection.fit = _with_best_ends(engine, selection.fit, step.chosen.score.effect)
         log.info("added %s", step.chosen.name)
     if doubtful is not None:  # the whitening was fitted with more effects
         selection = replace(doubtful, fit=converged_fit(engine, doubtful.fit.system, rounds=1))
         _screened(engine, selection, effects, seed, levels, within)
     return _eliminated(engine, selection)
+
+
+def _with_best_ends(engine: Engine, fit: Fit, effect: type[Effect]) -> Fit:
+    """The fit with the best ends of an interval that the effect may have."""
+    if effect.consecutive:
+        fit = refined_edges(engine, fit, effect.name)
+        if isinstance(engine, FollowersEngine) and not effect.overlapping:
+            return _with_likeliest_ends(engine, fit, effect.name)
+    return fit
+
+
+def _with_likeliest_ends(engine: FollowersEngine, fit: Fit, name: str) -> Fit:
+    """The fit of a model with a period, or a likelier one, an end of which lies within a sequence.
+
+    Where an end lies between sequences, drivers of the nearest ones are estimated as slower or
+    faster, and with these drivers the cost does not show that the end lies within. Drivers are
+    therefore estimated again, with the end in the middle of each of the two sequences.
+    """
+    place, spans = place_of(fit.system, name), [(s.time[0], s.time[-1]) for s in engine.sequences]
+    index = [fit.names.index(f"terms.{place}.{end}") for end in ("a", "b")]
+    for k in index:
+        value = float(fit.row[k])
+        if any(low < value < high for low, high in spans) or engine.population is None:
+            continue
+        nearest = [
+            max((span for span in spans if span[1] <= value), default=None),
+            min((span for span in spans if span[0] >= value), default=None),
+        ]
+        populations = [engine.population]
+        for low, high in filter(None, nearest):
+            row = fit.row.copy()
+            row[k] = (low + high) / 2
+            if row[index[0]] < row[index[1]]:
+                with suppress(SimulationError):
+                    populations.append(engine.population_of(with_parameters(fit.system, row)))
+        engine.set_likeliest(populations)
+        if engine.population is not populations[0]:
+            # with other drivers, the end moves further
+            fit = converged_fit(engine, engine.population.system)
+    return fit
 
 
 def _screened(

@@ -30,7 +30,7 @@ from nnode.model.terms import Rule
 #: ends. At a zone's edge the time per metre changes linearly, so that passing it takes as long as
 #: passing a sharp edge. Wider edges bias the factor of a sharp zone, see the table in
 #: docs/discovery.md.
-EDGE = {"m": 3.0, "s": 1.0}
+EDGE = {"m": 2.0, "s": 1.0}
 #: Number of the cells of a road or a time that are tested one by one.
 CELLS = 32
 #: Quantiles of the measured speeds that are tested as desired speeds.

@@ -51,7 +51,7 @@ DV = -np.diff(SPEEDS)
 @pytest.mark.parametrize(
     ("effect", "expected"),
     [
-        # places 0, 20 and 51 m; edges of a zone are 3 m wide
+        # places 0, 20 and 51 m; edges of a zone are 2 m wide
         (
             {"name": "speed_zone", "alpha": 0.6, "a": 10.0, "b": 35.0},
             [BARE[0], idm(1, P, v0=0.6 * P.v0), BARE[2]],
