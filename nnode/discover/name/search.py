@@ -217,8 +217,7 @@ def _with_likeliest_ends(engine: FollowersEngine, fit: Fit, name: str) -> Fit:
                     populations.append(engine.population_of(with_parameters(fit.system, row)))
         engine.set_likeliest(populations)
         if engine.population is not populations[0]:
-            # with other drivers, the end moves further
-            fit = converged_fit(engine, engine.population.system)
+            fit = refine(engine, engine.population.system)
     return fit
 
 
