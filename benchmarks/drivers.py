@@ -4,7 +4,8 @@ Every case is ``--platoons`` platoons of ``--vehicles`` vehicles for 30 s at 5 H
 ``idm`` or ``fvdm``, in which one effect is hidden or none, or two with ``--pairs``. Drivers'
 parameters are log-normal (``lin``: v0; ``idm``: T and v0; ``fvdm``: s_c and v0) with a standard
 deviation of ``--spread`` %, pushes last 4 s, and positions are measured with errors of ``--error``
-m. ``--nature`` departs from this. With ``--nothing``, nothing is hidden in any case. Paths are
+m. ``--nature`` departs from this. With ``--nothing``, nothing is hidden in any case, and with
+``--effects`` one of the named effects in every case. Paths are
 integrated here by Euler's method; everything else is the package's public interface. The cases of a
 run are fixed by its seed. The table has a row per case; the last lines count right and false
 answers, with exact intervals of 95 %. ``--compare`` only compares laws. ``--calibrate`` only
@@ -444,6 +445,9 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--table", type=Path, default=Path("runs/benchmark_drivers.csv"))
     given = parser.parse_args()
+    for law in given.laws:
+        if given.effects and not set(given.effects) & set(HIDDEN[law]):
+            parser.error(f"--effects: {law} can hide {', '.join(HIDDEN[law])}")
     chosen = cases(
         given.seed,
         given.cases,
