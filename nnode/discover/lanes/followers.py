@@ -68,6 +68,10 @@ from nnode.simulation.rhs import side_by_side
 #: from the model's by some centimetres, because its zones have ends of finite width and simulators
 #: integrate differently. The table in docs/discovery.md shows what other values do.
 ERROR = 0.05
+#: Smallest standard deviation of the start of a memory in residuals, in its own unit. Residuals do
+#: not depend on these starts then. They are not measured, and the mean of their deviations is not
+#: 0: false effects were found that act on the whole record, and there on the start only.
+DIFFUSE = 100.0
 #: Largest number of values of rates that are kept at once, for memory.
 NUMBERS = 4_000_000
 #: Difference of a curve's scale for derivatives.
@@ -415,8 +419,11 @@ class FollowersEngine(TrafficEngine):
     def _set_population(self, population: Population) -> None:
         estimate, variances = population.estimate, population.estimate.variances
         self.population = population
+        start = variances.start.copy()
+        memory = start[population.model.lane.order :]
+        memory[:] = np.maximum(memory, DIFFUSE)
         self._whitening = Whitening(
-            estimate.data, PushNoise(), variances.noise, variances.spread, variances.start
+            estimate.data, PushNoise(), variances.noise, variances.spread, start
         )
         self._last_run = None
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
+import torch
 
 import nnode
 from benchmarks.drivers import platoons
@@ -10,7 +13,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.model import Traffic, make_law
 from nnode.model.effects import Effect
-from nnode.model.effects.lane import Inertia, MultiAnticipation, ReactionDelay
+from nnode.model.effects.lane import Inertia, MultiAnticipation, ReactionDelay, SpeedPeriod
 from nnode.model.extend import extended
 
 
@@ -32,3 +35,21 @@ def test_derivatives_beside_a_memory_are_differences(memory: Effect) -> None:
     )
     difference = (after - before) / size
     assert float((column - difference).norm()) < 0.05 * float(difference.norm())
+
+
+@pytest.mark.parametrize("memory", [Inertia(tau_v=0.3), ReactionDelay(T=0.3)])
+def test_a_period_of_the_whole_record_is_another_desired_speed(memory: Effect) -> None:
+    table = platoons("lin", "inertia", 0.15, 77, number=6, vehicles=4)
+    engine = FollowersEngine(list(nnode.sequences(table)))
+    system = Traffic([make_law("lin"), memory], leader="measured").double()
+    engine.fit_whitening(system, ParameterVector(system).row)
+    assert engine.population is not None
+    system = engine.population.system
+    row = ParameterVector(system).row
+    first = SpeedPeriod.probes(engine.batch, system)[0]
+    always = replace(first, options={"a": -1e4, "b": 1e4})
+    (column,) = engine.screen_columns(system, row, SpeedPeriod, always)
+    tangents = torch.stack(list(engine.tangents(system, row)), 1)
+    basis, _ = torch.linalg.qr(tangents)
+    # not by another start of the memory, which is unknown
+    assert float((column - basis @ (basis.T @ column)).norm()) < 0.2 * float(column.norm())
