@@ -18,6 +18,7 @@ from nnode.app.python.inputs import model_options
 from nnode.calibrate.options import Pooling, TrainerOptions
 from nnode.errors import ConfigError
 from nnode.model import build_model
+from nnode.population import drivers as population
 from tests.app.conftest import Script, background
 from tests.app.different import LASTING, PUSH, TRUE, table
 from tests.app.following import TRUE as EXACT
@@ -144,12 +145,22 @@ def test_drivers_differ_by_default_in_laws_of_second_order(
         assert found == (plan if exact or options.get("drivers") else "none")
 
 
-def test_all_share_their_parameters_where_the_default_cannot_be_estimated(
-    small: pd.DataFrame, caplog: pytest.LogCaptureFixture
+def test_simulations_that_blow_up_are_refused_but_by_default_all_share_their_parameters(
+    small: pd.DataFrame, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    found = nnode.Calibrator("idm", effects=["reaction_delay"], epochs=3).fit(small).result_
+    monkeypatch.setattr(population, "_simulated_finitely", lambda model: False)
+    found = nnode.Calibrator("idm", epochs=3).fit(small).result_
     assert found.drivers is None
     assert "how drivers differ could not be estimated" in caplog.text
+    with pytest.raises(ConfigError, match=r"not simulated to finite .* drivers=none"):
+        nnode.Calibrator("idm", drivers="auto", epochs=3).fit(small)
+
+
+def test_a_short_delay_is_simulated_in_short_steps(small: pd.DataFrame) -> None:
+    delay = {"name": "reaction_delay", "T": 0.3}
+    found = nnode.Calibrator("idm", effects=[delay], drivers=["T"], epochs=3).fit(small).result_
+    assert found.drivers is not None
+    assert found.drivers.differ == ["idm.T"]
 
 
 @pytest.mark.parametrize(
@@ -161,10 +172,6 @@ def test_all_share_their_parameters_where_the_default_cannot_be_estimated(
         ({"drivers": "auto", "pooling": "alone"}, r"choose one of them"),
         ({"drivers": "auto", "model": "krauss"}, r"map from step to step; take .*drivers=none"),
         ({"drivers": ["v0"], "model": "n2"}, r"a network, whose weights"),
-        (
-            {"drivers": "auto", "effects": ["reaction_delay"]},
-            r"not simulated to finite .* drivers=none",
-        ),
     ],
 )
 def test_what_has_no_place_is_refused(
