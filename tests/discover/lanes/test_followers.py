@@ -11,20 +11,25 @@ import nnode
 from benchmarks.drivers import platoons
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.lanes.followers import FollowersEngine
-from nnode.model import Traffic, make_law
+from nnode.model import System, Traffic, make_law
 from nnode.model.effects import Effect
 from nnode.model.effects.lane import Inertia, MultiAnticipation, ReactionDelay, SpeedPeriod
 from nnode.model.extend import extended
 
 
-@pytest.mark.parametrize("memory", [Inertia(tau_v=0.3), ReactionDelay(T=0.5)])
-def test_derivatives_beside_a_memory_are_differences(memory: Effect) -> None:
+def estimated(memory: Effect) -> tuple[FollowersEngine, System]:
+    """Followers, and their law with a memory, calibrated."""
     table = platoons("lin", "inertia", 0.15, 77, number=6, vehicles=4)
     engine = FollowersEngine(list(nnode.sequences(table)))
     system = Traffic([make_law("lin"), memory], leader="measured").double()
     engine.fit_whitening(system, ParameterVector(system).row)
     assert engine.population is not None
-    system = engine.population.system
+    return engine, engine.population.system
+
+
+@pytest.mark.parametrize("memory", [Inertia(tau_v=0.3), ReactionDelay(T=0.5)])
+def test_derivatives_beside_a_memory_are_differences(memory: Effect) -> None:
+    engine, system = estimated(memory)
     row = ParameterVector(system).row
     probe = MultiAnticipation.probes(engine.batch, system)[0]
     (column,) = engine.screen_columns(system, row, MultiAnticipation, probe)
@@ -39,12 +44,7 @@ def test_derivatives_beside_a_memory_are_differences(memory: Effect) -> None:
 
 @pytest.mark.parametrize("memory", [Inertia(tau_v=0.3), ReactionDelay(T=0.3)])
 def test_a_period_of_the_whole_record_is_another_desired_speed(memory: Effect) -> None:
-    table = platoons("lin", "inertia", 0.15, 77, number=6, vehicles=4)
-    engine = FollowersEngine(list(nnode.sequences(table)))
-    system = Traffic([make_law("lin"), memory], leader="measured").double()
-    engine.fit_whitening(system, ParameterVector(system).row)
-    assert engine.population is not None
-    system = engine.population.system
+    engine, system = estimated(memory)
     row = ParameterVector(system).row
     first = SpeedPeriod.probes(engine.batch, system)[0]
     always = replace(first, options={"a": -1e4, "b": 1e4})
