@@ -24,9 +24,10 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-# What takes long beside it: runs that are stopped and gone on with, compiled twice, shared, or interrupted by injected faults.
+# The tests that take more than some seconds each: whole calibrations, diagnoses and studies, code that is compiled for
+# every law, and runs that are interrupted by injected faults.
 thorough: setup
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 -m thorough
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile -m thorough
 
 # The neighbouring programs let run: what they write is read, calibrated and diagnosed. Where one of
 # them cannot be installed, that is said and its tests are skipped.
@@ -39,10 +40,11 @@ exchange: setup
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
 	  -m "not tutorial" $(EXCHANGE)
 
-# Which lines of the package the tests run; below 90 % it fails.
+# Which lines of the package the tests run, thorough ones included; below 90 % it fails.
 coverage: setup
 	rm -rf $(VENV)/coverage && mkdir -p $(VENV)/coverage
-	$(BIN)/coverage run -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+	$(BIN)/coverage run -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
+	  -m "not slow and not tutorial"
 	$(BIN)/coverage combine --quiet
 	rm -f $(VENV)/coverage/data.*  # of processes that were killed while they wrote it
 	$(BIN)/coverage report

@@ -8,7 +8,8 @@ m. ``--nature`` departs from this. With ``--nothing``, nothing is hidden in any 
 ``--effects`` one of the named effects in every case. Paths are
 integrated here by Euler's method; everything else is the package's public interface. The cases of a
 run are fixed by its seed. The table has a row per case; the last lines count right and false
-answers, with exact intervals of 95 %. ``--compare`` only compares laws. ``--calibrate`` only
+answers, with exact intervals of 95 %. These diagnoses do not compare laws; with
+``--default`` they do, as other diagnoses. ``--compare`` only compares laws. ``--calibrate`` only
 calibrates, with nothing hidden; the last lines count intervals that contain the true value.
 """
 
@@ -339,14 +340,19 @@ def cases(
     return chosen
 
 
-def diagnosed(**case: Any) -> dict[str, Any]:
-    """The case with its diagnosis, and intervals of sizes and of differences between drivers."""
+def diagnosed(compare: bool = False, **case: Any) -> dict[str, Any]:
+    """The case with its diagnosis, and intervals of sizes and of differences between drivers.
+
+    Args:
+        compare: whether laws are compared first, as diagnoses do by default.
+    """
     begun, table = time.monotonic(), platoons(**case)
+    laws: list[str] | None = None if compare else []
     report = nnode.diagnose(
         table,
         "traffic",
         model=case["law"],
-        options=DiscoverOptions(page=False, replay=False, compare=[]),
+        options=DiscoverOptions(page=False, replay=False, compare=laws),
     ).plain()
     sizes = _sizes(case["law"], case["effect"])
     intervals = {
@@ -438,6 +444,9 @@ def main() -> None:
         "--effects", nargs="+", help="hidden in all cases, instead of in half of them"
     )
     parser.add_argument("--compare", action="store_true", help="only compare laws")
+    parser.add_argument(
+        "--default", action="store_true", help="compare laws first, as diagnoses do by default"
+    )
     parser.add_argument("--calibrate", action="store_true", help="only calibrate, nothing hidden")
     parser.add_argument("--nothing", action="store_true", help="nothing hidden in any case")
     parser.add_argument("--nature", default="plain", choices=NATURES)
@@ -463,6 +472,8 @@ def main() -> None:
     work = calibrated if given.calibrate else compared if given.compare else diagnosed
     if given.calibrate or given.nothing:
         chosen = [case | {"effect": "none"} for case in chosen]
+    if given.default:
+        chosen = [case | {"compare": True} for case in chosen]
     tasks = [Task(f"{case['law']}-{case['effect']}-s{case['seed']}", work, case) for case in chosen]
     folder = given.table.with_suffix("")
     results = run_tasks(

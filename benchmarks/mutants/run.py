@@ -95,6 +95,7 @@ def outcome(mutant: dict[Hashable, Any], checkout: Path) -> str:
         return "invalid"
     module.write_text(changed, encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+    command += ["-m", "not slow and not tutorial"]
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     try:
         done = subprocess.run(

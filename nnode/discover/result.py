@@ -321,8 +321,8 @@ class ComparedLaw:
 
     Attributes:
         parameters: number of calibrated parameters.
-        error: mean square error of positions of whole sequences, m², in left-out clusters; in
-            crowds, in the calibration clusters.
+        error: mean square error of positions of whole sequences, m², in left-out clusters, with
+            the same parameters for all drivers; in crowds, in the calibration clusters.
         behind: share by which its held-out cost exceeds that of the best law, in the mean of
             logarithms over clusters; or by which the best law's likelihood of a position exceeds
             this one's, see :class:`Laws`.

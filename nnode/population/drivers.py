@@ -40,6 +40,9 @@ SHORT, LONG, LASTING = 1.0, 1 / 3, 3.0
 START_POSITION, START_SPEED = 3.0, (0.02, 3.0, 0.3)
 #: Largest step of a parameter's logarithm, and the tolerance of estimates.
 LONGEST, TOLERANCE = 0.3, 1e-2
+#: Tolerance of estimates that only have to show the best of several starts, whose log likelihoods
+#: usually differ by hundreds.
+ROUGH = 1.0
 #: Number of corrections for bias. The second one halves what the first leaves of the bias of v0 of
 #: ``idm``, and a third one changes little (table in docs/method.md).
 CORRECTIONS = 2
@@ -198,22 +201,29 @@ def with_smaller_errors(population: Population) -> Population:
     return _estimated(population.model, before.theta, variances, before.agents, before.start)
 
 
-def fit_all_random(system: System, paths: Paths, steps: int = RANKING_STEPS) -> Population:
+def fit_all_random(starts: Iterable[tuple[System, Paths]]) -> Population:
     """A quick estimate in which all parameters of the law differ between drivers, for a comparison
     of laws. The variances of those that do not differ become small.
 
     Args:
-        system: the law; the search starts at its parameters. paths: the followers.
-        steps: largest number of steps.
+        starts: the law with different parameters, and its followers. The search continues from
+            those that are most likely after one step.
 
     Raises:
-        ConfigError: a model without a formula. SimulationError: its simulation diverges.
+        ConfigError: a model without a formula.
+        SimulationError: the simulations of all starts diverge.
     """
-    plain = Followers(system, paths)
-    if not _simulated_finitely(plain):
-        raise SimulationError("the followers' paths diverge")
-    model = plain.with_random(plain.may_differ)
-    return _estimated(model, model.start, initial_variances(model), steps=steps)
+    quick = list[Population]()
+    for system, paths in starts:
+        plain = Followers(system, paths)
+        model = plain.with_random(plain.may_differ)
+        with suppress(SimulationError, np.linalg.LinAlgError):
+            if _simulated_finitely(plain):
+                variances = initial_variances(model)
+                quick.append(_estimated(model, model.start, variances, steps=1, tolerance=ROUGH))
+    if not quick:
+        raise SimulationError("the followers' paths diverge from all starts")
+    return _continued(max(quick, key=lambda fit: fit.marginal.loglik), RANKING_STEPS)
 
 
 def obstacle(system: System, sequences: list[Sequence], needed: int = LEAST_DRIVERS) -> str | None:
@@ -314,6 +324,7 @@ def _estimated(
     agents: np.ndarray | None = None,
     start: np.ndarray | None = None,
     steps: int = STEPS,
+    tolerance: float = TOLERANCE,
 ) -> Population:
     """The estimate of a model, from given parameters, standard deviations and, optionally,
     deviations of drivers and of starts."""
@@ -325,7 +336,7 @@ def _estimated(
         low=model.low,
         high=model.high,
         longest=LONGEST,
-        tolerance=TOLERANCE,
+        tolerance=tolerance,
         agents=agents,
         start=start,
         steps=steps,
@@ -424,11 +435,14 @@ def _next_random_effect(best: Population, price: float) -> Population | None:
         if len(improved) == RANKED:
             break
     chosen = max(improved, key=lambda fit: fit.marginal.loglik, default=None)
-    if chosen is None or chosen.estimate.converged:
-        return chosen
-    partial = chosen.estimate
-    modes = partial.agents, partial.start
-    return _estimated(chosen.model, partial.theta, partial.variances, *modes)
+    return chosen if chosen is None or chosen.estimate.converged else _continued(chosen)
+
+
+def _continued(population: Population, steps: int = STEPS) -> Population:
+    """The estimate after further steps."""
+    last = population.estimate
+    modes = last.agents, last.start
+    return _estimated(population.model, last.theta, last.variances, *modes, steps)
 
 
 def _linearised_loglik(best: Population, name: str) -> float:

@@ -269,6 +269,7 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
     json.dumps(report, allow_nan=False)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("by_hand")
 def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(nearest_law, "with_effects", lambda laws, effects: laws)
@@ -288,6 +289,7 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
     assert load_checkpoint(tmp_path / "run" / "checkpoints" / "best.pt").config["seed"] == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("by_hand")
 def test_a_law_that_is_not_rejected_is_diagnosed_alone(tmp_path: Path) -> None:
     report = lin_diagnosed(tmp_path)
@@ -300,6 +302,7 @@ def test_a_law_that_is_not_rejected_is_diagnosed_alone(tmp_path: Path) -> None:
     assert report.nearest is None
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("by_hand")
 @pytest.mark.parametrize("imitated", [False, True])
 def test_laws_are_compared_again_with_the_missing_effect(

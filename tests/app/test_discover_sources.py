@@ -49,6 +49,7 @@ def pedpy(tmp_path: Path) -> Path:
     return tmp_path / "walk.txt"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("source", "options"),
     [

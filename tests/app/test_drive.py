@@ -63,6 +63,7 @@ def scene(sumo: Path, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.thorough
 def test_the_script(script: Script, scene: Path, tmp_path: Path) -> None:
     run, out = run_of(tmp_path / "run", "idm"), tmp_path / "out"
     options = [f"run={run}", f"sumo={scene}", "program=traci", "lengths=true"]

@@ -91,6 +91,7 @@ def options(table: pd.DataFrame, folder: Path) -> list[str]:
     ]
 
 
+@pytest.mark.thorough
 def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
     script: Script, tmp_path: Path, small: pd.DataFrame, fitted: nnode.Calibrator
 ) -> None:
@@ -111,6 +112,7 @@ def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
     script("evaluate", *evaluation, f"hydra.run.dir={tmp_path}/evaluation")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", ["idm", "fvdm"])
 def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model: str) -> None:
     given = pairs(number=6, seconds=20.0)

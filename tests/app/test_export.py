@@ -46,6 +46,7 @@ def traffic(script: Script, raw: Path) -> Path:
     return trained(script, raw, "traffic", "lin")
 
 
+@pytest.mark.thorough
 def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Path) -> None:
     done = script("export", f"run={traffic}", f"hydra.run.dir={tmp_path}")
     account = json.loads((tmp_path / "export.json").read_text())

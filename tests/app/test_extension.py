@@ -148,6 +148,7 @@ def copy(folder: Path) -> Iterator[Script]:
     processes.close()
 
 
+@pytest.mark.thorough
 def test_every_engine_and_what_drivers_do(copy: Script, folder: Path) -> None:
     done = copy(PROGRAM)
     found = json.loads(done.stdout)
@@ -203,6 +204,7 @@ def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path
     assert estimates(tmp_path / "run") == pytest.approx(TRUTH, rel=0.02)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("law", ["polite", "strolling"])
 def test_people_are_trained(copy: Script, law: str, tmp_path: Path) -> None:
     copy(

@@ -101,6 +101,7 @@ def test_crowd_from_raw_file_to_plots(script: Script, raw: Path, tmp_path: Path)
     assert names == {"sf_force_x.png", "sf_force_y.png", "sf_settings.png", "sf_settings.csv"}
 
 
+@pytest.mark.thorough
 def test_sweep_ends_with_one_table_and_survives_a_failing_run(
     script: Script, raw: Path, tmp_path: Path
 ) -> None:
@@ -194,6 +195,7 @@ def test_resuming_and_evaluating_can_be_swept(
         assert {p.name for p in (tmp_path / name).iterdir() if p.is_dir()} == {"0", "1"}
 
 
+@pytest.mark.thorough
 def test_evaluation_tells_what_was_trained_on(
     script: Script, traffic: Path, tmp_path: Path
 ) -> None:

@@ -28,6 +28,7 @@ def simulated(idm_run: Path) -> nnode.Simulated:
     return nnode.simulate(idm_run, samples=SAMPLES)
 
 
+@pytest.mark.thorough
 def test_a_run_is_sampled_and_scored(
     script: Script, idm_run: Path, simulated: nnode.Simulated, tmp_path: Path
 ) -> None:
@@ -106,6 +107,7 @@ def test_in_python_it_is_an_object(simulated: nnode.Simulated, tmp_path: Path) -
     assert simulated.trajectories[0].name.rpartition("/")[2] == first.name.rpartition("/")[2]
 
 
+@pytest.mark.thorough
 def test_drivers_are_drawn_as_they_were_estimated() -> None:
     drives = different.table(1, platoons=8, cars=3, seconds=10.0, noise=0.05, differ={"T": 0.15})[0]
     run = nnode.fit(drives, "traffic", model="idm", drivers=["T"])

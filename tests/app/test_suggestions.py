@@ -158,6 +158,7 @@ def test_the_diagnosis_that_is_printed_runs(script: Script, tmp_path: Path, form
     assert "verdict: " in ran.stdout
 
 
+@pytest.mark.thorough
 def test_what_is_told_in_python_reads_what_is_recognised(tmp_path: Path) -> None:
     """A table is recognised alike in a file and in memory, and by what a check tells."""
     for form, _ in FORMS:

@@ -24,6 +24,7 @@ def run(monkeypatch: pytest.MonkeyPatch, path: Path, *options: str) -> pd.DataFr
     return pd.read_csv(path)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("law", "covered"), [("lin", True), ("fvdm", False)])
 def test_rows_are_scored_and_kept(
     law: str, covered: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -46,6 +46,7 @@ def processes(folder: Path) -> list[dict[str, Any]]:
     return [json.loads((folder / f"process_{rank}.json").read_text()) for rank in (0, 1)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", CASES)
 def test_two_processes_end_where_one_ends(
     together: Path, store: Store, tmp_path: Path, case: str

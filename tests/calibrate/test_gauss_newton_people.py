@@ -87,6 +87,7 @@ def test_derivatives_at_a_bound_stay_inside(people: list[Sequence], at: float) -
     assert slope == pytest.approx((costs[1] - costs[0]) / 1e-5, rel=1e-2)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("start", [(48.0, 35.0, 23.0), (0.1, 300.0, 80.0), (10.0, 30.0, 10.0)])
 def test_the_social_force_is_found_from_any_start(
     people: list[Sequence], start: tuple[float, ...]

@@ -58,6 +58,7 @@ def test_what_the_data_do_not_tell_has_no_variance(which: str, lost: list[bool])
     assert found.flat.tolist() == [on and which == "combination" for on in lost]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("clusters", [4, 8, 20])
 def test_intervals_cover_the_truth_although_clusters_are_few(clusters: int) -> None:
     """Errors that clusters share."""

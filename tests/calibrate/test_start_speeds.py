@@ -43,6 +43,7 @@ def wrong_starts(sequences: list[Sequence]) -> Batch:
     return batch
 
 
+@pytest.mark.thorough
 def test_wrong_first_speeds_are_found_beside_the_parameters() -> None:
     sequences = driven()
     batch = wrong_starts(sequences)
@@ -92,6 +93,7 @@ def test_every_follower_of_a_platoon_has_its_own() -> None:
     assert cost.costs(row)[0] < 1e-8
 
 
+@pytest.mark.thorough
 def test_it_is_said_and_refused_where_there_is_no_speed() -> None:
     table = pairs(number=4, seconds=12.0)
     table.loc[table.time == 0, "v_follower"] += 0.8
@@ -183,6 +185,7 @@ def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
     return found
 
 
+@pytest.mark.thorough
 def test_costs_do_not_rise_from_one_step_of_the_training_loop_to_the_next() -> None:
     """The loop attaches a new copy of the batch before each step. The law of Krauss is a map whose
     cost has several minima over the first speeds, so the search has to go on from the last ones."""

@@ -59,6 +59,7 @@ def test_matlab_values_of_all_kinds(tmp_path: Path, packed: bool) -> None:
     assert isinstance(found["z"], Other)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("packed", [False, True])
 def test_single_bits_of_a_matlab_file_is_read_or_refused(tmp_path: Path, packed: bool) -> None:
     path = tmp_path / "sequence_datax.mat"

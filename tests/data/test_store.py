@@ -330,6 +330,7 @@ def _read_first(store: Store, out: multiprocessing.SimpleQueue) -> None:
     out.put(store[0].x.tobytes())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_a_store_may_cross_into_another_process(folder: Path, method: str) -> None:
     store = Store(folder)

@@ -115,6 +115,7 @@ def plain_acceleration(
     return result
 
 
+@pytest.mark.thorough
 def test_people_are_accelerated_as_the_paper_says(tmp_path: Path) -> None:
     rate, width = 200.0, 1.2
     p = Forces(A=3.0, B=0.2)  # forces that change little between two frames
@@ -158,6 +159,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return demo_data(tmp_path_factory.mktemp("demo"))
 
 
+@pytest.mark.thorough
 def test_the_demo_is_laid_out_like_the_real_data(demo: dict[str, Path]) -> None:
     assert demo["esimas"].parts[-2:] == ("esimas", "sequence_datademo.mat")
     assert demo["juelich"].parts[-2:] == ("juelich", "demo_corridor.txt")
@@ -186,6 +188,7 @@ def test_people_cross_the_corridor_in_both_directions(demo: dict[str, Path]) -> 
     assert 25 <= (table[:, 1].max() - table[:, 1].min()) / 25 <= 36
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same_bytes(
     tmp_path: Path, demo: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

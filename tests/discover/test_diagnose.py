@@ -114,6 +114,7 @@ def test_a_law_whose_parameters_reach_bounds_with_effects_is_noted() -> None:
     assert _reached_bounds(extended, extended) == []
 
 
+@pytest.mark.thorough
 def test_smoothed_positions_are_used_one_second_apart_with_drivers_who_differ() -> None:
     sequences = platoons(relative_speed(KAPPA), **MANY | {"noise": 0.0})
     options = DiscoverOptions(effects=["relative_speed"], structure=False, smoothed=True)

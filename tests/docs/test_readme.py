@@ -26,6 +26,7 @@ PAGES = [
 MADE = {"model=lin_with_speed_zone", "data=i80"}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_every_command_has_options_that_exist(page: Path) -> None:
     for language, text in blocks(page):

@@ -122,6 +122,7 @@ def test_a_model_that_is_code_is_sampled_as_its_formula() -> None:
     torch.testing.assert_close(one, two, rtol=0, atol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("domain", "noise", "number", "seconds"),
     [

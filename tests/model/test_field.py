@@ -183,6 +183,7 @@ def _transfer(name: str, p: Any, omega: float) -> float:
     return abs((p.kappa * slope + s * lam) / (p.kappa * slope + s * s + s * (p.kappa + lam)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "values", "stable"),
     [

@@ -79,6 +79,7 @@ def test_drivers_alike_do_not_differ() -> None:
     assert error == pytest.approx(ERROR, rel=0.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "drivers"),
     [

@@ -108,6 +108,7 @@ def errors(steps: int, contact: float) -> np.ndarray:
     return np.array(away)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("contact", "order", "most"), [(0.0, 2, 0.01), (1.0, 1, 0.1)])
 def test_responses_are_differences_of_simulations(contact: float, order: int, most: float) -> None:
     """Where the force has no corner, the error has the order of the interpolation of its derivative

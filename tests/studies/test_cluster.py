@@ -27,6 +27,7 @@ def scheduler() -> Iterator[str]:
         yield str(cluster.scheduler_address)
 
 
+@pytest.mark.thorough
 def test_tasks_run_in_its_workers_and_are_kept(scheduler: str, tmp_path: Path) -> None:
     log = str(tmp_path / "calls")
     tasks: list[Task] = [

@@ -127,6 +127,7 @@ def test_a_damaged_result_is_computed_again(text: str, tmp_path: Path, caplog) -
     assert calls(tmp_path) == ["2", "2"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("workers", [1, 2])
 def test_failing_tasks_let_the_others_finish(workers: int, tmp_path: Path) -> None:
     kinds = ["data", "python", "list", "object"] + ["exit", "killed"] * (workers > 1)

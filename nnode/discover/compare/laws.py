@@ -1,9 +1,10 @@
 """Comparison of base laws.
 
-Every law is calibrated to the positions of whole sequences. Where drivers may differ, laws are then
-compared by their marginal likelihoods, each with drivers, pushes and parameters of its own, minus a
-price of parameters (BIC). A common parameter for drivers who differ would favour laws that imitate
-differences. The test is that of Vuong 1989, by cluster.
+Every law is calibrated to the positions of whole sequences, with the same parameters for all
+drivers. Where drivers may differ, followers are simulated behind their measured leaders, and laws
+are then compared by their marginal likelihoods, each with drivers, pushes and parameters of its
+own, minus a price of parameters (BIC). A common parameter for drivers who differ would favour laws
+that imitate differences. The test is that of Vuong 1989, by cluster.
 
 Otherwise laws are compared by leave-one-cluster-out costs. The whitening is fitted to the residuals
 of the best law, and all laws are recalibrated to residuals with this common whitening. If another
@@ -80,21 +81,23 @@ def compare_laws(
     used = without_starts(sequences) if differ and exact else sequences
     exploration = [used[i] for i in division.exploration]
     label = division.label[division.exploration]
-    whole = engine_of(asked, exploration, label, whole=True)
-    formulas, refused = dict(candidates), dict[str, str]()
+    formulas, refused, engine = dict(candidates), dict[str, str](), None
     if differ:
         formulas = {key: law for key, law in candidates.items() if follower_formula(law)}
         refused = {key: NO_FORMULA for key in candidates if key not in formulas}
-    fits, failed = _calibrated(whole, formulas, within)
+        engine = FollowersEngine(
+            exploration, label, large=np.inf, apart=spacing(sequences, options)
+        )
+    alike = engine or engine_of(asked, exploration, label, whole=True)
+    fits, failed = _calibrated(alike, formulas, within)
     refused |= failed
     if not fits:
         return Laws([], refused, 0), {}
-    number = np.bincount(whole.cluster)
-    errors = {key: float((heldout(f, whole.cluster) / number).mean()) for key, f in fits.items()}
+    number = np.bincount(alike.cluster)
+    errors = {key: float((heldout(f, alike.cluster) / number).mean()) for key, f in fits.items()}
     if asked.domain == "crowd":  # its residuals are not positions
-        errors = {key: square_of(whole, fit.system) for key, fit in fits.items()}
-    if differ:
-        engine = FollowersEngine(exploration, label, apart=spacing(sequences, options))
+        errors = {key: square_of(alike, fit.system) for key, fit in fits.items()}
+    if engine is not None:
         compared = _by_likelihood(engine, formulas, fits, refused, within)
     else:
         compared = _by_cost(windows_of(asked, exploration, label), fits, errors, within)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -35,7 +34,6 @@ from nnode.discover.lanes.engine import (
 from nnode.discover.outcome import Simulation
 from nnode.discover.residuals.engine import Squares, of_residuals
 from nnode.discover.residuals.variables import Curve
-from nnode.errors import SimulationError
 from nnode.model.effects import Effect, Probe
 from nnode.model.scene import Scene
 from nnode.model.system import System
@@ -283,28 +281,14 @@ class FollowersEngine(TrafficEngine):
         Raises:
             SimulationError: the simulations of all starts diverge.
         """
-        system, paths = self._likeliest_start(starts)
-        population = fit_all_random(system, paths)
+        population = fit_all_random((s, self._paths_for(s, ParameterVector(s).row)) for s in starts)
+        paths = population.model.paths
         cluster = np.zeros(len(paths.names), dtype=int)
         cluster[paths.agent] = self._label[paths.sequence]
         each = np.bincount(cluster, population.marginal.each)
         present = np.bincount(cluster) > 0
         price = (population.marginal.loglik - population.criterion) / present.sum()
         return each[present] - price, population.system
-
-    def _likeliest_start(self, starts: tuple[System, ...]) -> tuple[System, Paths]:
-        """The model that is most likely after one step of its search, and its followers."""
-        candidates = [(s, self._paths_for(s, ParameterVector(s).row)) for s in starts]
-        if len(candidates) == 1:
-            return candidates[0]
-        quick = list[Population]()
-        for system, paths in candidates:
-            with suppress(SimulationError, np.linalg.LinAlgError):
-                quick.append(fit_all_random(system, paths, steps=1))
-        if not quick:
-            raise SimulationError("the followers' paths diverge from all starts")
-        best = max(quick, key=lambda population: population.marginal.loglik)
-        return best.model.system, best.model.paths
 
     def with_usual_variances(self, system: System) -> FollowersEngine:
         """An engine with the variances where searches start, and all parameters of the law that can

@@ -50,6 +50,7 @@ def table(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out"
 
 
+@pytest.mark.thorough
 def test_training_needs_the_folder_alone(script: Script, table: Path, tmp_path: Path) -> None:
     arguments = ["trainer.max_epochs=1", f"hydra.run.dir={tmp_path}"]
     script("train", f"data.prepared={table}", *arguments)

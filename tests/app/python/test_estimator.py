@@ -59,6 +59,7 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
     assert found.score(pairs(number=2, seconds=20.0, seed=5)) == pytest.approx(0, abs=1e-3)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("given", "options"),
     [
@@ -280,6 +281,7 @@ def test_anonymous_pairs_have_intervals() -> None:
     assert alone.parameters_.lower.isna().all()
 
 
+@pytest.mark.thorough
 @pytest.mark.real
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(

@@ -76,6 +76,7 @@ def test_nothing_missing_is_an_empty_table() -> None:
     assert panel.get_ylabel() == "position along the lane (m)"
 
 
+@pytest.mark.thorough
 def test_the_order_of_rows_and_sequences_changes_no_diagnosis() -> None:
     frame = as_table(platoons(number=12, seconds=6.0))
     shuffled = frame.sample(frac=1.0, random_state=3)

@@ -111,6 +111,7 @@ def test_the_default_has_all_arms():
         assert len({case["effects"][0] for case in part if case["arm"] == "outside"}) >= 4
 
 
+@pytest.mark.thorough
 def test_each_threshold_is_halved_and_doubled(tmp_path):
     rows = run(tmp_path, **ONE, kinds=["rules"], effects=["inertia"])
     number = sum(name.isupper() for name in vars(thresholds))

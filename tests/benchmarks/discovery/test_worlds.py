@@ -78,6 +78,7 @@ def test_a_world_of_a_law_is_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (second["law"], second["right"], second["false_names"]) == ("idm", False, "memory")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["krauss_light", "krauss_lane_drop", "krauss_factors"])
 def test_sumo_drives_a_scene(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("sumo")

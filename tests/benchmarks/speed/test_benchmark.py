@@ -69,6 +69,7 @@ def series(monkeypatch) -> None:  # type: ignore[no-untyped-def]
         monkeypatch.setitem(SHAPES, name, shapes)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("engine", ["loop", pytest.param("fused_1", marks=pytest.mark.thorough)])
 def test_a_series_is_drawn(engine, series, tmp_path) -> None:  # type: ignore[no-untyped-def]
     chosen = {"shapes": ["steps", "scale"], "engines": ["odeint", engine]}

@@ -9,6 +9,7 @@ import pytest
 from benchmarks.speed.driving import LAWS, SECONDS, STEP, alone, measured, rows, scene
 
 
+@pytest.mark.thorough
 def test_a_small_case() -> None:
     pytest.importorskip("sumo")
     found = list(rows([25], LAWS, ["traci"], repeats=1))

@@ -26,6 +26,7 @@ def read(folder: Path):
     return read_table(folder / TABLE, TableOptions(domain="crowd"), folder / WALLS)
 
 
+@pytest.mark.thorough
 def test_equal_cases_give_equal_files_that_the_reader_takes(tmp_path):
     case = small("group_cohesion")
     for name in "ab":
@@ -47,6 +48,7 @@ def test_equal_cases_give_equal_files_that_the_reader_takes(tmp_path):
     assert len({agent for s in sequences for agent in s.agents}) == 32
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("effect", list(EFFECTS))
 def test_an_oracle_explains_sound_data_and_the_base_law_does_not(effect):
     made = CrowdCase(small(effect, noise=0.0))

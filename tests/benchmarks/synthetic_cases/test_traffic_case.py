@@ -30,6 +30,7 @@ def read(folder: Path):
     return read_table(folder / TABLE, TableOptions(domain="traffic"))
 
 
+@pytest.mark.thorough
 def test_equal_cases_give_equal_files_and_other_seeds_others(tmp_path):
     one = small("relative_speed", strength="full")
     for name, case in (("a", one), ("b", one), ("c", replace(one, seed=1))):

@@ -392,6 +392,7 @@ REAL = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.real
 @pytest.mark.parametrize("name", REAL)
 def test_real_files_are_recognised(real_data: Path, name: str) -> None:

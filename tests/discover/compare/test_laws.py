@@ -39,6 +39,7 @@ def selection(fit: Fit, effect: str) -> Selection:
     return Selection(fit, [Step(chosen, [])])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("true", ["idm", "lin"])
 def test_the_true_law_comes_first(true: str) -> None:
     table, parameters = measured(true, 5, sequences=24, vehicles=4, seconds=20.0)

@@ -48,6 +48,7 @@ def test_livelier_leaders_tell_more(engine: TrafficEngine) -> None:
     assert lively > 50 * calm > 0
 
 
+@pytest.mark.thorough
 def test_the_number_of_platoons_tells_with_the_probability_that_is_asked_for(
     engine: TrafficEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -83,6 +83,7 @@ def test_a_delay_is_simulated_precisely() -> None:
     assert error < 0.05 * engine.squares(lin(), ROW).means().mean()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("data", ["reacting", "plain"])
 def test_an_effect_is_named_and_measured_where_it_is_hidden(
     data: str, request: pytest.FixtureRequest

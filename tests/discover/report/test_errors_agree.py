@@ -66,6 +66,7 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     return Run(found, sequences, folder)
 
 
+@pytest.mark.thorough
 def test_errors_are_those_of_the_simulations_that_are_shown(run: Run) -> None:
     rows = run.found.diagnosis.sealed
     assert len(rows) == len(run.found.simulated) > 3

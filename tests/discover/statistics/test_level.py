@@ -27,6 +27,7 @@ class Truck(VehicleClass):
     strengths: ClassVar = {"phi": replace(VehicleClass.strengths["phi"], min_effect_size=None)}
 
 
+@pytest.mark.thorough
 def test_clusters_keep_the_level_where_windows_do_not() -> None:
     """Nothing is hidden; every driver is in a mood that outlasts his ten windows of 5 s."""
     alarms = {"clusters": 0, "windows": 0}

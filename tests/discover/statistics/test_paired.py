@@ -73,6 +73,7 @@ def rivals(rng: np.random.Generator, true: int, clusters: int = 24) -> list[Fit]
     return [regression(-one[:, None], made) for one in columns]
 
 
+@pytest.mark.thorough
 def test_a_wrong_rival_is_outdone_and_a_true_one_is_not() -> None:
     rng = np.random.default_rng(5)
     cluster = np.repeat(np.arange(24), 20)

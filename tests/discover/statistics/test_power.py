@@ -67,6 +67,7 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
     return bool(likelier and p_value <= thresholds.EACH and together <= ALPHA)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("size", "sealed"), [(0.15, 5), (0.15, 16)])
 def test_power_is_how_often_the_whole_search_names(size: float, sealed: int) -> None:
     rng = np.random.default_rng(1)

@@ -65,6 +65,7 @@ def judged(
     return simultaneous(cast(Any, engine), cast(Any, fit), seed)
 
 
+@pytest.mark.thorough
 def test_independent_agents_give_every_p_value_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "SHIFTS", 199)  # the level is exact with any number
     # of more than a few clusters, as what all have in common since their start is taken out

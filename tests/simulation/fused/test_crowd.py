@@ -236,6 +236,7 @@ def test_a_cutoff_that_leaves_out_contacts(people: list[Sequence]) -> None:
         FusedSolver(DT, cutoff=0.4)(Crowd(MODELS["sf"]()), collate(people))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_loops_are_vector_code(name: str) -> None:
     # losing this makes everything ten times slower and nothing else would tell

@@ -60,6 +60,7 @@ def near(a: np.ndarray, b: np.ndarray, cutoff: float) -> set[tuple[int, int]]:
     return {(int(i), int(j)) for i, j in np.argwhere(away < cutoff**2)}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("cutoff", [0.7, 1.0, 1.65, 100.0])
 @pytest.mark.parametrize("name", PLACES)
 def test_all_pairs_once(name: str, cutoff: float) -> None:

@@ -49,6 +49,7 @@ def fresh(tmp_path, monkeypatch) -> Path:  # type: ignore[no-untyped-def]
     return Path(tmp_path)
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(platform.machine() not in PACKED, reason="unknown instruction set")
 @pytest.mark.parametrize(
     ("law", "dtype"),

@@ -32,6 +32,7 @@ def tables(blocks: list[Block]) -> dict[str, pd.DataFrame]:
     return {b.name: b.full for b in blocks if isinstance(b, TableBlock) and b.full is not None}
 
 
+@pytest.mark.thorough
 def test_costs_are_in_both_units(tables: dict[str, pd.DataFrame]) -> None:
     table = tables["crowd_costs"]
     assert table.loc["SF", "printed (m²)"] == printed.costs["sf"]

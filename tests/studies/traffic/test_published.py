@@ -82,6 +82,7 @@ def test_the_average_is_one(table: pd.DataFrame) -> None:
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("model", "label"), [("sf", "SF"), pytest.param("nn", "NN", marks=pytest.mark.thorough)]
 )

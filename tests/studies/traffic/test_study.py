@@ -136,6 +136,7 @@ SEARCHED = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", SEARCHED)
 def test_laws_cost_what_a_direct_search_found(model: str, esimas: str) -> None:
     for name, expected in zip(printed.recordings, SEARCHED[model], strict=True):
