@@ -47,8 +47,8 @@ FLOOR = 0.01
 #: Range of white measurement errors, m. Below it, positions were simulated, or they were smoothed:
 #: then their errors are autocorrelated, which the likelihood neglects. SUMO's paths at 5 Hz, which
 #: have no errors, seem to have errors of 0.011 m. Above it, smoothed leaders keep too much noise:
-#: ESIMAS's errors of 0.57 m are attributed to pushes. Tables in docs/discovery.md compare both
-#: approaches.
+#: ESIMAS's errors of 0.57 m are attributed to pushes. A table in docs/discovery_earlier.md compares
+#: both approaches.
 NOISE = (0.015, 0.45)
 #: Longest step of laws that are maps from step to step, s: SUMO's default.
 MAPPED = 0.1

@@ -52,10 +52,10 @@ def influence(population: Population, cluster: np.ndarray) -> tuple[ClusterInflu
 def deviation_intervals(population: Population) -> np.ndarray:
     """``(V, 2)`` intervals of 95 % of the standard deviations and times, in the order of
     :attr:`nnode.population.estimate.Variances.row`; NaN at a bound, if the likelihood is not
-    concave, or of the time of a process whose standard deviation may be 0."""
+    concave, or of the time of a process whose standard deviation may be 0. The likelihood hardly
+    depends on such a process, which is therefore fixed for the intervals of the others."""
     variances, data = population.estimate.variances, population.estimate.data
     logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
-    free = np.flatnonzero(at_bounds(logs, low, high, NEAR) == "")
     theta, model = population.estimate.theta, population.model
     products: dict[tuple[float, ...], Products] = {}
 
@@ -75,22 +75,8 @@ def deviation_intervals(population: Population) -> np.ndarray:
             high=model.high - theta,
         ).loglik
 
-    steps, size = DIFFERENCE * np.eye(len(free)), len(free)
-    curvature = np.zeros((size, size))
-    for i in range(size):
-        for j in range(i + 1):
-            sum_step, difference_step = steps[i] + steps[j], steps[i] - steps[j]
-            cross = sum(
-                sign * loglik(free, logs[free] + move)
-                for sign, step in ((1, sum_step), (-1, difference_step))
-                for move in (step, -step)
-            )
-            curvature[i, j] = curvature[j, i] = -cross / (4 * DIFFERENCE**2)
-    half = np.full(len(logs), np.nan)
-    if size and np.linalg.eigvalsh(curvature).min() > 0:
-        half[free] = ndtri(0.5 + LEVEL / 2) * np.sqrt(np.diag(np.linalg.inv(curvature)))
-    ends: np.ndarray = np.exp(logs[:, None] + half[:, None] * np.array([-1.0, 1.0]))
-    peak, noise = loglik(free, logs[free]), NOISE[: len(variances.noise)]
+    noise, peak = NOISE[: len(variances.noise)], loglik(slice(None), logs)
+    ends, free = np.full((len(logs), 2), np.nan), at_bounds(logs, low, high, NEAR) == ""
     for k in map(int, np.flatnonzero((low < high)[: len(noise) + len(variances.spread)])):
         name = noise[k] if k < len(noise) else ""
         if name.endswith("_time") or peak - loglik(k, low[k]) >= DROP:
@@ -100,9 +86,24 @@ def deviation_intervals(population: Population) -> np.ndarray:
             return peak - loglik(k, value) - DROP
 
         upper = brentq(difference, logs[k], high[k]) if difference(high[k]) > 0 else high[k]
-        ends[k] = 0.0, np.exp(upper)
+        ends[k], free[k] = (0.0, np.exp(upper)), False
         if f"{name}_time" in noise:
-            ends[noise.index(f"{name}_time")] = np.nan
+            free[noise.index(f"{name}_time")] = False
+    places = np.flatnonzero(free)
+    steps, size = DIFFERENCE * np.eye(len(places)), len(places)
+    curvature = np.zeros((size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            sum_step, difference_step = steps[i] + steps[j], steps[i] - steps[j]
+            cross = sum(
+                sign * loglik(places, logs[places] + move)
+                for sign, step in ((1, sum_step), (-1, difference_step))
+                for move in (step, -step)
+            )
+            curvature[i, j] = curvature[j, i] = -cross / (4 * DIFFERENCE**2)
+    if size and np.linalg.eigvalsh(curvature).min() > 0:
+        half = ndtri(0.5 + LEVEL / 2) * np.sqrt(np.diag(np.linalg.inv(curvature)))
+        ends[places] = np.exp(logs[places, None] + half[:, None] * np.array([-1.0, 1.0]))
     return ends
 
 

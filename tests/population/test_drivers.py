@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -138,6 +140,25 @@ def test_pushes_that_do_not_exist_have_an_interval_from_zero() -> None:
     assert push[0] == 0.0
     assert found.estimate.variances.noise[0] < push[1] < 0.1
     assert np.isnan(lasting).all()
+
+
+def test_errors_that_may_not_exist_leave_the_intervals_of_the_others() -> None:
+    sequences, _ = platoons(0.15, 1)
+    found = fit_drivers(law(), paths_of(sequences, 0.2), ["v0"], pairs=0)
+    before = found.estimate.variances
+    low, high = before.low.copy(), before.high.copy()
+    tiny = replace(
+        before,
+        noise=np.append(before.noise, [0.003, 0.3]),
+        low=np.insert(low, 3, [0.001, 0.1]),
+        high=np.insert(high, 3, [1.0, 5.0]),
+    )
+    beside = replace(found, estimate=replace(found.estimate, variances=tiny))
+    ends, without = deviation_intervals(beside), deviation_intervals(found)
+    np.testing.assert_allclose(ends[[0, 1, 5]], without[[0, 1, 3]], rtol=1e-3)
+    assert ends[3, 0] == 0.0
+    assert 0.003 < ends[3, 1] < ERROR
+    assert np.isnan(ends[4]).all()
 
 
 def test_simulated_drivers_start_at_the_gaps_that_they_keep() -> None:
