@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, cast
@@ -67,6 +68,8 @@ DIFFERENCE, START_DIFFERENCE = 1e-6, 1e-4
 #: Antithetic pairs of simulations that estimate the bias. The Monte Carlo error of four pairs is
 #: about 15 % of an estimate's standard error.
 PAIRS = 4
+#: At most so many times as many pairs are simulated as are used, see :func:`simulated_pairs`.
+ATTEMPTS = 3
 #: The push on the highest rate ``(R, F)``, as a function of the index of the time in the paths
 #: ahead, and of states and rates ``(M, R, F)``.
 Push = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
@@ -617,7 +620,7 @@ class Followers:
             draw: of deviations of drivers, pushes and errors.
 
         Raises:
-            SimulationError: drawn drivers blow up.
+            SimulationError: a drawn driver passes the vehicle ahead, or his path blows up.
         """
         paths, (push, push_time, error, *lasting) = self.paths, estimate.variances.noise
         agents = estimate.variances.spread * draw(estimate.agents.shape)
@@ -635,8 +638,9 @@ class Followers:
         start = estimate.start.copy()
         start[:, 0] -= self._longer_distance(estimate, agents - estimate.agents)
         x = self.simulate(parameters[None], start.T[None], pushes)[:, 0, 0].T
-        if not np.isfinite(x[paths.observed]).all():
-            raise SimulationError("followers with drawn parameters and disturbances blow up")
+        behind = x[paths.observed] < paths.ahead_at_samples[:, 0].T[paths.observed]
+        if not behind.all():  # of a path that blows up, this is False
+            raise SimulationError("followers with drawn parameters pass the vehicle ahead")
         return paths.remeasured(x, errors)
 
     def _longer_distance(self, estimate: Estimate, change: np.ndarray) -> np.ndarray:
@@ -681,19 +685,47 @@ def score_biases(
     pair of draws, in which the linear part of the score cancels.
 
     Args:
-        seed: of the draws. pairs: their number.
+        seed, pairs: see :func:`simulated_pairs`.
+
+    Raises:
+        SimulationError: see :func:`simulated_pairs`.
     """
-    biases = []
-    for pair in range(pairs):
-        changes = []
-        for draw in antithetic_draws(seed + pair):
-            paths = model.simulated_paths(estimate, draw)
-            modes = fit_deviations(
-                model.with_paths(paths), noise, estimate.theta, estimate.variances
-            )
-            changes.append(modes.marginal.change)
-        biases.append(np.mean(changes, 0))
-    return np.stack(biases)
+    simulated = simulated_pairs(model, noise, estimate, seed, pairs)
+    return np.array(
+        [np.mean([modes.marginal.change for _, modes in pair], 0) for pair in simulated]
+    )
+
+
+def simulated_pairs(
+    model: Followers, noise: Noise, estimate: Estimate, seed: int, pairs: int
+) -> list[list[tuple[Followers, Estimate]]]:
+    """Antithetic pairs of simulated data of an estimated model: the model with these data, and the
+    deviations of their drivers.
+
+    A drawn driver can come so close to the vehicle ahead that the law throws him off the road. Such
+    a driver alone would determine the scores, so the pair is replaced by the next one. The same is
+    done if the search for deviations does not converge.
+
+    Args:
+        seed: of the first pair; the others have the following ones. pairs: their number.
+
+    Raises:
+        SimulationError: fewer than one in :data:`ATTEMPTS` pairs can be used.
+    """
+    simulated = list[list[tuple[Followers, Estimate]]]()
+    for attempt in range(ATTEMPTS * pairs):
+        pair = list[tuple[Followers, Estimate]]()
+        with suppress(SimulationError, np.linalg.LinAlgError):
+            for draw in antithetic_draws(seed + attempt):
+                drawn = model.with_paths(model.simulated_paths(estimate, draw))
+                pair.append(
+                    (drawn, fit_deviations(drawn, noise, estimate.theta, estimate.variances))
+                )
+        if len(pair) == 2 and all(modes.converged for _, modes in pair):
+            simulated.append(pair)
+        if len(simulated) == pairs:
+            return simulated
+    raise SimulationError("most simulations of the estimated model have drivers who leave the road")
 
 
 def antithetic_draws(seed: int) -> list[Draw]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,15 +13,16 @@ from benchmarks.drivers import LASTS, PUSH, T
 from benchmarks.drivers import platoons as benchmark_platoons
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
-from nnode.errors import ConfigError
+from nnode.errors import ConfigError, SimulationError
 from nnode.model import Traffic, make_law
 from nnode.model.effects import Effect
 from nnode.model.effects.lane import Inertia, ReactionDelay, SpeedZone
 from nnode.model.term import Interval
+from nnode.population import followers
 from nnode.population.drivers import fit_drivers
 from nnode.population.followers import longest_step, paths_of
 from nnode.population.intervals import deviation_intervals, influence
-from nnode.population.likelihood import NOISE
+from nnode.population.likelihood import NOISE, PushNoise
 from tests.discover.platoons import DT, LENGTH, V0
 from tests.discover.platoons import platoons as following
 
@@ -159,6 +161,26 @@ def test_errors_that_may_not_exist_leave_the_intervals_of_the_others() -> None:
     assert ends[3, 0] == 0.0
     assert 0.003 < ends[3, 1] < ERROR
     assert np.isnan(ends[4]).all()
+
+
+def test_simulations_with_a_driver_who_passes_the_vehicle_ahead_are_replaced(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sequences, _ = platoons(0.15, 1)
+    found = fit_drivers(law(), paths_of(sequences, 0.2), ["v0"], pairs=0)
+    simulated = partial(followers.simulated_pairs, found.model, PushNoise(), found.estimate)
+    (usual,) = simulated(seed=1, pairs=1)
+    draws = followers.antithetic_draws
+
+    def passing(below: int, seed: int) -> list[followers.Draw]:
+        return [lambda shape: np.full(shape, 30.0)] * 2 if seed < below else draws(seed)
+
+    monkeypatch.setattr(followers, "antithetic_draws", partial(passing, 1))
+    (replaced,) = simulated(seed=0, pairs=1)
+    np.testing.assert_array_equal(replaced[0][0].paths.x, usual[0][0].paths.x)
+    monkeypatch.setattr(followers, "antithetic_draws", partial(passing, 99))
+    with pytest.raises(SimulationError, match="leave the road"):
+        simulated(seed=0, pairs=1)
 
 
 def test_simulated_drivers_start_at_the_gaps_that_they_keep() -> None:

@@ -54,9 +54,9 @@ from nnode.population.followers import (
     Followers,
     Paths,
     Push,
-    antithetic_draws,
     paths_of,
     score_biases,
+    simulated_pairs,
 )
 from nnode.population.likelihood import PushNoise, Whitening, marginal
 from nnode.simulation.numpy import strides
@@ -313,11 +313,13 @@ class FollowersEngine(TrafficEngine):
         """Engines of paths simulated by a model, with deviations of drivers, pushes and measurement
         errors as estimated under it: an antithetic pair of draws."""
         refitted, engines = self._deviations_under(system, row), []
-        for draw in antithetic_draws(seed):
+        (pair,) = simulated_pairs(refitted.model, PushNoise(), refitted.estimate, seed, pairs=1)
+        for model, modes in pair:
             engine = copy.copy(self)
-            paths = refitted.model.simulated_paths(refitted.estimate, draw)
-            engine._paths_by_step = {strides(paths.dt, 2 * paths.half + 1e-9): paths}
-            engine._set_population(refit(refitted, refitted.model.system, paths, fixed=True))
+            engine._paths_by_step = {
+                strides(model.paths.dt, 2 * model.paths.half + 1e-9): model.paths
+            }
+            engine._set_population(replace(refitted, model=model, estimate=modes))
             engines.append(engine)
         return engines
 
