@@ -119,8 +119,8 @@ def remarks(diagnosis: Diagnosis) -> list[str]:
     """Remarks on the verdict: a better-fitting law, faults of the measurement."""
     sentences, laws = [], diagnosis.laws_again or diagnosis.laws
     if laws is not None and laws.nearest not in ("", diagnosis.model):
-        best = _listed([laws.nearest, *laws.effects])
-        sentences.append(f"Of the compared laws, {best} fits best.")
+        added = f", each with {_listed(laws.effects)}," if laws.effects else ","
+        sentences.append(f"Of the compared laws{added} {laws.nearest} fits best.")
     faults = diagnosis.data_faults
     if faults:
         where = len({fault.sequence for fault in faults})
