@@ -35,6 +35,7 @@ def test_the_page_is_committed_and_nothing_else_of_the_folder(page: str) -> None
     assert git("check-ignore", "--no-index", "--quiet", f"{folder}/mine").returncode == 0
 
 
+@pytest.mark.thorough
 def test_every_folder_that_a_script_writes_to_is_listed() -> None:
     pages = {page.partition("/")[0]: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
     for script in (ROOT / "scripts").glob("*.py"):

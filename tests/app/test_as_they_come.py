@@ -70,6 +70,7 @@ def known(platoons: pd.DataFrame) -> pd.DataFrame:
     return fitted(nnode.sequences(platoons))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("form", FORMS)
 def test_a_fit_does_not_depend_on_how_the_table_is_written(
     platoons: pd.DataFrame, known: pd.DataFrame, form: str

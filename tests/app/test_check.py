@@ -16,6 +16,7 @@ from tests.app.conftest import Script
 from tests.data.check.planted import cars, people, saved, text
 
 
+@pytest.mark.thorough
 def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
     table = cars()
     table["t"] = (1000 * table["t"]).round().astype(int)

@@ -91,6 +91,7 @@ def test_from_python(scene: Path, tmp_path: Path) -> None:
     assert 0 < found.in_sumo < found.wall
 
 
+@pytest.mark.thorough
 def test_steps_are_those_of_the_run(scene: Path, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", "idm", dt=0.05, method="semi_implicit")
     options: dict[str, Any] = {

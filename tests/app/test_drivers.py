@@ -45,6 +45,7 @@ def fitted(small: pd.DataFrame) -> nnode.Calibrator:
     return nnode.Calibrator("idm", drivers=["T"], seed=3).fit(small)
 
 
+@pytest.mark.thorough
 def test_the_typical_driver_and_every_driver_are_found(
     drawn: tuple[pd.DataFrame, Own], fitted: nnode.Calibrator
 ) -> None:
@@ -165,6 +166,7 @@ def test_a_short_delay_is_simulated_in_short_steps(small: pd.DataFrame) -> None:
     assert found.drivers.differ == ["idm.T"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -88,6 +88,7 @@ def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Pat
     assert {"cost/train", "cost/heldout", "parameters/lin.v0"} <= set(history["quantity"])
 
 
+@pytest.mark.thorough
 def test_idm_s_vehicle_type_has_the_run_s_intervals(
     script: Script, idm_run: Path, tmp_path: Path
 ) -> None:

@@ -188,10 +188,12 @@ def estimates(run: Path) -> dict[str, float]:
     }
 
 
+@pytest.mark.thorough
 def test_training_recovers_the_truth(trained: Path) -> None:
     assert estimates(trained) == pytest.approx(TRUTH, rel=0.02)
 
 
+@pytest.mark.thorough
 def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path) -> None:
     """The law stands in a folder of configurations, the effect in a file of ``NNODE_EFFECTS``."""
     conf = tmp_path / "conf" / "model"
@@ -260,6 +262,7 @@ def test_it_is_found_and_shown(
     assert named["formula"] in page
 
 
+@pytest.mark.thorough
 def test_it_drives_in_sumo(copy: Script, trained: Path, tmp_path: Path) -> None:
     by_sumo.write_scene(
         Path(pytest.importorskip("sumo").SUMO_HOME), tmp_path, "Krauss", {"decel": 4.5}

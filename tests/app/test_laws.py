@@ -5,10 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 from nnode.model.effects import CATALOGUE
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 
 
+@pytest.mark.thorough
 def test_the_catalogue_is_printed_whole() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "nnode.app.laws"], capture_output=True, text=True, check=True

@@ -75,6 +75,7 @@ def test_evaluate_beats_the_baselines_and_agrees_with_training(
     assert everything["J"] == metrics["J"]  # and there is no fault to keep in them
 
 
+@pytest.mark.thorough
 def test_plot_forces_draws_one_and_many(script: Script, traffic: Path, tmp_path: Path) -> None:
     paths = ",".join(str(traffic / "checkpoints" / name) for name in ("best.pt", "last.pt"))
     script("plot_forces", f"checkpoint=[{paths}]", f"hydra.run.dir={tmp_path}")
@@ -228,6 +229,7 @@ class Draught(Effect):
 """
 
 
+@pytest.mark.thorough
 def test_a_run_without_compiled_code_says_so(script: Script, raw: Path, tmp_path: Path) -> None:
     (tmp_path / "draught.py").write_text(OWN)
     done = script(

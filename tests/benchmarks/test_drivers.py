@@ -55,6 +55,7 @@ def test_rows_are_scored_and_kept(
     ]
 
 
+@pytest.mark.thorough
 def test_laws_are_compared_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     laws = {name: build_model(model_options(name, "measured")) for name in ("lin", "log")}
     monkeypatch.setattr(drivers, "candidates", lambda *given: laws)

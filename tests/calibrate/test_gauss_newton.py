@@ -83,6 +83,7 @@ def test_costs_of_platoons_are_those_that_come_with_slopes(kind: Convention) -> 
     np.testing.assert_allclose(cost.costs(cost.start), wanted.detach().numpy(), rtol=1e-11)
 
 
+@pytest.mark.thorough
 def test_costs_are_what_their_names_say(pairs: Batch) -> None:
     run = TorchdiffeqSolver(None, "discrete")(model(T=1.1), pairs)
     found = {kind: sequence_costs(run, pairs, kind).detach().numpy() for kind in FOLLOWING}

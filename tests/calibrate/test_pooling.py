@@ -28,6 +28,7 @@ def own(kind: Pooling, sequences: list[Sequence]) -> SequenceParameters:
     return sequence_parameters(kind, known(), sequences, cost, seed=0)
 
 
+@pytest.mark.thorough
 def test_drivers_who_differ_are_told_apart() -> None:
     found = own(Pooling.alone, driven(time_gaps=TIME_GAPS))
     assert found.table["T"].to_numpy() == pytest.approx(TIME_GAPS, rel=1e-3)

@@ -266,6 +266,7 @@ def test_plot(tmp_path: Path, domain: Domain) -> None:
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.thorough
 def test_memory_grows_with_the_number_of_vehicles() -> None:
     # the matrix of all distances has 3.2 GB
     n = 20_000

@@ -235,6 +235,7 @@ def test_platoons_follow_the_law_of_the_table(tmp_path: Path) -> None:
     assert inside > 100
 
 
+@pytest.mark.thorough
 def test_drivers_and_noise_of_platoons_are_as_asked_for(tmp_path: Path) -> None:
     still = SlowZone(drivers=0.0, noise=0.0)
     clean, noisy = (

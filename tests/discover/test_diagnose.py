@@ -59,6 +59,7 @@ def test_a_hidden_effect_is_named_with_its_coefficient_and_what_it_changes(
     assert "relative_speed" in names
 
 
+@pytest.mark.thorough
 def test_nothing_is_named_where_the_law_is_right() -> None:
     sequences = platoons(**MANY)
     options = DiscoverOptions(effects=["relative_speed", "speed_zone", "free_flow_speed"])
@@ -81,6 +82,7 @@ def test_nothing_is_named_where_the_law_is_right() -> None:
     assert d.gap.after == d.gap.before
 
 
+@pytest.mark.thorough
 def test_a_desired_speed_that_never_binds_cannot_be_tested() -> None:
     options = DiscoverOptions(effects=["free_flow_speed"], structure=False)
     d = diagnose(LAW, platoons(**MANY, calm=0.05, noise=0.1), options).diagnosis

@@ -76,6 +76,7 @@ def platoon_engine() -> TrafficEngine:
     return engine
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("base", "kind", "own"),
     [
@@ -112,6 +113,7 @@ def test_a_lane_asks_an_individual_effect_what_it_does(
     assert not columns[4].any()
 
 
+@pytest.mark.thorough
 def test_a_law_of_another_kind_is_diagnosed_in_a_lane() -> None:
     engine = TrafficEngine(platoons(number=4, driver=0.2))
     fit = converged_fit(engine, Traffic([Optimal()], leader="measured"), rounds=1)

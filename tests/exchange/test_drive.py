@@ -142,6 +142,7 @@ def test_where_no_step_ends_at_rest_ballistic_steps_are_the_same(
     assert apart(system, seen, "ballistic") < ROUNDED
 
 
+@pytest.mark.thorough
 def test_both_ways_to_run_sumo_are_the_same(sumo: Path, tmp_path: Path) -> None:
     pytest.importorskip("libsumo")
     seen = [
@@ -163,6 +164,7 @@ FIRST_ORDER = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", FIRST_ORDER)
 def test_laws_of_first_order(sumo: Path, program: str, tmp_path: Path, name: str) -> None:
     system = model("lin", *FIRST_ORDER[name], **LIN)
@@ -189,6 +191,7 @@ def test_effects_on_accelerations(sumo: Path, program: str, tmp_path: Path, name
     assert apart(system, seen, "semi_implicit") < 2 * ROUNDED
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["krauss", "gipps", "newell"])
 def test_other_laws_of_the_field(sumo: Path, program: str, tmp_path: Path, name: str) -> None:
     system = model(name)
@@ -232,6 +235,7 @@ def two_edges(home: Path, folder: Path, *, length: int, lanes: int, speed: int) 
     by_sumo.network(home, folder, nodes, edges)
 
 
+@pytest.mark.thorough
 def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path: Path) -> None:
     """Two lanes over two edges, a slow vehicle that is overtaken, a flow that leaves at the end."""
     two_edges(sumo, tmp_path, length=400, lanes=2, speed=30)

@@ -132,6 +132,7 @@ def test_an_order_for_everybody_even_in_a_ring() -> None:
     assert [g.tolist() for g in groups[3:]] == [[4], [6], [5]]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["lin", "idm", "ovm", "fvdm", "gipps", "krauss"])
 def test_laws_with_a_speed_on_an_empty_road(name: str) -> None:
     drivers = Drivers(model(name), DT, "semi_implicit")

@@ -161,6 +161,7 @@ def test_noise_is_found_again(domain: str, noise: Noise, number: int, seconds: f
     assert fitted.noise.measurement == pytest.approx(wanted, rel=0.1, abs=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("domain", "drivers"), [("traffic", 0.0), ("crowd", 0.1)])
 def test_bands_cover_what_was_sampled_from_the_model_itself(domain: str, drivers: float) -> None:
     noise = Noise(0.3, 1.5, 0.0, drivers)
@@ -178,6 +179,7 @@ def test_bands_cover_what_was_sampled_from_the_model_itself(domain: str, drivers
     assert abs(np.mean(inside) - 0.95) < 3 * math.sqrt(0.95 * 0.05 / number)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("domain", "solver", "how"),
     [
@@ -222,6 +224,7 @@ def test_drivers_with_parameters_of_their_own_move_by_these() -> None:
     torch.testing.assert_close(moved.x, solver(system, batch).x)
 
 
+@pytest.mark.thorough
 def test_parameters_are_drawn_for_each_driver() -> None:
     batch, noise = measured("traffic", 1, 20.0), Noise(0.0, 1.0, parameters={"idm.T": 0.2})
     system = model("traffic")
@@ -238,6 +241,7 @@ def test_parameters_are_drawn_for_each_driver() -> None:
     assert float(x[-1, :, 0].std()) < 0.2 * float(response[0])
 
 
+@pytest.mark.thorough
 def test_paces_are_drawn_around_the_measured_ones() -> None:
     batch = measured("crowd", 2, 20.0)
     x = sample(model("crowd"), batch, Noise(0.0, 1.0, 0.0, 0.2), 500, seed=0).x

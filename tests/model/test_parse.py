@@ -145,6 +145,7 @@ def test_what_is_written_is_what_was_read(text: str) -> None:
     assert parse(plain(parse(text))) is parse(text)
 
 
+@pytest.mark.thorough
 @given(st.text(max_size=40))
 @settings(max_examples=300, deadline=None)
 def test_any_text_is_a_formula_or_an_error(text: str) -> None:

@@ -90,6 +90,7 @@ def test_an_acceleration_that_is_no_number_shows(method: str) -> None:
             solver(broken, bad)
 
 
+@pytest.mark.thorough
 def test_no_speed_is_ever_negative() -> None:
     """Cars that stand, touch, and drive into each other, and a leader who stops."""
     draw = np.random.default_rng(4)
@@ -105,6 +106,7 @@ def test_no_speed_is_ever_negative() -> None:
         assert torch.diff(found.x[:, 0, :-1, 0], dim=0).min() > -1e-13, (law, method)
 
 
+@pytest.mark.thorough
 def test_orders_of_accuracy_against_dop853() -> None:
     """Errors of places fall with the step h: Runge and Kutta's as h⁴, the others' as h."""
     system, seconds = model("idm", leader="constant"), 4.0
@@ -168,6 +170,7 @@ def test_a_description_without_a_step_keeps_ballistic_steps() -> None:
     assert (found - now).abs().max() > 1e-3
 
 
+@pytest.mark.thorough
 def test_the_default_follows_the_solution_for_half_a_minute() -> None:
     """Places of IDM behind a leader who swings, against DOP853 from sample to sample: the default
     to 5e-5 m in steps of 0.1 s, where ballistic ones are off by decimetres."""

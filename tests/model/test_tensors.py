@@ -58,6 +58,7 @@ def test_values_and_derivatives(text: str) -> None:
         torch.testing.assert_close(slope, wanted, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_an_operation_is_the_same_in_every_library(name: str) -> None:
     row = OPERATIONS[name]

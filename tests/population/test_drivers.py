@@ -226,6 +226,7 @@ def test_an_unknown_parameter_is_refused() -> None:
         fit_drivers(law(), paths_of(sequences, 0.2), ["T"])
 
 
+@pytest.mark.thorough
 def test_positions_apart_in_time_have_the_same_starts_and_parameters() -> None:
     sequences, _ = platoons(0.0, 5)
     every = paths_of(sequences, 0.2)

@@ -55,6 +55,7 @@ def test_a_search_around_a_kink_ends_with_its_most_likely_iterate() -> None:
     assert not result.converged
 
 
+@pytest.mark.thorough
 def test_further_steps_never_make_an_estimate_less_likely() -> None:
     sequences = nnode.sequences(platoons("idm", "speed_zone", 0.15, 3, 4, 4, 0.0))
     # far from the zone that slows the vehicles, steps raise the pushes in place of the likelihood

@@ -30,6 +30,7 @@ def simulated_gap(method: str, dt: float, **tolerances: float) -> np.ndarray:
 ANALYTIC = np.sqrt(GAP**2 + 2 * V0 * LENGTH * 0.2 * np.arange(8))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("method", "order"),
     [("euler", 1), ("midpoint", 2), ("heun3", 3), ("rk4", 4)],

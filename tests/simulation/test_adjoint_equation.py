@@ -68,6 +68,7 @@ def by_hand(item: Sequence) -> tuple[float, np.ndarray]:
     return float(cost), y[n:]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("method", "dt"), [("rk4", 0.01), ("dopri5", 0.2), ("implicit_adams", 0.005)]
 )

@@ -133,6 +133,7 @@ def test_discrete_gradient_in_crowds() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_adjoint_gradient_in_crowds_deviates_at_first_order() -> None:
     model = people()
     # at 0.35 m neighbours stay in contact all the time: no kink is crossed

@@ -76,6 +76,7 @@ def gradient(model: System, solver: object, batch: Batch) -> tuple[Tensor, Tenso
     return found.x.detach(), torch.cat([part.flatten() for part in own])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", SOLVERS)
 @pytest.mark.parametrize("case", CASES)
 def test_float32_does_not_depend_on_the_origin(case: str, kind: str) -> None:

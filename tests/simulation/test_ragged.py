@@ -83,6 +83,7 @@ def test_traffic(ragged, model, gradient, dtype, rtol) -> None:  # type: ignore[
     check(TRAFFIC[model](), ragged, TorchdiffeqSolver("euler", gradient, 0.02), dtype, rtol)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-9), (torch.float32, 2e-3)])
 @pytest.mark.parametrize("gradient", ["adjoint", "discrete"])
 @pytest.mark.parametrize("model", CROWD)
@@ -90,6 +91,7 @@ def test_crowd(crowds, model, gradient, dtype, rtol) -> None:  # type: ignore[no
     check(CROWD[model](), crowds, TorchdiffeqSolver("euler", gradient, 0.04), dtype, rtol)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["rk4", "dopri5"])
 def test_other_methods(ragged, method: str) -> None:  # type: ignore[no-untyped-def]
     # an adaptive step suits all sequences of a batch: equal to tolerance, not to rounding

@@ -69,6 +69,7 @@ def test_a_request_to_stop_waits_for_no_task(scheduler: str, tmp_path: Path) -> 
     assert time.monotonic() - start < 30
 
 
+@pytest.mark.thorough
 def test_nobody_at_the_address_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("studies.cluster.ANSWER", 0.5)
     tasks = [Task("where", work.conditions, {})]

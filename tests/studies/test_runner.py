@@ -71,6 +71,7 @@ def threads() -> Iterator[int]:
     torch.set_num_threads(before)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_are_the_same_in_any_number_of_processes(
     workers: int, tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch

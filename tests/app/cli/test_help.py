@@ -18,6 +18,7 @@ from tests.app.conftest import CONF, ROOT, Script, composed, examples
 SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py"))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_help_names_purpose_choices_options_and_results(name: str) -> None:
     config = composed(name)

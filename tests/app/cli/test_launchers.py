@@ -101,6 +101,7 @@ def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_p
     assert load_checkpoint(last).progress["epoch"] == end
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("override", "message", "status"),
     [

@@ -73,6 +73,7 @@ def test_a_notebook_takes_such_a_table(tmp_path: Path) -> None:
     assert run.cost_heldout > 0
 
 
+@pytest.mark.thorough
 def test_a_diagnosis_needs_the_folder_alone(script: Script, table: Path, tmp_path: Path) -> None:
     options = ["discover.page=false", "discover.compare=[]", f"hydra.run.dir={tmp_path}"]
     script("discover", f"data.prepared={table}", *options)

@@ -18,6 +18,7 @@ from nnode.simulation import FusedSolver
 from tests.app.conftest import CONF, Script, composed
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "overrides",
     [

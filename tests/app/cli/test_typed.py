@@ -100,6 +100,7 @@ def test_only_what_differs_is_told() -> None:
     assert changes("data", defaults, defaults) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("model", "given"),
     [

@@ -268,6 +268,7 @@ def test_a_part_of_sequences_is_calibrated(tidy: pd.DataFrame) -> None:
     assert {f"table/{name}" for name in run.residuals().sequence} == {s.name for s in part}
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("error")
 def test_anonymous_pairs_have_intervals() -> None:
     """Each is a cluster of its own; one pair alone has no interval, which is said."""

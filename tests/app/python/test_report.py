@@ -65,6 +65,7 @@ def test_coefficients_are_a_labelled_array(found: nnode.Report) -> None:
     assert told.attrs["verdict"] == "named"
 
 
+@pytest.mark.thorough
 def test_nothing_missing_is_an_empty_table() -> None:
     frame = as_table(platoons(number=14, seconds=8.0))
     found = nnode.diagnose(frame, "traffic", model="lin", options=ALONE)

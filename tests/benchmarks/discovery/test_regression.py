@@ -79,6 +79,7 @@ def test_bic_takes_little_from_noise():
     assert taken <= 5
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", CROSS_VALIDATED)
 def test_clusters_are_predicted_as_a_whole(name):
     """What clusters have by chance is learnt where their rows are on both sides of a fold."""

@@ -92,6 +92,7 @@ def test_sumo_drives_a_scene(name: str, monkeypatch: pytest.MonkeyPatch) -> None
     np.testing.assert_array_equal(sumo_scenes.recorded(name, 5)[0]["x"], table["x"])
 
 
+@pytest.mark.thorough
 def test_followers_wait_at_a_light(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("sumo")
     monkeypatch.setattr(sumo_scenes, "ROADS", 12)

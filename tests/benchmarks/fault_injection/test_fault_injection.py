@@ -51,6 +51,7 @@ def test_many_inputs(script: Script, tmp_path: Path) -> None:
     assert found["tried"]["fuzz"] >= 100_000
 
 
+@pytest.mark.thorough
 def test_a_reader_that_misbehaves_is_a_loss(tmp_path: Path) -> None:
     outside, scratch = tmp_path / "elsewhere", tmp_path / "fuzz"
     scratch.mkdir()

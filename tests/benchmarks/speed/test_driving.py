@@ -20,6 +20,7 @@ def test_a_small_case() -> None:
         assert row["steps_per_s"] > 0
 
 
+@pytest.mark.thorough
 def test_all_make_the_same_steps(tmp_path: Path) -> None:
     pytest.importorskip("sumo")
     path = scene(tmp_path, 3)

@@ -116,6 +116,7 @@ def test_windows_of_crowds_hold_the_same_people_on_one_clock(tmp_path):
     assert sequences[0].group == sequences[1].group
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("variant", "low", "high"),
     [("autocorrelated", 0.3, 0.6), ("windows", 0.3, 0.6), ("slow", 1.0, 2.0)],

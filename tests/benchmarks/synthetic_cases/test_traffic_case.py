@@ -81,6 +81,7 @@ def test_an_oracle_removes_the_share_that_was_asked_for(effect, strength):
     assert made.costs(made.truth).share == pytest.approx(made.amplitude.share, abs=0.03)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("effect", list(EFFECTS))
 def test_an_oracle_explains_sound_data_and_the_base_law_does_not(effect):
     made = TrafficCase(small(effect, strength="full", noise=0.0))

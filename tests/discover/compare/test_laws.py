@@ -78,6 +78,7 @@ def test_laws_are_compared_with_drivers_who_differ() -> None:
     assert p_value < 0.01
 
 
+@pytest.mark.thorough
 def test_the_search_of_a_law_begins_at_its_most_likely_start() -> None:
     sequences = list(nnode.sequences(drivers.platoons("lin", "none", 0.15, 6013, number=6)))
     engine, good = FollowersEngine(sequences), law("lin").double()
@@ -140,6 +141,7 @@ def test_effects_go_to_the_laws_that_have_a_place_for_them() -> None:
     assert [effect.name for effect in effects_of(again["lin"])] == ["speed_zone"]
 
 
+@pytest.mark.thorough
 def test_what_a_nearer_law_does_without_is_no_finding() -> None:
     """Behind ``ovm`` a law of the gap alone answers late, which it imitates by looking two ahead;
     what laws have in themselves, such as an inertia, is right to be missed."""

@@ -76,6 +76,7 @@ def test_the_same_seed_gives_the_same_numbers_and_bounds_hold() -> None:
     assert (found.row[fit.free] != fit.row[fit.free]).any()
 
 
+@pytest.mark.thorough
 def test_crowds_that_cannot_be_calibrated_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*given: Any, **more: Any) -> Fit:
         raise SimulationError("it blows up")

@@ -41,6 +41,7 @@ def sequences() -> list[Sequence]:
     ]
 
 
+@pytest.mark.thorough
 @torch.no_grad()
 @pytest.mark.parametrize(
     ("law", "close"),
@@ -73,6 +74,7 @@ def sequences_smoothed(engine: TrafficEngine) -> list[Sequence]:
 MEMORY, REACTION = {"name": "memory", "tau_m": 8.0}, {"name": "relative_speed", "kappa": 0.2}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("law", "effects", "share"),
     [

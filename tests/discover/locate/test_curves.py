@@ -32,6 +32,7 @@ def wavy() -> tuple[TrafficEngine, Fit]:
     return engine, converged_fit(engine, lin())
 
 
+@pytest.mark.thorough
 def test_a_wave_along_the_road_is_found(wavy: tuple[TrafficEngine, Fit]) -> None:
     engine, fit = wavy
     best = significant_curves(engine, fit, curves(engine, fit, engine.variables()), 0.01)[0]

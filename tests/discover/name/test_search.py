@@ -28,6 +28,7 @@ def fitted(strength: float) -> tuple[TrafficEngine, Fit]:
     return engine, converged_fit(engine, lin())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("strength", "names"), [(0.5, ["relative_speed"]), (0.0, [])])
 def test_held_out_clusters_may_be_sure_of_what_no_score_shows(
     monkeypatch: pytest.MonkeyPatch, strength: float, names: list[str]

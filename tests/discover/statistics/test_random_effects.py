@@ -68,6 +68,7 @@ def test_what_all_have_in_common_is_no_difference_between_drivers(what: str) -> 
 CASES = 6
 
 
+@pytest.mark.thorough
 def test_a_mood_is_no_number_of_one_s_own() -> None:
     """Disturbances of 6 s in windows of 10 s that keep names: both halves of a window are in one
     mood, but windows of an agent that are far from each other are not."""
@@ -80,6 +81,7 @@ def test_a_mood_is_no_number_of_one_s_own() -> None:
     assert alarms <= stats.binom.ppf(0.975, CASES, 0.05)
 
 
+@pytest.mark.thorough
 def test_true_paces_are_found_among_moods() -> None:
     pace, inside = 0.05, 0
     for seed in range(CASES):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 import nnode
@@ -19,6 +20,7 @@ from nnode.model.effects import CATALOGUE
 ZONE = CATALOGUE.effects["speed_zone"]
 
 
+@pytest.mark.thorough
 def test_cells_add_up_to_an_interval_with_ends_as_wide_as_a_cell() -> None:
     engine = FollowersEngine(list(nnode.sequences(platoons("lin", "speed_zone", 0.0, 6, number=8))))
     model = build_model(model_options("lin", "measured", effects=[])).double()

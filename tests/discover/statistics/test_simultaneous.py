@@ -81,6 +81,7 @@ def test_independent_agents_give_every_p_value_alike(monkeypatch: pytest.MonkeyP
     assert stats.kstest(wrong, "uniform").pvalue < 1e-3
 
 
+@pytest.mark.thorough
 def test_a_shock_in_common_is_seen() -> None:
     found = [judged(seed, shock=1.0, clusters=10) for seed in range(8)]
     assert all(one.p_value <= 0.01 and one.together for one in found)

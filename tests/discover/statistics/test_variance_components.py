@@ -44,6 +44,7 @@ def shared_out(one: PeriodEstimates) -> dict[str, float | None]:
     return shares(one, curve, own, mood)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("sd", [(0.03, 0.05, 0.04, 0.03), (0.05, 0.03, 0.03, 0.04)])
 def test_variance_is_told_apart_by_what_it_belongs_to(sd: Components) -> None:
     true = np.array(sd) ** 2 / np.sum(np.array(sd) ** 2)

@@ -79,6 +79,7 @@ def test_all_pairs_once(name: str, cutoff: float) -> None:
     assert {(j, i) for i, j in both[:, :twice].T} == {(i, j) for i, j in both[:, :twice].T}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("points", ["line", "square", "point", "alone"])
 @pytest.mark.parametrize("name", PLACES)
 def test_people_and_wall_points(name: str, points: str) -> None:

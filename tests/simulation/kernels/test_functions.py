@@ -57,6 +57,7 @@ def arguments(name: str, kind: Any) -> np.ndarray:
     return x.astype(kind)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", EXACT)
 def test_a_few_units_in_the_last_place(name: str, kind: Any) -> None:

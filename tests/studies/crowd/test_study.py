@@ -90,6 +90,7 @@ def test_turning_a_corridor_changes_nothing_for_a_force_without_directions():
     torch.testing.assert_close(costs("nn", network, collate(back)), expected)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, 2])
 def test_known_parameters_are_found_from_the_papers_starts(seed):
     batch = corridor(3, system=system_of("sf", TRUE), samples=26, people=40, number=4)
@@ -108,6 +109,7 @@ def test_weights_choose_the_sequences():
     assert row == pytest.approx(2 * TRUE, rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_walls_alone_leave_people_without_force_and_still_learn():
     batch = corridor(3, system=system_of("sf", 50 * TRUE), people=20)
     start = row_of(new_system("nn", 5))

@@ -142,6 +142,7 @@ def study(monkeypatch: pytest.MonkeyPatch) -> Study:
     return found
 
 
+@pytest.mark.thorough
 def test_tables_hold_what_was_found(study: Study, tmp_path: Path) -> None:
     blocks = page("following", study.tables(), study.figures(), **study.values())
     tables = {b.name: b.frame for b in blocks if isinstance(b, TableBlock)}

@@ -46,6 +46,7 @@ def tables(blocks: list[Block]) -> dict[str, pd.DataFrame]:
     return {b.name: b.full for b in blocks if isinstance(b, TableBlock) and b.full is not None}
 
 
+@pytest.mark.thorough
 def test_averages_stand_beside_the_printed_ones(tables: dict[str, pd.DataFrame]) -> None:
     table = tables["averages"]
     assert list(table["printed"]) == [printed.average_costs[model] for model in table.index]
