@@ -126,9 +126,9 @@ def test_a_model_that_is_code_is_sampled_as_its_formula() -> None:
 @pytest.mark.parametrize(
     ("domain", "noise", "number", "seconds"),
     [
-        pytest.param("traffic", Noise(0.3, 1.5, 0.0025), 24, 60.0, marks=pytest.mark.thorough),
-        pytest.param("traffic", Noise(0.2, 2.0, 0.0, 0.2), 60, 24.0, marks=pytest.mark.thorough),
-        pytest.param("crowd", Noise(0.4, 1.5, 0.0001), 40, 12.0, marks=pytest.mark.thorough),
+        ("traffic", Noise(0.3, 1.5, 0.0025), 24, 60.0),
+        ("traffic", Noise(0.2, 2.0, 0.0, 0.2), 60, 24.0),
+        ("crowd", Noise(0.4, 1.5, 0.0001), 40, 12.0),
         ("crowd", Noise(0.3, 0.8, 0.0, 0.15), 40, 12.0),
     ],
 )

@@ -85,12 +85,7 @@ def test_drivers_alike_do_not_differ() -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("name", "drivers"),
-    [
-        ("lin", "auto"),
-        ("idm", ["T", "v0"]),
-        pytest.param("idm", "auto", marks=pytest.mark.thorough),
-    ],
+    ("name", "drivers"), [("lin", "auto"), ("idm", ["T", "v0"]), ("idm", "auto")]
 )
 def test_errors_that_last_are_found_and_told_apart_from_pushes(
     name: str, drivers: str | list[str]

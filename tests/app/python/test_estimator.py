@@ -64,11 +64,7 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
     ("given", "options"),
     [
         ({"model": "idm"}, ["model=idm"]),
-        pytest.param(
-            {"model": "helly", "pooling": "shrunk"},
-            ["model=helly", "trainer.pooling=shrunk"],
-            marks=pytest.mark.thorough,
-        ),
+        ({"model": "helly", "pooling": "shrunk"}, ["model=helly", "trainer.pooling=shrunk"]),
         (
             {
                 "model": "lin",
@@ -85,10 +81,9 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
                 "model.effects=[relative_speed]",
             ],
         ),
-        pytest.param(
+        (
             {"model": "ovm", "optimizer": "lbfgs", "cost": "gap", "epochs": 3},
             ["model=ovm", "optimizer=lbfgs", "trainer.cost=gap", "trainer.max_epochs=3"],
-            marks=pytest.mark.thorough,
         ),
     ],
     ids=["idm", "shrunk", "lin", "ovm"],

@@ -70,7 +70,7 @@ def series(monkeypatch) -> None:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("engine", ["loop", pytest.param("fused_1", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("engine", ["loop", "fused_1"])
 def test_a_series_is_drawn(engine, series, tmp_path) -> None:  # type: ignore[no-untyped-def]
     chosen = {"shapes": ["steps", "scale"], "engines": ["odeint", engine]}
     benchmark(options(**chosen), tmp_path)

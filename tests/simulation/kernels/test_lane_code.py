@@ -56,10 +56,10 @@ def fresh(tmp_path, monkeypatch) -> Path:  # type: ignore[no-untyped-def]
     [
         ("network_speed", torch.float64),
         ("log", torch.float32),
-        pytest.param("network_speed", torch.float32, marks=pytest.mark.thorough),
-        pytest.param("log", torch.float64, marks=pytest.mark.thorough),
-        pytest.param("lin", torch.float64, marks=pytest.mark.thorough),
-        pytest.param("lin", torch.float32, marks=pytest.mark.thorough),
+        ("network_speed", torch.float32),
+        ("log", torch.float64),
+        ("lin", torch.float64),
+        ("lin", torch.float32),
     ],
 )
 def test_loops_are_vector_code(law, dtype, ragged, fresh, monkeypatch) -> None:  # type: ignore[no-untyped-def]

@@ -83,9 +83,7 @@ def test_the_average_is_one(table: pd.DataFrame) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("model", "label"), [("sf", "SF"), pytest.param("nn", "NN", marks=pytest.mark.thorough)]
-)
+@pytest.mark.parametrize(("model", "label"), [("sf", "SF"), ("nn", "NN")])
 def test_crowd_costs_follow_from_the_parameters(
     model: str, label: str, real_data: Path, tmp_path: Path
 ) -> None:
