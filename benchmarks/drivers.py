@@ -8,8 +8,8 @@ m. ``--nature`` departs from this. With ``--nothing``, nothing is hidden in any 
 ``--effects`` one of the named effects in every case. Paths are
 integrated here by Euler's method; everything else is the package's public interface. The cases of a
 run are fixed by its seed. The table has a row per case; the last lines count right and false
-answers, with exact intervals of 95 %. These diagnoses do not compare laws; with
-``--default`` they do, as other diagnoses. ``--compare`` only compares laws. ``--calibrate`` only
+answers, with exact intervals of 95 %. Laws are not compared before a diagnosis; with ``--default``
+they are, as in every diagnosis by default. ``--compare`` only compares laws. ``--calibrate`` only
 calibrates, with nothing hidden; the last lines count intervals that contain the true value.
 """
 
@@ -443,11 +443,12 @@ def main() -> None:
     parser.add_argument(
         "--effects", nargs="+", help="hidden in all cases, instead of in half of them"
     )
-    parser.add_argument("--compare", action="store_true", help="only compare laws")
-    parser.add_argument(
+    works = parser.add_mutually_exclusive_group()
+    works.add_argument("--compare", action="store_true", help="only compare laws")
+    works.add_argument(
         "--default", action="store_true", help="compare laws first, as diagnoses do by default"
     )
-    parser.add_argument("--calibrate", action="store_true", help="only calibrate, nothing hidden")
+    works.add_argument("--calibrate", action="store_true", help="only calibrate, nothing hidden")
     parser.add_argument("--nothing", action="store_true", help="nothing hidden in any case")
     parser.add_argument("--nature", default="plain", choices=NATURES)
     parser.add_argument("--laws", nargs="+", default=["lin", "idm"], choices=list(HIDDEN))

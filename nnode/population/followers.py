@@ -714,18 +714,27 @@ def simulated_pairs(
     """
     simulated = list[list[tuple[Followers, Estimate]]]()
     for attempt in range(ATTEMPTS * pairs):
-        pair = list[tuple[Followers, Estimate]]()
         with suppress(SimulationError, np.linalg.LinAlgError):
-            for draw in antithetic_draws(seed + attempt):
-                drawn = model.with_paths(model.simulated_paths(estimate, draw))
-                pair.append(
-                    (drawn, fit_deviations(drawn, noise, estimate.theta, estimate.variances))
-                )
-        if len(pair) == 2 and all(modes.converged for _, modes in pair):
-            simulated.append(pair)
+            draws = antithetic_draws(seed + attempt)
+            simulated.append([_simulated_data(model, noise, estimate, draw) for draw in draws])
         if len(simulated) == pairs:
             return simulated
     raise SimulationError("most simulations of the estimated model have drivers who leave the road")
+
+
+def _simulated_data(
+    model: Followers, noise: Noise, estimate: Estimate, draw: Draw
+) -> tuple[Followers, Estimate]:
+    """One of the data sets of :func:`simulated_pairs`.
+
+    Raises:
+        SimulationError: it cannot be used.
+    """
+    drawn = model.with_paths(model.simulated_paths(estimate, draw))
+    modes = fit_deviations(drawn, noise, estimate.theta, estimate.variances)
+    if not modes.converged:
+        raise SimulationError("the search for the deviations of drawn drivers does not converge")
+    return drawn, modes
 
 
 def antithetic_draws(seed: int) -> list[Draw]:

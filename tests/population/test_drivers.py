@@ -19,7 +19,7 @@ from nnode.model.effects import Effect
 from nnode.model.effects.lane import Inertia, ReactionDelay, SpeedZone
 from nnode.model.term import Interval
 from nnode.population import followers
-from nnode.population.drivers import fit_drivers
+from nnode.population.drivers import Population, fit_drivers
 from nnode.population.followers import longest_step, paths_of
 from nnode.population.intervals import deviation_intervals, influence
 from nnode.population.likelihood import NOISE, PushNoise
@@ -51,6 +51,13 @@ def law(**bounds: Interval) -> Traffic:
     lin.bounds.update(bounds)
     lin.project_()
     return Traffic([lin], leader="measured").double()
+
+
+@pytest.fixture(scope="module")
+def found() -> Population:
+    """Drivers whose v0 differs."""
+    sequences, _ = platoons(0.15, 1)
+    return fit_drivers(law(), paths_of(sequences, 0.2), ["v0"], pairs=0)
 
 
 def test_drivers_who_differ_are_found_and_told_apart() -> None:
@@ -139,9 +146,7 @@ def test_pushes_that_do_not_exist_have_an_interval_from_zero() -> None:
     assert np.isnan(lasting).all()
 
 
-def test_errors_that_may_not_exist_leave_the_intervals_of_the_others() -> None:
-    sequences, _ = platoons(0.15, 1)
-    found = fit_drivers(law(), paths_of(sequences, 0.2), ["v0"], pairs=0)
+def test_errors_that_may_not_exist_leave_the_intervals_of_the_others(found: Population) -> None:
     before = found.estimate.variances
     low, high = before.low.copy(), before.high.copy()
     tiny = replace(
@@ -159,10 +164,9 @@ def test_errors_that_may_not_exist_leave_the_intervals_of_the_others() -> None:
 
 
 def test_simulations_with_a_driver_who_passes_the_vehicle_ahead_are_replaced(
+    found: Population,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    sequences, _ = platoons(0.15, 1)
-    found = fit_drivers(law(), paths_of(sequences, 0.2), ["v0"], pairs=0)
     simulated = partial(followers.simulated_pairs, found.model, PushNoise(), found.estimate)
     (usual,) = simulated(seed=1, pairs=1)
     draws = followers.antithetic_draws

@@ -81,23 +81,25 @@ def compare_laws(
     used = without_starts(sequences) if differ and exact else sequences
     exploration = [used[i] for i in division.exploration]
     label = division.label[division.exploration]
-    formulas, refused, engine = dict(candidates), dict[str, str](), None
+    formulas, refused = dict(candidates), dict[str, str]()
+    engine: Engine
     if differ:
         formulas = {key: law for key, law in candidates.items() if follower_formula(law)}
         refused = {key: NO_FORMULA for key in candidates if key not in formulas}
         engine = FollowersEngine(
             exploration, label, large=np.inf, apart=spacing(sequences, options)
         )
-    alike = engine or engine_of(asked, exploration, label, whole=True)
-    fits, failed = _calibrated(alike, formulas, within)
+    else:
+        engine = engine_of(asked, exploration, label, whole=True)
+    fits, failed = _calibrated(engine, formulas, within)
     refused |= failed
     if not fits:
         return Laws([], refused, 0), {}
-    number = np.bincount(alike.cluster)
-    errors = {key: float((heldout(f, alike.cluster) / number).mean()) for key, f in fits.items()}
+    number = np.bincount(engine.cluster)
+    errors = {key: float((heldout(f, engine.cluster) / number).mean()) for key, f in fits.items()}
     if asked.domain == "crowd":  # its residuals are not positions
-        errors = {key: square_of(alike, fit.system) for key, fit in fits.items()}
-    if engine is not None:
+        errors = {key: square_of(engine, fit.system) for key, fit in fits.items()}
+    if isinstance(engine, FollowersEngine):
         compared = _by_likelihood(engine, formulas, fits, refused, within)
     else:
         compared = _by_cost(windows_of(asked, exploration, label), fits, errors, within)
