@@ -18,11 +18,12 @@ single one at another place is what a fault of the measurement looks like.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 from nnode.data.clusters import components
 from nnode.data.limits import LIMITS
@@ -158,36 +159,35 @@ def _neighbours(tracks: list[_Track | None], error: float) -> tuple[_Pairs, _Pai
 
     Of each identifier's places at a time only those next to each other are compared.
     """
-    often = Counter(name for track in tracks if track for name in track.place)
-    number = {name: code for code, name in enumerate(often)}
     parts = []
     for i, track in enumerate(tracks):
-        names = [name for name in track.place if often[name] > 1] if track else []
-        if track is None or not names:
-            continue
-        k, _, d = track.x.shape
-        rows = np.empty((k, len(names), 4 + d))
-        rows[:, :, 0] = [number[name] for name in names]
-        rows[:, :, 1] = track.first + np.arange(k)[:, None]
-        rows[:, :, 2] = i
-        rows[:, :, 3] = (np.arange(k) == k - 1)[:, None]
-        rows[:, :, 4:] = track.x[:, [track.place[name] for name in names]]
-        parts.append(rows.reshape(-1, 4 + d))
+        if track is not None and track.place:
+            k = np.arange(len(track.x))
+            columns = {
+                "name": np.tile(list(track.place), len(k)),
+                "time": np.repeat(track.first + k, len(track.place)),
+                "sequence": i,
+                "ahead": np.repeat(k == k[-1], len(track.place)),
+            }
+            x = track.x[:, list(track.place.values())]
+            parts.append(pd.DataFrame(x.reshape(-1, x.shape[2])).assign(**columns))
     if not parts:
         return [], []
-    table = np.concatenate(parts)
-    table = table[np.isfinite(table).all(axis=1)]
-    table = table[np.lexsort((table[:, 2], *table.T[:3:-1], table[:, 1], table[:, 0]))]
-    row, next_row = table[:-1], table[1:]
-    ghosts = row[:, 3] + next_row[:, 3]
-    met = (row[:, :2] == next_row[:, :2]).all(axis=1) & (row[:, 2] != next_row[:, 2]) & (ghosts < 2)
-    close = np.linalg.norm(row[:, 4:] - next_row[:, 4:], axis=1) <= error
+    table = pd.concat(parts)
+    places = table.columns[:-4].to_list()
+    table = table[np.isfinite(table[places]).all(axis=1)]
+    table["name"] = pd.factorize(table["name"])[0]
+    table = table.sort_values(["name", "time", *places, "sequence"])
+    row, next_row = table[:-1].reset_index(), table[1:].reset_index()
+    sequences = np.stack([row["sequence"], next_row["sequence"]], axis=1)
+    met = (row["name"] == next_row["name"]) & (row["time"] == next_row["time"])
+    met &= (row["sequence"] != next_row["sequence"]) & ~(row["ahead"] & next_row["ahead"])
+    close = np.linalg.norm(row[places] - next_row[places], axis=1) <= error
 
-    def pairs(mask: np.ndarray) -> _Pairs:
-        indices = np.sort(np.stack([row[mask, 2], next_row[mask, 2]], axis=1), axis=1)
-        return [(int(i), int(j)) for i, j in np.unique(indices, axis=0)]
+    def pairs(mask: pd.Series) -> _Pairs:
+        return [(int(i), int(j)) for i, j in np.unique(np.sort(sequences[mask], axis=1), axis=0)]
 
-    return pairs(met & close), pairs(met & ~close & (ghosts == 0))
+    return pairs(met & close), pairs(met & ~close & ~row["ahead"] & ~next_row["ahead"])
 
 
 def _met(tracks: list[_Track | None], pair: tuple[int, int], error: float) -> dict[str, bool]:

@@ -385,23 +385,27 @@ def _overlaps(view: _View) -> Iterator[Fault]:
     points = np.column_stack([x[time, agent], 2 * limit * time])
     i, j = _near(points, points, limit)
     distance = np.sqrt(((x[time[i], agent[i]] - x[time[j], agent[j]]) ** 2).sum(axis=1))
-    first, second = np.minimum(agent[i], agent[j]), np.maximum(agent[i], agent[j])
-    rows = np.stack([first, second, time[i]], axis=1)
-    close = (first < second) & (distance < limit)
-    # each pair stands there twice
-    rows, index = np.unique(rows[close], axis=0, return_index=True)
-    distance = distance[close][index]
-    starts = np.flatnonzero(np.diff(rows[:, :2], axis=0, prepend=-1).any(axis=1))
-    for rank in np.argsort(rows[starts, 2], kind="stable"):
-        begin = starts[rank]
-        end = starts[rank + 1] if rank + 1 < len(starts) else len(rows)
-        pair = int(rows[begin, 0]), int(rows[begin, 1])
+    near = pd.DataFrame(
+        {
+            "first": np.minimum(agent[i], agent[j]),
+            "second": np.maximum(agent[i], agent[j]),
+            "sample": time[i],
+            "distance": distance,
+        }
+    )
+    near = near[(near["first"] < near["second"]) & (near["distance"] < limit)]
+    # each pair is listed in both orders
+    pairs = near.drop_duplicates(["first", "second", "sample"]).groupby(["first", "second"])
+    spans = pairs.agg({"sample": ["min", "size"], "distance": "min"})
+    for pair, sample, number, smallest in spans.sort_values(
+        ("sample", "min"), kind="stable"
+    ).itertuples(name=None):
+        i, j = map(int, pair)
         text = (
-            f"{view.who(pair[0])} and {view.who(pair[1])} are down to "
-            f"{distance[begin:end].min():.2f} m apart at {end - begin} of {len(x)} samples, less "
-            f"than {limit:g} m"
+            f"{view.who(i)} and {view.who(j)} are down to {smallest:.2f} m apart at {number} of "
+            f"{len(x)} samples, less than {limit:g} m"
         )
-        yield view.fault("overlap", pair, int(rows[begin, 2]), text)
+        yield view.fault("overlap", (i, j), int(sample), text)
 
 
 @dataclass(frozen=True)

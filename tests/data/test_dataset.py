@@ -92,13 +92,13 @@ def test_the_loader_streams_the_sequences_of_the_sampler(store: Store, workers: 
     assert isinstance(sampler, EpochSampler)
     for number in (0, 1):
         expected = epoch(sampler, number, start=1)
-        found = list(loader)
-        assert [batch.names for batch in found] == [
+        loaded = list(loader)
+        assert [batch.names for batch in loaded] == [
             tuple(f"r/{chosen[i]}" for i in batch) for batch in expected
         ]
-        again = collate(store[chosen[i]] for i in expected[0])
-        assert torch.equal(found[0].x, again.x)
-        assert torch.equal(found[0].valid, again.valid)
+        expected_batch = collate(store[chosen[i]] for i in expected[0])
+        assert torch.equal(loaded[0].x, expected_batch.x)
+        assert torch.equal(loaded[0].valid, expected_batch.valid)
 
 
 def test_the_loader_leaves_the_global_generator_alone(store: Store) -> None:

@@ -23,15 +23,15 @@ ENDS = {
 
 
 def test_nearest_points_of_a_line() -> None:
-    (one,) = read_exits({"door": {"line": [2, 0, 4, 2]}})
+    (door,) = read_exits({"door": {"line": [2, 0, 4, 2]}})
     x = np.array([[0.0, 0.0], [3.0, 0.0], [9.0, 5.0], [2.0, 4.0]])
     expected = [[2, 0], [2.5, 0.5], [4, 2], [4, 2]]
-    np.testing.assert_allclose([one.point(place) for place in x], expected)
+    np.testing.assert_allclose([door.point(place) for place in x], expected)
     # no point of the line is nearer
     points = np.linspace([2, 0], [4, 2], 1001)
-    for place, own in zip(x, expected, strict=True):
+    for place, point in zip(x, expected, strict=True):
         nearest = points[np.linalg.norm(points - place, axis=1).argmin()]
-        np.testing.assert_allclose(own, nearest, atol=2e-3)
+        np.testing.assert_allclose(point, nearest, atol=2e-3)
 
 
 def test_whose_exit() -> None:
@@ -53,7 +53,7 @@ def test_whose_exit() -> None:
     rows = [np.array([2 * i, 2 * i + 1]) for i in range(4)]
 
     def names(exits: list[Exit]) -> list[str]:
-        return [own.name for _, own in exits_of(exits, people, rows)]
+        return [exit_.name for _, exit_ in exits_of(exits, people, rows)]
 
     assert names(exits) == ["right", "left", "up", "ahead"]
     heading = exits[3].point(np.array([1.0, 1.0]))
@@ -136,8 +136,8 @@ def test_people_of_a_table(tmp_path: Path) -> None:
 @pytest.mark.real
 def test_the_corridor_has_an_exit_at_each_end(real_data: Path) -> None:
     path = real_data / "juelich" / "bi_corr_400_b_03.txt"
-    found = read_juelich(path, JuelichOptions(exits=ENDS))
-    for s in found:
+    result = read_juelich(path, JuelichOptions(exits=ENDS))
+    for s in result:
         assert s.destination is not None
         assert set(s.destination[:, 0]) <= {-6.0, 6.0}
         assert ((s.destination[:, 1] >= 0) & (s.destination[:, 1] <= 4)).all()
@@ -145,7 +145,7 @@ def test_the_corridor_has_an_exit_at_each_end(real_data: Path) -> None:
     towards = np.concatenate(
         [
             (s.x[-1, :, 0] - s.x[0, :, 0]) * (s.destination[:, 0] - s.x[0, :, 0])
-            for s in found
+            for s in result
             if s.destination is not None
         ]
     )

@@ -47,14 +47,14 @@ def cut(
 def groups(sequences: list[Sequence], domain: str, mode: str = "auto") -> int:
     """Number of groups of sequences that share an agent."""
     named, _ = identify(sequences, domain, Agents[mode])  # type: ignore[arg-type]
-    unique = (replace(s, agents=own) for s, own in zip(sequences, named, strict=True))
+    unique = (replace(s, agents=names) for s, names in zip(sequences, named, strict=True))
     return int(clusters(index_of(unique), 0.0).max()) + 1
 
 
-both = pytest.mark.parametrize("domain", ["traffic", "crowd"])
+domains = pytest.mark.parametrize("domain", ["traffic", "crowd"])
 
 
-@both
+@domains
 def test_clocks_and_identifiers_that_start_again(domain: str) -> None:
     sequences = [cut(world(domain, i, 6 + i % 3), str(i)) for i in range(8)]
     named, (note,) = identify(sequences, domain, Agents.auto)  # type: ignore[arg-type]
@@ -65,7 +65,7 @@ def test_clocks_and_identifiers_that_start_again(domain: str) -> None:
     assert groups(sequences, domain, "global") == 1
 
 
-@both
+@domains
 @pytest.mark.parametrize(("step", "samples"), [(20, 21), (20, 20), (10, 21), (25, 15)])
 def test_windows_of_one_recording_keep_their_agents(domain: str, step: int, samples: int) -> None:
     """Windows that share a sample, that follow at once, that overlap, and with pauses between."""
@@ -77,7 +77,7 @@ def test_windows_of_one_recording_keep_their_agents(domain: str, step: int, samp
     assert groups(sequences, domain, "sequence") == 4
 
 
-@both
+@domains
 @pytest.mark.parametrize("samples", [21, 20])
 @pytest.mark.parametrize("order", ["runs", "times"])
 def test_windows_of_several_runs_in_one_recording(domain: str, samples: int, order: str) -> None:
@@ -92,13 +92,13 @@ def test_windows_of_several_runs_in_one_recording(domain: str, samples: int, ord
     assert len(set(named)) == 3
 
 
-@both
+@domains
 def test_an_agent_who_does_the_same_in_all_runs_makes_them_no_one_world(domain: str) -> None:
     """Such as a leader on a prescribed course, or somebody who stands still."""
     x = [world(domain, seed, agents=3) for seed in range(4)]
     for other in x[1:]:
         other[:, 2] = x[0][:, 2]
-    assert groups([cut(own, str(i)) for i, own in enumerate(x)], domain) == 4
+    assert groups([cut(path, str(i)) for i, path in enumerate(x)], domain) == 4
 
 
 def test_positions_may_differ_by_their_error() -> None:
@@ -119,7 +119,7 @@ def test_one_fault_does_not_part_windows() -> None:
     assert not notes
 
 
-@both
+@domains
 @pytest.mark.parametrize("pause", [0.1, 0.5])
 def test_identifiers_that_start_again_on_a_clock_that_does_not(domain: str, pause: float) -> None:
     sequences, clock = [], 0.0
@@ -172,10 +172,10 @@ def test_a_number_that_is_a_name_already_is_not_given() -> None:
 def test_odd_sequences_are_left_alone() -> None:
     """Faults are not judged here: they must not raise either."""
     nobody = np.full((3, 2, 1), np.nan)
-    one = cut(world("traffic", 0), "one", 0, 1)
-    odd = [cut(nobody, "nobody"), one, cut(nobody, "again"), cut(world("traffic", 1), "sound")]
+    single = cut(world("traffic", 0), "one", 0, 1)
+    odd = [cut(nobody, "nobody"), single, cut(nobody, "again"), cut(world("traffic", 1), "sound")]
     named, _ = identify(odd, "traffic", Agents.auto)
-    assert [len(own) for own in named] == [2, 4, 2, 4]
+    assert [len(names) for names in named] == [2, 4, 2, 4]
     nameless = Sequence(name="n", recording="run", time=np.arange(3.0), x=np.zeros((3, 2, 1)))
     assert identify([nameless], "traffic", Agents.sequence)[0] == [()]
 
@@ -193,7 +193,7 @@ def table(path: Path, domain: str, sequences: int = 10, restart: bool = True) ->
     return TableOptions(domain=domain, path=str(path))
 
 
-@both
+@domains
 @pytest.mark.parametrize("restart", [True, False])
 def test_a_table_of_numbered_agents_can_be_split(
     tmp_path: Path, domain: str, restart: bool, caplog: pytest.LogCaptureFixture

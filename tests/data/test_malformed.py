@@ -12,12 +12,15 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat
 
+from nnode.data.cut import Reading
+from nnode.data.options import DataOptions
+from nnode.data.prepare import FORMATS
 from nnode.data.readers import matlab
 from nnode.data.readers.esimas import read_esimas
-from nnode.data.readers.juelich import JuelichOptions, read_juelich
+from nnode.data.readers.juelich import JuelichOptions
 from nnode.data.readers.matlab import Other, read_matlab
 from nnode.data.readers.table import TableOptions, read_table
-from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles
+from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.errors import DataError, NNodeError
 
 
@@ -27,10 +30,10 @@ def saved(path: Path, *, packed: bool, **values: object) -> Path:
 
 
 def cells() -> np.ndarray:
-    found = np.empty((1, 2), dtype=object)
+    result = np.empty((1, 2), dtype=object)
     for i in range(2):
-        found[0, i] = {"Xarr": np.arange(6.0).reshape(2, 3) + i, "Tarr": np.arange(3)[None]}
-    return found
+        result[0, i] = {"Xarr": np.arange(6.0).reshape(2, 3) + i, "Tarr": np.arange(3)[None]}
+    return result
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -40,23 +43,23 @@ def test_matlab_values_of_all_kinds(tmp_path: Path, packed: bool) -> None:
         packed=packed,
         cells=cells(),
         small=np.array([[1, 2]], np.uint8),
-        one=np.array([(1.0, 2)], dtype=[("a", "f8"), ("b", "i4")]),
+        pair=np.array([(1.0, 2)], dtype=[("a", "f8"), ("b", "i4")]),
         text="words",
         z=np.array([1j]),
         many=np.array([(1.0,), (2.0,)], dtype=[("a", "f8")]),
         empty=np.zeros((0, 3)),
     )
-    found = read_matlab(path)
+    result = read_matlab(path)
     for i in range(2):
         np.testing.assert_array_equal(
-            found["cells"][i]["Xarr"], np.arange(6.0).reshape(2, 3) + i, strict=True
+            result["cells"][i]["Xarr"], np.arange(6.0).reshape(2, 3) + i, strict=True
         )
-    np.testing.assert_array_equal(found["small"], [[1, 2]])
-    assert found["one"] == {"a": [[1.0]], "b": [[2]]}
-    assert [one["a"].item() for one in found["many"]] == [1.0, 2.0]
-    assert found["empty"].shape == (0, 3)
-    assert isinstance(found["text"], Other)
-    assert isinstance(found["z"], Other)
+    np.testing.assert_array_equal(result["small"], [[1, 2]])
+    assert result["pair"] == {"a": [[1.0]], "b": [[2]]}
+    assert [element["a"].item() for element in result["many"]] == [1.0, 2.0]
+    assert result["empty"].shape == (0, 3)
+    assert isinstance(result["text"], Other)
+    assert isinstance(result["z"], Other)
 
 
 @pytest.mark.thorough
@@ -88,64 +91,70 @@ def test_a_matlab_file_that_swells_is_refused(
         read_esimas(path)
 
 
-def test_a_frame_far_away_takes_no_memory(tmp_path: Path) -> None:
-    path = tmp_path / "corridor.txt"
-    path.write_text("# framerate: 16\n1 1 0 0 0\n1 2 1 0 0\n2 4000000000000 1 0 0\n")
-    with pytest.raises(DataError, match=r"3 rows stand in frames 1 to 4000000000000"):
-        read_juelich(path, JuelichOptions(unit="m"))
+TIDY, CARS = "sequence,time,agent,x\n", "vehicle,time,x\n"
+PLATOON = CARS + "".join(f"{n},{t},{20 * n + 10 * t}\n" for n in (1, 2, 3) for t in (0, 0.2, 0.4))
 
 
-@pytest.mark.parametrize("rate", ["1e308", "1e9", "inf", "-16", "0"])
-def test_a_frame_rate_of_no_camera_is_refused(tmp_path: Path, rate: str) -> None:
-    path = tmp_path / "corridor.txt"
-    path.write_text(f"# framerate: {rate}\n1 1 0 0 0\n1 2 1 0 0\n")
-    with pytest.raises(NNodeError, match="frame rate"):
-        read_juelich(path, JuelichOptions(unit="m"))
+def read(path: Path, options: DataOptions, text: str) -> Reading:
+    path.write_text(text)
+    return FORMATS[type(options)].read({"table": path}, options)
 
 
-def test_more_cells_than_names_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    path.write_text("sequence,time,agent,x\n" + "".join(f"s,{k},a,{k},9\n" for k in range(3)))
-    with pytest.raises(DataError, match="more cells in its rows than names"):
-        read_table(path, TableOptions(domain="traffic"))
+@pytest.mark.parametrize(
+    ("options", "text", "message"),
+    [
+        # a frame far away takes no memory
+        (
+            JuelichOptions(unit="m"),
+            "# framerate: 16\n1 1 0 0 0\n1 2 1 0 0\n2 4000000000000 1 0 0\n",
+            "3 rows stand in frames 1 to 4000000000000",
+        ),
+        *(
+            (
+                JuelichOptions(unit="m"),
+                f"# framerate: {rate}\n1 1 0 0 0\n1 2 1 0 0\n",
+                "frame rate",
+            )
+            for rate in ("1e308", "1e9", "inf", "-16", "0")
+        ),
+        (
+            TableOptions(domain="traffic"),
+            TIDY + "".join(f"s,{k},a,{k},9\n" for k in range(3)),
+            "more cells in its rows than names",
+        ),
+        # times that no step counts
+        *(
+            (VehicleTableOptions(), f"{PLATOON}1,{time},0\n", r"line 11: the time .* cannot count")
+            for time in ("1e308", "-1e300", "1e17")
+        ),
+    ],
+)
+def test_one_clear_error(tmp_path: Path, options: DataOptions, text: str, message: str) -> None:
+    with pytest.raises(NNodeError, match=message):
+        read(tmp_path / "file.txt", options, text)
 
 
 def test_times_and_agents_of_a_sequence_are_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("nnode.data.cut.MOST_CELLS", 100)
-    path = tmp_path / "t.csv"
-    path.write_text("sequence,time,agent,x\n" + "".join(f"s,{k},a{k},{k}\n" for k in range(11)))
+    text = TIDY + "".join(f"s,{k},a{k},{k}\n" for k in range(11))
     with pytest.raises(DataError, match="11 times and 11 agents in 11 rows, expected at most"):
-        read_table(path, TableOptions(domain="traffic"))
-
-
-def cars(path: Path, *times: float, vehicle: str = "1") -> Path:
-    rows = [f"{n},{t},{20 * n + 10 * t}" for n in (1, 2, 3) for t in times]
-    path.write_text("vehicle,time,x\n" + "\n".join(rows) + "\n")
-    return path
-
-
-@pytest.mark.parametrize("time", ["1e308", "-1e300", "1e17"])
-def test_times_that_no_step_counts_are_refused(tmp_path: Path, time: str) -> None:
-    path = cars(tmp_path / "c.csv", 0.0, 0.2, 0.4)
-    path.write_text(path.read_text() + f"1,{time},0\n")
-    with pytest.raises(DataError, match=r"line 11: the time is .* cannot count"):
-        read_vehicles(path, VehicleTableOptions())
+        read(tmp_path / "t.csv", TableOptions(domain="traffic"), text)
 
 
 def test_windows_between_two_stays_far_apart_take_no_time(tmp_path: Path) -> None:
-    near = [0.0, 0.2, 0.4, 0.6, 0.8]
-    path = cars(tmp_path / "c.csv", *near, *(1e9 + t for t in near))
-    found = read_vehicles(path, VehicleTableOptions(window=0.4))
-    assert [s.n_samples for s in found] == [3, 3, 3, 3]
-    assert found[-1].time[-1] == pytest.approx(1e9 + 0.8)
+    near = 0.2 * np.arange(5)
+    times = [*near, *(1e9 + near)]
+    text = CARS + "".join(f"{n},{t},{20 * n + 10 * t}\n" for n in (1, 2, 3) for t in times)
+    result = read(tmp_path / "c.csv", VehicleTableOptions(window=0.4), text)
+    assert [s.n_samples for s in result] == [3, 3, 3, 3]
+    assert result[-1].time[-1] == pytest.approx(1e9 + 0.8)
 
 
 def test_huge_whole_numbers_are_names(tmp_path: Path) -> None:
-    path = cars(tmp_path / "c.csv", 0.0, 0.2, 0.4)
-    path.write_text(path.read_text() + "".join(f"1e300,{t},{90 + t}\n" for t in (0, 0.2, 0.4)))
-    assert "1e+300" in read_vehicles(path, VehicleTableOptions())[0].agents
+    text = PLATOON + "".join(f"1e300,{t},{90 + t}\n" for t in (0, 0.2, 0.4))
+    assert "1e+300" in read(tmp_path / "c.csv", VehicleTableOptions(), text)[0].agents
 
 
 def test_damaged_notes_of_pandas_in_parquet_are_refused(tmp_path: Path) -> None:

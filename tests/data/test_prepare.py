@@ -233,8 +233,8 @@ def test_two_percent_of_missing_samples_cost_no_platoon(tmp_path: Path) -> None:
     store = prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
     assert len(store) == 8
     told = store.manifest["filled"]
-    assert sum(one["samples"] for one in told) == pytest.approx(0.02 * len(rows), rel=0.3)
-    assert {one["sequence"] for one in told} <= {s.name for s in store}
+    assert sum(entry["samples"] for entry in told) == pytest.approx(0.02 * len(rows), rel=0.3)
+    assert {entry["sequence"] for entry in told} <= {s.name for s in store}
     # what is longer is not filled: it cuts a platoon in two, and that is said
     gone = rows[~(rows.time.between(3, 5) & (rows.agent == 1))]
     gone.to_csv(path, index=False)

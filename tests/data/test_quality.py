@@ -37,7 +37,7 @@ def people(n: int = 4, k: int = 26, dt: float = 0.04) -> Sequence:
     return replace(walked, v=None)
 
 
-def changed(sequence: Sequence, at: tuple, value: object) -> Sequence:
+def altered(sequence: Sequence, at: tuple, value: object) -> Sequence:
     x = sequence.x.copy()
     x[at] = value
     return replace(sequence, x=x)
@@ -119,7 +119,7 @@ def test_a_fault_is_told_where_it_is(
     sample: int,
 ) -> None:
     domain: Domain = "traffic" if sequence.x.shape[2] == 1 else "crowd"
-    (fault,) = find_faults(changed(sequence, at, value), domain)
+    (fault,) = find_faults(altered(sequence, at, value), domain)
     assert (fault.kind, fault.agents) == (kind, agents)
     assert fault.time == pytest.approx(sequence.time[sample])
     if sequence.agents and agents[0] == 0:
@@ -134,13 +134,13 @@ def test_a_car_may_start_at_the_origin() -> None:
 def test_limit_of_displacement_grows_with_the_interval() -> None:
     for dt, step, expected in ((0.2, 13.0, ["jump"]), (0.4, 13.0, []), (0.4, 25.0, ["jump"])):
         s = platoon(n=2, dt=dt)
-        assert kinds(changed(s, np.s_[5:, 1], s.x[5:, 1] + step - 25.0 * dt)) == expected
+        assert kinds(altered(s, np.s_[5:, 1], s.x[5:, 1] + step - 25.0 * dt)) == expected
 
 
 @pytest.mark.parametrize(("step", "expected"), [(-0.4, []), (-1.5, ["backward"]), (-3.0, ["jump"])])
 def test_backward(step: float, expected: list[str]) -> None:
     s = platoon(n=2, speed=5.0)
-    assert kinds(changed(s, np.s_[4:, 0], s.x[4:, 0] + step - 1.0)) == expected
+    assert kinds(altered(s, np.s_[4:, 0], s.x[4:, 0] + step - 1.0)) == expected
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_a_front_within_the_vehicle_ahead_is_an_overlap(length: float, expected:
 
 def test_overlap_of_cars() -> None:
     s = platoon(n=2)
-    near = changed(s, (slice(3, 5), 0), s.x[3:5, 1] - 1.5)
+    near = altered(s, (slice(3, 5), 0), s.x[3:5, 1] - 1.5)
     faults = [f for f in find_faults(near, "traffic") if f.kind == "overlap"]
     assert len(faults) == 1
     assert "1.50 m apart at 2 of 8 samples" in faults[0].detail
@@ -171,7 +171,7 @@ def test_overlap_of_cars() -> None:
 
 def test_people_beside_each_other() -> None:
     s = people()
-    assert kinds(changed(s, np.s_[:, 2], s.x[:, 0] + [0.0, 0.05]), "crowd") == ["overlap"]
+    assert kinds(altered(s, np.s_[:, 2], s.x[:, 0] + [0.0, 0.05]), "crowd") == ["overlap"]
 
 
 def test_duplicates() -> None:
@@ -180,19 +180,19 @@ def test_duplicates() -> None:
     (fault,) = find_faults(same, "crowd")
     assert (fault.kind, fault.agents) == ("duplicate", (0, 2))
     twin = replace(s, x=s.x[:, [0, 1, 1, 3]])
-    found = find_faults(twin, "crowd")
-    assert [f.kind for f in found] == ["duplicate", "overlap"]
-    assert not usable(twin, found)
+    result = find_faults(twin, "crowd")
+    assert [f.kind for f in result] == ["duplicate", "overlap"]
+    assert not usable(twin, result)
 
 
 def test_gaps_and_numbers() -> None:
     s = platoon()
-    absent = changed(s, np.s_[2:4, 1], np.nan)
+    absent = altered(s, np.s_[2:4, 1], np.nan)
     (fault,) = find_faults(absent, "traffic")
     assert "10.4-10.6 s" in fault.detail
     assert not usable(absent, [fault])
-    assert kinds(changed(s, (3, 1), np.inf)) == ["non_finite"]
-    assert kinds(changed(people(), (3, 1, 0), np.nan), "crowd") == ["non_finite"]
+    assert kinds(altered(s, (3, 1), np.inf)) == ["non_finite"]
+    assert kinds(altered(people(), (3, 1, 0), np.nan), "crowd") == ["non_finite"]
     time = s.time.copy()
     time[5:] += 0.2
     (fault,) = find_faults(replace(s, time=time), "traffic")
@@ -215,12 +215,12 @@ def test_too_short() -> None:
 @pytest.mark.real
 def test_motorway_recording_judged_by_eye(real_data: Path) -> None:
     sequences = read_esimas(real_data / "esimas" / "sequence_data1-1_1.mat")
-    found = {i: {f.kind for f in find_faults(s, "traffic")} for i, s in enumerate(sequences)}
+    result = {i: {f.kind for f in find_faults(s, "traffic")} for i, s in enumerate(sequences)}
     # Sequences whose positions fall by 10 to 25 m although all cars drive on.
-    assert [i for i, k in found.items() if "identity_swap" in k] == [0, 11, 15, 18, 32, 33]
+    assert [i for i, k in result.items() if "identity_swap" in k] == [0, 11, 15, 18, 32, 33]
     # Sequences in which two fronts come closer than 2 m, from the raw positions.
     close = [i for i, s in enumerate(sequences) if np.diff(s.x[:, :, 0], axis=1).min() < 2]
-    assert [i for i, k in found.items() if "overlap" in k] == close
+    assert [i for i, k in result.items() if "overlap" in k] == close
     (swap,) = [f for f in find_faults(sequences[0], "traffic") if f.kind == "identity_swap"]
     assert swap.agents == (0, 1, 2)
     assert "car 0 carries on as car 1" in swap.detail
@@ -276,11 +276,11 @@ def test_memory_grows_with_the_number_of_vehicles() -> None:
     s = lane(x[..., 0], agents=tuple(map(str, range(n))))
     tracemalloc.start()
     try:
-        found = {(f.kind, f.agents) for f in find_faults(s, "traffic")}
+        result = {(f.kind, f.agents) for f in find_faults(s, "traffic")}
         most = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert found == {("identity_swap", (5, 6)), ("overlap", (8, 9))}
+    assert result == {("identity_swap", (5, 6)), ("overlap", (8, 9))}
     assert most < 200e6
 
 

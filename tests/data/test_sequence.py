@@ -12,10 +12,10 @@ from nnode.data.sequence import PADDING_GAP, Sequence, collate
 from nnode.errors import DataError
 
 
-def platoon(name: str, k: int, n: int, dt: float = 0.2, **more: object) -> Sequence:
+def platoon(name: str, k: int, n: int, dt: float = 0.2, **further: object) -> Sequence:
     time = 3.0 + dt * np.arange(k)
     x = 10.0 * np.arange(n)[None, :, None] + 20.0 * (time - 3.0)[:, None, None]
-    return Sequence(name=name, recording="r", time=time, x=x, **more)  # type: ignore[arg-type]
+    return Sequence(name=name, recording="r", time=time, x=x, **further)  # type: ignore[arg-type]
 
 
 def test_sequence_knows_its_sizes_and_interval() -> None:
@@ -158,10 +158,10 @@ def test_single_precision_keeps_the_places_of_a_map(dims: int) -> None:
     walls = None if dims == 1 else np.array([[0.0, 0.0, 9.0, 0.0]])
     here = Sequence(name="a", recording="a", time=0.1 * np.arange(5), x=x, walls=walls)
     by = np.array([7e6, -3e6])[:dims]
-    there = replace(here, x=x + by, walls=None if walls is None else walls + np.tile(by, 2))
+    moved = replace(here, x=x + by, walls=None if walls is None else walls + np.tile(by, 2))
     local, mapped = (
         batch.relative_to(batch.origins())
-        for batch in (collate([s]).to(dtype=torch.float32) for s in (here, there))
+        for batch in (collate([s]).to(dtype=torch.float32) for s in (here, moved))
     )
     assert mapped.x.dtype == torch.float32
     for name in ("x", "destination", "walls"):

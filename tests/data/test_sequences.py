@@ -26,15 +26,15 @@ def test_a_data_frame_is_read_as_its_file_is(tidy: pd.DataFrame, tmp_path: Path)
     tidy.to_parquet(tmp_path / "table.parquet")
     options = TableOptions(domain="traffic", path=str(tmp_path / "table.parquet"))
     store = prepare(options, tmp_path / "store")
-    for found in (nnode.sequences(tidy), nnode.sequences(tmp_path / "table.parquet")):
-        assert [s.name for s in found] == [entry["name"] for entry in store.index]
-        for ours, theirs in zip(found, store, strict=True):
+    for result in (nnode.sequences(tidy), nnode.sequences(tmp_path / "table.parquet")):
+        assert [s.name for s in result] == [entry["name"] for entry in store.index]
+        for ours, theirs in zip(result, store, strict=True):
             assert np.array_equal(ours.x, theirs.x)
             assert np.array_equal(ours.time, theirs.time)
             assert ours.agents == theirs.agents
             assert np.array_equal(ours.length, theirs.length)
-        assert found.manifest["counts"] == store.manifest["counts"]
-        assert found.domain == "traffic"
+        assert result.manifest["counts"] == store.manifest["counts"]
+        assert result.domain == "traffic"
 
 
 def test_the_format_shows_in_the_columns(tidy: pd.DataFrame) -> None:
@@ -43,9 +43,9 @@ def test_the_format_shows_in_the_columns(tidy: pd.DataFrame) -> None:
     assert two.manifest["reader"] == PairOptions.__name__
     assert [s.n_agents for s in two] == [2, 2]
     assert two[0].v is not None
-    one = tidy[tidy.sequence == 0].rename(columns={"agent": "vehicle"}).drop(columns="sequence")
-    (cars,) = nnode.sequences(one, dt=0.1)
-    assert nnode.sequences(one).manifest["reader"] == VehicleTableOptions.__name__
+    single = tidy[tidy.sequence == 0].rename(columns={"agent": "vehicle"}).drop(columns="sequence")
+    (cars,) = nnode.sequences(single, dt=0.1)
+    assert nnode.sequences(single).manifest["reader"] == VehicleTableOptions.__name__
     assert cars.n_agents == 3
     walk = tidy.assign(y=0.5 * tidy.agent)
     assert nnode.sequences(walk, faults="keep").domain == "crowd"
@@ -54,14 +54,14 @@ def test_the_format_shows_in_the_columns(tidy: pd.DataFrame) -> None:
 def test_columns_of_other_names_and_units_are_told(tidy: pd.DataFrame) -> None:
     feet = tidy[tidy.sequence == 0].assign(front=tidy.x / 0.3048)[["time", "agent", "front"]]
     columns = {"vehicle": "agent", "x": "front"}
-    (one,) = nnode.sequences(feet, data="vehicles", columns=columns, position_unit="ft", dt=0.1)
-    assert one.x[:, 0, 0] == pytest.approx(tidy[tidy.agent == 0].x.to_numpy(), abs=1e-6)
+    (single,) = nnode.sequences(feet, data="vehicles", columns=columns, position_unit="ft", dt=0.1)
+    assert single.x[:, 0, 0] == pytest.approx(tidy[tidy.agent == 0].x.to_numpy(), abs=1e-6)
 
 
 def test_a_data_set_is_read_by_its_name(real_data: Path) -> None:
-    found = nnode.sequences(data="esimas", recording="1-1_1", source=str(real_data))
-    assert len(found) > 10
-    assert {s.recording for s in found} == {"1-1_1"}
+    result = nnode.sequences(data="esimas", recording="1-1_1", source=str(real_data))
+    assert len(result) > 10
+    assert {s.recording for s in result} == {"1-1_1"}
 
 
 def test_parts_are_sequences_again(tidy: pd.DataFrame) -> None:

@@ -53,11 +53,11 @@ def errors(kind: str, n: int) -> np.ndarray:
     draw = np.random.default_rng(0).standard_normal(n)
     if kind == "new":
         return 0.3 * draw
-    keep, found = np.exp(-STEP), np.empty(n)
-    found[0] = draw[0]
+    keep, result = np.exp(-STEP), np.empty(n)
+    result[0] = draw[0]
     for k in range(1, n):
-        found[k] = keep * found[k - 1] + np.sqrt(1 - keep**2) * draw[k]
-    return 0.3 * found
+        result[k] = keep * result[k - 1] + np.sqrt(1 - keep**2) * draw[k]
+    return 0.3 * result
 
 
 def spread(values: np.ndarray) -> float:
@@ -87,8 +87,8 @@ def figures(folder: Path, kind: str, window: float | None) -> tuple[float, float
 def test_a_cubic_stays_as_it_is() -> None:
     time = np.arange(0, 8, STEP)
     x = 3 + 8 * time + 0.5 * time**2 - 0.05 * time**3
-    found, speed = smooth(time, x, 2.0)
-    np.testing.assert_allclose(found, x, atol=1e-9)
+    result, speed = smooth(time, x, 2.0)
+    np.testing.assert_allclose(result, x, atol=1e-9)
     np.testing.assert_allclose(speed, 8 + time - 0.15 * time**2, atol=1e-8)
     # a hole that is interpolated, and a record shorter than the window
     some = np.delete(np.arange(len(time)), [31, 32])
@@ -97,10 +97,10 @@ def test_a_cubic_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3, 4])
-def test_a_record_of_few_samples_stays_as_it_is(samples: int) -> None:
+def test_a_partof_few_samples_stays_as_it_is(samples: int) -> None:
     time = STEP * np.arange(samples)
-    found, speed = smooth(time, 5 * time, 2.0)
-    np.testing.assert_array_equal(found, 5 * time)
+    result, speed = smooth(time, 5 * time, 2.0)
+    np.testing.assert_array_equal(result, 5 * time)
     np.testing.assert_allclose(speed, 5.0 if samples > 1 else 0.0)
 
 
@@ -130,9 +130,9 @@ def row(label: str) -> list[float]:
 
 @pytest.mark.parametrize("window", WINDOWS)
 def test_the_page_s_figures_on_a_known_truth(tmp_path: Path, window: float | None) -> None:
-    found = [f for kind in ("new", "lasting") for f in figures(tmp_path, kind, window)]
+    result = [f for kind in ("new", "lasting") for f in figures(tmp_path, kind, window)]
     label = "as measured" if window is None else f"`data.smooth={window:g}`"
-    assert row(label) == pytest.approx(found, abs=0.0006)
+    assert row(label) == pytest.approx(result, abs=0.0006)
 
 
 @pytest.mark.real
@@ -140,13 +140,16 @@ def test_the_page_s_figures_on_a_known_truth(tmp_path: Path, window: float | Non
 def test_the_page_s_figures_on_a_reconstructed_table(real_data: Path, window: float | None) -> None:
     path = real_data / "ngsim" / "i80_lanes_1_2.csv"
     raw = read_ngsim(path, NgsimOptions(window=10.0))
-    found = read_ngsim(path, NgsimOptions(window=10.0, smooth=window))
-    assert [s.agents for s in raw] == [s.agents for s in found]
-    pairs = list(zip(raw, found, strict=True))
+    result = read_ngsim(path, NgsimOptions(window=10.0, smooth=window))
+    assert [s.agents for s in raw] == [s.agents for s in result]
+    pairs = list(zip(raw, result, strict=True))
     figures = [
         spread(np.concatenate([(a.x - b.x).ravel() for a, b in pairs])),
         spread(np.concatenate([(a.velocity() - b.velocity()).ravel() for a, b in pairs])),
-        *(spread(np.concatenate([acceleration(s).ravel() for s in own])) for own in (raw, found)),
+        *(
+            spread(np.concatenate([acceleration(s).ravel() for s in group]))
+            for group in (raw, result)
+        ),
     ]
     assert row(f"NGSIM, `data.smooth={window:g}`") == pytest.approx(figures, abs=0.0006)
 
@@ -164,10 +167,10 @@ def test_the_noise_of_positions_is_found(rate: float, sigma: float) -> None:
     x = np.stack(paths, 1)[..., None]
     x = x + sigma * rng.normal(size=x.shape)
     x[100, 3] += 40.0  # outliers do not matter
-    found = measured_noise([Sequence(name="a", recording="a", time=time, x=x)])
-    assert found.position == pytest.approx(sigma, rel=0.05)
-    assert found.start_speed == pytest.approx(np.sqrt(2) * sigma * rate, rel=0.05)
-    assert found.beyond == (found.start_speed > BEARABLE)
+    result = measured_noise([Sequence(name="a", recording="a", time=time, x=x)])
+    assert result.position == pytest.approx(sigma, rel=0.05)
+    assert result.start_speed == pytest.approx(np.sqrt(2) * sigma * rate, rel=0.05)
+    assert result.beyond == (result.start_speed > BEARABLE)
 
 
 def record(time: np.ndarray, x: np.ndarray) -> list[Record]:
@@ -186,17 +189,17 @@ def record(time: np.ndarray, x: np.ndarray) -> list[Record]:
 def test_a_hole_does_not_bias_speeds() -> None:
     time = 0.1 * np.arange(60)
     x = 10 * time + 0.5 * 1.5 * time**2
-    (found,) = record(np.delete(time, range(20, 25)), np.delete(x, range(20, 25)))
-    np.testing.assert_allclose(found.x[:, 0], x, atol=1e-9)
-    assert found.filled.nonzero()[0].tolist() == [20, 21, 22, 23, 24]
-    line = np.interp(time, time[~found.filled], x[~found.filled])
+    (result,) = record(np.delete(time, range(20, 25)), np.delete(x, range(20, 25)))
+    np.testing.assert_allclose(result.x[:, 0], x, atol=1e-9)
+    assert result.filled.nonzero()[0].tolist() == [20, 21, 22, 23, 24]
+    line = np.interp(time, time[~result.filled], x[~result.filled])
     assert (np.diff(x) - np.diff(line))[19] / 0.1 < -0.3  # m/s, the bias of a straight line
     # what is longer ends a record, and so does an empty cell
     apart = record(np.delete(time, range(20, 26)), np.delete(x, range(20, 26)))
-    assert [(one.first, one.last) for one in apart] == [(0, 19), (26, 59)]
+    assert [(part.first, part.last) for part in apart] == [(0, 19), (26, 59)]
     lacking = x.copy()
     lacking[20:26] = np.nan
-    assert [len(one.x) for one in record(time, lacking)] == [20, 34]
+    assert [len(part.x) for part in record(time, lacking)] == [20, 34]
 
 
 NOISE = 0.05 * np.random.default_rng(6).standard_normal((3, 120))

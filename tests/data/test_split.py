@@ -201,8 +201,8 @@ def test_real_corridor_is_held_out_as_a_block(real_data: Path) -> None:
     index = []
     for second in range(int(table[:, 1].max()) // 25):
         window = table[(table[:, 1] >= 25 * second) & (table[:, 1] <= 25 * second + 25)]
-        who, seen = np.unique(window[:, 0], return_counts=True)
-        whole = [f"{int(i)}" for i in who[seen == 26]]
+        who, count = np.unique(window[:, 0], return_counts=True)
+        whole = [f"{int(i)}" for i in who[count == 26]]
         if whole:
             index.append(entry(float(second), second + 1.0, *whole))
     result = split(index, SplitOptions(heldout=0.2))

@@ -71,8 +71,8 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     store = write_store(tmp_path / "a" / "b", iter(items), {"domain": "crowd", "n": 7})
     assert len(store) == 7
     assert store.manifest == {"domain": "crowd", "n": 7}
-    for item, found in zip(items, store, strict=True):
-        assert_same(item, found)
+    for item, result in zip(items, store, strict=True):
+        assert_same(item, result)
     assert_same(store[-1], items[-1])
     with pytest.raises(IndexError):
         store[7]
@@ -80,11 +80,11 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
 
 def test_what_a_sequence_has_not_it_has_not_after_the_round_trip(tmp_path: Path) -> None:
     store = write_store(tmp_path, [bare("tunnel/1")], {})
-    found = store[0]
-    assert_same(found, bare("tunnel/1"))
-    assert found.agents == ()
-    assert found.v is found.length is found.kind is found.group is None
-    assert found.destination is found.walls is None
+    result = store[0]
+    assert_same(result, bare("tunnel/1"))
+    assert result.agents == ()
+    assert result.v is result.length is result.kind is result.group is None
+    assert result.destination is result.walls is None
 
 
 @settings(max_examples=25, deadline=None)
@@ -296,12 +296,12 @@ def test_flipped_bits_are_noticed(folder: Path) -> None:
         damaged[position] ^= 0x10
         (folder / TABLE).write_bytes(damaged)
         try:
-            found = list(Store(folder))
+            result = list(Store(folder))
         except DataError as error:
             assert str(folder / TABLE) in str(error)  # noqa: PT017
             noticed += 1
         else:  # a byte that carries no data
-            for a, b in zip(reference, found, strict=True):
+            for a, b in zip(reference, result, strict=True):
                 assert_same(a, b)
     assert noticed > 5
 

@@ -48,10 +48,10 @@ def test_every_car_drives_at_the_speed_of_its_gap(tmp_path: Path) -> None:
 
 
 def test_platoons_have_the_shape_of_the_published_ones(tmp_path: Path) -> None:
-    found = platoons(traffic_recording(tmp_path / "a.mat", seed=3))
-    assert len(found) == 40
-    assert {x.shape[0] for x, _ in found} == {3, 4, 5, 6}
-    for x, t in found:
+    recorded = platoons(traffic_recording(tmp_path / "a.mat", seed=3))
+    assert len(recorded) == 40
+    assert {x.shape[0] for x, _ in recorded} == {3, 4, 5, 6}
+    for x, t in recorded:
         assert x.dtype == t.dtype == np.float64
         assert t.shape == (1, x.shape[1])
         np.testing.assert_allclose(np.diff(t), 0.2)
@@ -60,7 +60,7 @@ def test_platoons_have_the_shape_of_the_published_ones(tmp_path: Path) -> None:
         assert (np.diff(x[:, 0]) <= 40.0).all()
         assert (np.diff(x, axis=0) > 0).all()
         assert (x > 0).all()
-    pauses = [b[1][0, 0] - a[1][0, -1] for a, b in pairwise(found)]
+    pauses = [b[1][0, 0] - a[1][0, -1] for a, b in pairwise(recorded)]
     assert min(pauses) == pytest.approx(10.0)
 
 
@@ -132,10 +132,10 @@ def test_people_are_accelerated_as_the_paper_says(tmp_path: Path) -> None:
         noise=0.0,
     )
     table = np.loadtxt(path)
-    one, two = (table[table[:, 0] == i] for i in (1, 2))
-    shared = np.intersect1d(one[:, 1], two[:, 1])
-    x = np.stack([s[np.isin(s[:, 1], shared)][:, 2:4] / 100 for s in (one, two)], axis=1)
-    lane = np.stack([one[0, 3], two[0, 3]]) / 100  # straight ahead from where each came in
+    first, two = (table[table[:, 0] == i] for i in (1, 2))
+    shared = np.intersect1d(first[:, 1], two[:, 1])
+    x = np.stack([s[np.isin(s[:, 1], shared)][:, 2:4] / 100 for s in (first, two)], axis=1)
+    lane = np.stack([first[0, 3], two[0, 3]]) / 100  # straight ahead from where each came in
     heading = np.sign(x[-1, :, 0] - x[0, :, 0])
     goal = np.column_stack([heading * (3.0 + 1.0 + 5.0), lane])
     along = np.linspace(-4.0, 4.0, 33)
@@ -183,8 +183,8 @@ def test_people_cross_the_corridor_in_both_directions(demo: dict[str, Path]) -> 
     assert len(crossed) == 45
     assert sum(c > 9 for c in crossed) >= 15
     assert sum(c < -9 for c in crossed) >= 15
-    seen = np.bincount(table[:, 1].astype(int))
-    assert seen.max() >= 10
+    present = np.bincount(table[:, 1].astype(int))
+    assert present.max() >= 10
     assert 25 <= (table[:, 1].max() - table[:, 1].min()) / 25 <= 36
 
 
@@ -197,12 +197,12 @@ def test_the_same_seed_gives_the_same_bytes(
     monkeypatch.setattr(
         nnode.data.synthetic, "crowd_recording", lambda path, seed, **_: few(path, seed=seed)
     )
-    first, again, other = (
+    first, repeated, other = (
         demo_data(tmp_path / n, seed=s) for n, s in (("a", 0), ("b", 0), ("c", 1))
     )
     assert first["esimas"].read_bytes() == demo["esimas"].read_bytes()
     for name, path in first.items():
-        assert again[name].read_bytes() == path.read_bytes()
+        assert repeated[name].read_bytes() == path.read_bytes()
         assert other[name].read_bytes() != path.read_bytes()
 
 

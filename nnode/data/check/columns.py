@@ -13,114 +13,57 @@ from nnode.data.check.raw import Raw
 from nnode.data.readers.columns import floats
 
 #: Names by meaning, small letters and digits only; the first is the meaning's own.
-NAMES: dict[str, tuple[str, ...]] = {
-    "agent": (
-        "agent",
-        "id",
-        "vehicle",
-        "vehicleid",
-        "veh",
-        "vehid",
-        "vid",
-        "track",
-        "trackid",
-        "car",
-        "carid",
-        "person",
-        "personid",
-        "pid",
-        "ped",
-        "pedid",
-        "pedestrian",
-        "pedestrianid",
-        "agentid",
-        "object",
-        "objectid",
-        "obj",
-        "objid",
-        "targetid",
-        "name",
-    ),
-    "time": ("time", "t", "timestamp", "globaltime", "seconds", "sec", "datetime", "epoch"),
-    "frame": ("frame", "frameid", "framenumber", "framenum", "frameindex", "fr", "step"),
-    "x": (
-        "x",
-        "posx",
-        "xpos",
-        "positionx",
-        "xposition",
-        "localy",
-        "position",
-        "pos",
-        "station",
-        "distance",
-        "s",
-        "px",
-        "xcoord",
-        "xcenter",
-        "xm",
-        "east",
-        "easting",
-        "frontx",
-    ),
-    "y": (
-        "y",
-        "posy",
-        "ypos",
-        "positiony",
-        "yposition",
-        "localx",
-        "lateral",
-        "py",
-        "ycoord",
-        "ycenter",
-        "ym",
-        "north",
-        "northing",
-        "d",
-    ),
-    "lane": ("lane", "laneid", "laneno", "lanenumber", "laneindex"),
-    "speed": ("speed", "v", "vel", "velocity", "vvel", "spd", "speedmps"),
-    "vx": ("vx", "xvelocity", "velx", "velocityx", "xvel", "speedx"),
-    "vy": ("vy", "yvelocity", "vely", "velocityy", "yvel", "speedy"),
-    "length": ("length", "len", "vlength", "vehiclelength", "vehlength", "carlength"),
-    "kind": ("kind", "class", "cls", "type", "vclass", "vehicletype", "vehicleclass", "agenttype"),
-    "sequence": ("sequence", "seq", "scene", "sceneid", "segment", "episode", "trial", "platoon"),
-    "recording": ("recording", "recordingid", "run", "runno", "location", "session", "dataset"),
-    "x_follower": ("xfollower", "xfollowerreal", "xf", "followerx", "xfollowing", "xfoll"),
-    "x_leader": ("xleader", "xleaderreal", "xl", "leaderx", "xlead", "xpreceding"),
-    "v_follower": ("vfollower", "vfollowerreal", "vf", "followerv", "vfollowing", "followerspeed"),
-    "v_leader": ("vleader", "vleaderreal", "vl", "leaderv", "vlead", "leaderspeed"),
-    "leader_length": ("leaderlength", "lengthleader", "lleader"),
-    "spacing": ("spacing", "gap", "spaceheadway", "ivs"),
-    "pair": ("pair", "pairid", "event", "eventid"),
-    "follower": ("follower", "followerid", "following"),
-    "leader": ("leader", "leaderid", "preceding", "precedingid"),
-    "split": ("split",),
-    "leader_kind": ("leaderkind", "leadertype"),
-    "position": ("order", "rank", "place"),
+NAMES: dict[str, list[str]] = {
+    meaning: usual.split()
+    for meaning, usual in {
+        "agent": "agent id vehicle vehicleid veh vehid vid track trackid car carid person "
+        "personid pid ped pedid pedestrian pedestrianid agentid object objectid obj "
+        "objid targetid name",
+        "time": "time t timestamp globaltime seconds sec datetime epoch",
+        "frame": "frame frameid framenumber framenum frameindex fr step",
+        "x": "x posx xpos positionx xposition localy position pos station distance s px "
+        "xcoord xcenter xm east easting frontx",
+        "y": "y posy ypos positiony yposition localx lateral py ycoord ycenter ym north northing d",
+        "lane": "lane laneid laneno lanenumber laneindex",
+        "speed": "speed v vel velocity vvel spd speedmps",
+        "vx": "vx xvelocity velx velocityx xvel speedx",
+        "vy": "vy yvelocity vely velocityy yvel speedy",
+        "length": "length len vlength vehiclelength vehlength carlength",
+        "kind": "kind class cls type vclass vehicletype vehicleclass agenttype",
+        "sequence": "sequence seq scene sceneid segment episode trial platoon",
+        "recording": "recording recordingid run runno location session dataset",
+        "x_follower": "xfollower xfollowerreal xf followerx xfollowing xfoll",
+        "x_leader": "xleader xleaderreal xl leaderx xlead xpreceding",
+        "v_follower": "vfollower vfollowerreal vf followerv vfollowing followerspeed",
+        "v_leader": "vleader vleaderreal vl leaderv vlead leaderspeed",
+        "leader_length": "leaderlength lengthleader lleader",
+        "spacing": "spacing gap spaceheadway ivs",
+        "pair": "pair pairid event eventid",
+        "follower": "follower followerid following",
+        "leader": "leader leaderid preceding precedingid",
+        "split": "split",
+        "leader_kind": "leaderkind leadertype",
+        "position": "order rank place",
+    }.items()
 }
 #: Units that a name may end in, with their own names.
 UNITS = {
-    "m": "m",
-    "cm": "cm",
-    "mm": "mm",
-    "ft": "ft",
-    "feet": "ft",
-    "km": "km",
-    "s": "s",
-    "sec": "s",
-    "ms": "ms",
-    "frames": "frame",
-    "m/s": "m/s",
-    "mps": "m/s",
-    "ms-1": "m/s",
-    "km/h": "km/h",
-    "kmh": "km/h",
-    "kph": "km/h",
-    "mph": "mph",
-    "ft/s": "ft/s",
-    "fps": "ft/s",
+    ending: unit
+    for unit, endings in {
+        "m": "m",
+        "cm": "cm",
+        "mm": "mm",
+        "ft": "ft feet",
+        "km": "km",
+        "s": "s sec",
+        "ms": "ms",
+        "frame": "frames",
+        "m/s": "m/s mps ms-1",
+        "km/h": "km/h kmh kph",
+        "mph": "mph",
+        "ft/s": "ft/s fps",
+    }.items()
+    for ending in endings.split()
 }
 _ENDING = re.compile(
     r"(?:\s*[\[(/]\s*|[_ ])("
@@ -128,23 +71,11 @@ _ENDING = re.compile(
     + r")\s*[\])]?$",
     re.IGNORECASE,
 )
-_NUMERIC = (
-    "time",
-    "frame",
-    "x",
-    "y",
-    "speed",
-    "vx",
-    "vy",
-    "length",
-    "x_follower",
-    "x_leader",
-    "v_follower",
-    "v_leader",
-    "leader_length",
-    "spacing",
-    "position",
-)
+#: Meanings whose cells are names, not numbers.
+_WORDS = {
+    *("agent", "lane", "kind", "sequence", "recording", "split"),
+    *("pair", "follower", "leader", "leader_kind"),
+}
 #: Share of a column's cells that must be numbers where its meaning needs them.
 MOSTLY = 0.5
 
@@ -253,7 +184,7 @@ def meanings(raw: Raw) -> dict[str, Meaning]:
         fit = [
             column
             for column in sorted(candidates, key=lambda c: candidates[c])
-            if meaning not in _NUMERIC or np.isfinite(numbers(frame, column)).mean() > MOSTLY
+            if meaning in _WORDS or np.isfinite(numbers(frame, column)).mean() > MOSTLY
         ]
         if fit:
             column = fit[0]

@@ -157,57 +157,11 @@ def _runs(key: str, path: Path, options: OpenAccOptions) -> Iterator[Trajectorie
     lines = [*start.decode("utf-8-sig", errors="replace").splitlines(), *[""] * len(HEAD)]
     if lines[0].startswith(HEAD[0] + ","):
         name = re.sub(r"\.[^./]*$", "", key).replace("/", "_")
-        yield _published_run(name, path, lines, options)
+        table = _published(name, path, lines)
+        coordinates = table.frame[["E", "N"]].to_numpy()
     else:
-        yield from _flat_runs(path, options)
-
-
-def _published_run(
-    name: str, path: Path, lines: list[str], options: OpenAccOptions
-) -> Trajectories:
-    head = [line.strip().rstrip(",").split(",") for line in lines[: len(HEAD)]]
-    for number, (cells, expected) in enumerate(zip(head, HEAD, strict=True), start=1):
-        if cells[0] != expected:
-            raise DataError(f"{path}, line {number}: expected {expected},…, found {cells[0]!r}")
-    make = [cell.strip() for cell in head[1][1:]]
-    said = head[2][1] if len(head[2]) > 1 else ""
-    if said != str(len(make)):
-        raise DataError(
-            f"{path}, line 3: {said or 'no number of'} vehicles, but line 2 has the order of "
-            f"{len(make)}: correct either"
-        )
-    table = Table(path, skiprows=len(HEAD))
-    table.choose(("Time",))
-    held, n = set(table.frame.columns), len(make)
-
-    def cells_of(word: str, first: int = 1) -> np.ndarray:
-        """``(rows * n,)``, vehicle by vehicle, NaN where the file has no column."""
-        names = [f"{word}{i + first}" for i in range(n)]
-        nowhere = np.full(len(table), np.nan)
-        return np.concatenate(
-            [table.numbers(c, empty=True) if c in held else nowhere for c in names]
-        )
-
-    acc = len(head[3]) > 1 and head[3][1] == "1"
-    setting = head[4][1] if acc and len(head[4]) > 1 and head[4][1] else "none"
-    return _run(
-        path,
-        name,
-        place=np.repeat(np.arange(n), len(table)),
-        make=make,
-        told={"acc": "ACC" if acc else "people", "setting": setting},
-        options=options,
-        where=lambda i: table.row(i % len(table)),
-        time=np.tile(table.numbers("Time"), n),
-        x=np.stack([cells_of("E"), cells_of("N")], -1),
-        v=cells_of("Speed")[:, None],
-        # the first has nobody in front
-        spacing=cells_of("IVS", 0),
-    )
-
-
-def _flat_runs(path: Path, options: OpenAccOptions) -> Iterator[Trajectories]:
-    table = Table(path)
+        table = Table(path)
+        coordinates = np.full((len(table), 2), np.nan)
     names = table.choose(_FLAT, ("make", "acc", "setting"))
     run, position = table.names("run"), _positions(table)
     time = table.numbers("t")
@@ -231,10 +185,40 @@ def _flat_runs(path: Path, options: OpenAccOptions) -> Iterator[Trajectories]:
             options=options,
             where=lambda i, rows=rows: table.row(int(rows[i])),
             time=time[rows],
-            x=np.full((len(rows), 2), np.nan),
+            x=coordinates[rows],
             v=v[rows, None],
             spacing=np.where(alone, np.nan, gap[rows]),
         )
+
+
+def _published(name: str, path: Path, lines: list[str]) -> Table:
+    """A published file as a table with one row per vehicle and time, and with coordinates."""
+    head = [[*line.strip().rstrip(",").split(","), ""] for line in lines[: len(HEAD)]]
+    for number, (cells, expected) in enumerate(zip(head, HEAD, strict=True), start=1):
+        if cells[0] != expected:
+            raise DataError(f"{path}, line {number}: expected {expected},…, found {cells[0]!r}")
+    _, order, vehicles, acc, setting = head
+    make = [cell.strip() for cell in order[1:-1]]
+    if vehicles[1] != str(len(make)):
+        raise DataError(
+            f"{path}, line 3: {vehicles[1] or 'no number of'} vehicles, but line 2 has the order "
+            f"of {len(make)}: correct either"
+        )
+    table = Table(path, skiprows=len(HEAD))
+    table.choose(("Time",))
+    parts = []
+    for place in range(1, len(make) + 1):
+        # the first vehicle has nobody in front, and some have no coordinates
+        columns = {"v": f"Speed{place}", "gap": f"IVS{place - 1}"}
+        columns |= {axis: f"{axis}{place}" for axis in ("E", "N")}
+        values: dict[str, Any] = {
+            key: table.numbers(column, empty=True) if column in table.frame else np.nan
+            for key, column in columns.items()
+        }
+        values |= {"t": table.numbers("Time"), "position": place, "make": make[place - 1]}
+        parts.append(pd.DataFrame(values, index=table.frame.index))
+    table.frame = pd.concat(parts).assign(run=name, acc=acc[1], setting=setting[1])
+    return table
 
 
 def _run(

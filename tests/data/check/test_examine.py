@@ -22,29 +22,29 @@ from nnode.errors import ConfigError, DataError
 from tests.data.check.planted import cars, people, saved, text
 
 
-def said(found: Examination, level: str = "error") -> dict[str, str]:
+def said(file: Examination, level: str = "error") -> dict[str, str]:
     """Findings of a level by kind."""
-    return {one.kind: one.text for one in found.findings if one.level == level}
+    return {item.kind: item.text for item in file.findings if item.level == level}
 
 
-def vehicles(found: Examination) -> VehicleTableOptions:
-    assert found.source.group == "vehicles"
-    return cast(VehicleTableOptions, found.source.options)
+def vehicles(file: Examination) -> VehicleTableOptions:
+    assert file.source.group == "vehicles"
+    return cast(VehicleTableOptions, file.source.options)
 
 
 def test_a_sound_table_is_read_with_the_options_that_are_told(tmp_path: Path) -> None:
-    found = examine(saved(cars(), tmp_path))
-    assert said(found) == {}
-    assert said(found, "warning") == {}
-    options = vehicles(found)
+    file = examine(saved(cars(), tmp_path))
+    assert said(file) == {}
+    assert said(file, "warning") == {}
+    options = vehicles(file)
     assert options.columns == {"vehicle": "veh", "time": "t", "speed": "v"}
     assert (options.position_unit, options.time_unit, options.speed_unit) == ("m", "s", "m/s")
     assert (options.direction, options.dt) == (1, 0.2)
-    assert certainty(found.scale.probability) == "sure"
-    (platoon,) = found.sequences
+    assert certainty(file.scale.probability) == "sure"
+    (platoon,) = file.sequences
     assert platoon.n_agents == 12
     assert platoon.agents[-1] == "0"  # the leader
-    assert found.rows.dt == pytest.approx(0.1)
+    assert file.rows.dt == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
@@ -62,30 +62,30 @@ def test_other_units(
     table = cars().drop(columns=lacking)
     for column, factor in scale.items():
         table[column] = (factor * table[column]).round(9)
-    found = examine(saved(table, tmp_path))
-    options = vehicles(found)
+    file = examine(saved(table, tmp_path))
+    options = vehicles(file)
     assert (options.position_unit, options.time_unit, options.speed_unit) == units
-    assert said(found) == {}
-    assert np.ptp(found.rows.x) == pytest.approx(np.ptp(cars()["x"]), rel=1e-9)
+    assert said(file) == {}
+    assert np.ptp(file.rows.x) == pytest.approx(np.ptp(cars()["x"]), rel=1e-9)
 
 
 def test_the_rate_of_frames_follows_from_speeds_in_the_file(tmp_path: Path) -> None:
     table = cars(dt=0.04)
     table["frame"] = (table.pop("t") / 0.04).round().astype(int)
-    found = examine(saved(table, tmp_path))
-    options = vehicles(found)
+    file = examine(saved(table, tmp_path))
+    options = vehicles(file)
     assert (options.time_unit, options.frame_rate) == ("frame", 25.0)
     assert options.columns["time"] == "frame"
-    assert said(found) == {}
-    assert found.rows.dt == pytest.approx(0.04)
+    assert said(file) == {}
+    assert file.rows.dt == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.5, 0.25])
 def test_a_clock_that_is_wrong_is_told_by_speeds_in_the_file(tmp_path: Path, factor: float) -> None:
     table = cars()
     table["t"] *= factor
-    found = examine(saved(table, tmp_path))
-    text = said(found)["time_scale"]
+    file = examine(saved(table, tmp_path))
+    text = said(file)["time_scale"]
     drive = re.search(r"by their positions vehicles drive ([\d.]+) m/s", text)
     assert drive is not None
     assert float(drive[1]) == pytest.approx(12 / factor, rel=0.01)
@@ -93,10 +93,10 @@ def test_a_clock_that_is_wrong_is_told_by_speeds_in_the_file(tmp_path: Path, fac
 
 
 def test_a_mirrored_direction_is_turned(tmp_path: Path) -> None:
-    found = examine(saved(cars().assign(x=lambda t: -t["x"]), tmp_path))
-    assert vehicles(found).direction == -1
-    assert "data.direction=-1" in said(found, "warning")["direction"]
-    assert said(found) == {}
+    file = examine(saved(cars().assign(x=lambda t: -t["x"]), tmp_path))
+    assert vehicles(file).direction == -1
+    assert "data.direction=-1" in said(file, "warning")["direction"]
+    assert said(file) == {}
 
 
 def test_one_that_drives_the_other_way_is_seen(tmp_path: Path) -> None:
@@ -109,14 +109,13 @@ def test_one_that_drives_the_other_way_is_seen(tmp_path: Path) -> None:
 def test_swapped_identifiers_are_seen(tmp_path: Path) -> None:
     table = cars()
     late = table["t"] > 20
-    one, two = late & (table["veh"] == 3), late & (table["veh"] == 4)
-    table.loc[one, "veh"], table.loc[two, "veh"] = 4, 3
-    found = examine(saved(table, tmp_path))
-    assert "the path of car" in said(found)["identity_swap"]
-    assert "at 20" in said(found)["identity_swap"]
-    assert "(id 4) carries on as car 8 (id 3)" in said(found)["identity_swap"]
+    table.loc[late, "veh"] = table["veh"].replace({3: 4, 4: 3})
+    file = examine(saved(table, tmp_path))
+    assert "the path of car" in said(file)["identity_swap"]
+    assert "at 20" in said(file)["identity_swap"]
+    assert "(id 4) carries on as car 8 (id 3)" in said(file)["identity_swap"]
     # one detector says so
-    assert set(said(found)) == {"identity_swap"}
+    assert set(said(file)) == {"identity_swap"}
 
 
 def test_identifiers_that_change_along_the_way_are_seen(tmp_path: Path) -> None:
@@ -136,9 +135,9 @@ def test_nobody_comes_or_goes_where_a_sequence_begins_and_ends(told: bool, tmp_p
         table.assign(t=table["t"] + 100 * k, x=table["x"] + 300 * (k == 1), veh=100 * k + table.veh)
         for k in range(3)
     ]
-    table = pd.concat([one.assign(sequence=k) for k, one in enumerate(stays)])
-    found = examine(saved(table if told else table.drop(columns="sequence"), tmp_path))
-    kinds = {one.kind for one in found.findings}
+    table = pd.concat([stay.assign(sequence=k) for k, stay in enumerate(stays)])
+    file = examine(saved(table if told else table.drop(columns="sequence"), tmp_path))
+    kinds = {item.kind for item in file.findings}
     assert ("broken" in kinds) is not told
 
 
@@ -148,8 +147,8 @@ def test_cells_rows_and_holes(tmp_path: Path) -> None:
     table.loc[101, "x"] = None
     table = pd.concat([table, table.iloc[[7, 7]]])
     table = table.drop(index=range(600, 640))
-    found = examine(saved(table, tmp_path))
-    wrong = said(found)
+    file = examine(saved(table, tmp_path))
+    wrong = said(file)
     # the empty one is a missing sample
     assert "column 'x' (x) holds no number in 1 of" in wrong["cells"]
     assert "first 'oops' in line 102" in wrong["cells"]
@@ -157,8 +156,8 @@ def test_cells_rows_and_holes(tmp_path: Path) -> None:
         "2 rows repeat the agent and the time of an earlier row (2 of them" in wrong["duplicates"]
     )
     assert "refuses it" in wrong["reader"]
-    assert "the longest of 4.1 s" in said(found, "note")["holes"]
-    assert "readers sort them" in said(found, "note")["unsorted"]
+    assert "the longest of 4.1 s" in said(file, "note")["holes"]
+    assert "readers sort them" in said(file, "note")["unsorted"]
 
 
 def test_overlaps_are_seen(tmp_path: Path) -> None:
@@ -169,25 +168,25 @@ def test_overlaps_are_seen(tmp_path: Path) -> None:
 
 def test_people_in_text_whose_header_tells_all(tmp_path: Path) -> None:
     head = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
-    found = examine(text(people(), tmp_path, head, 100.0))
-    assert said(found) == said(found, "warning") == {}
-    options = cast(WalkwayOptions, found.source.options)
-    assert found.source.group == "pedpy"
+    file = examine(text(people(), tmp_path, head, 100.0))
+    assert said(file) == said(file, "warning") == {}
+    options = cast(WalkwayOptions, file.source.options)
+    assert file.source.group == "pedpy"
     assert (options.frame_rate, options.unit) == (None, None)
-    assert "right to about a tenth" in said(found, "note")["gait"]
-    assert "50% of them towards larger values" in said(found, "note")["direction"]
+    assert "right to about a tenth" in said(file, "note")["gait"]
+    assert "50% of them towards larger values" in said(file, "note")["direction"]
 
 
 def test_people_in_centimetres_whose_rate_nobody_tells(tmp_path: Path) -> None:
-    found = examine(text(people(), tmp_path, "", 100.0))
-    options = cast(WalkwayOptions, found.source.options)
+    file = examine(text(people(), tmp_path, "", 100.0))
+    options = cast(WalkwayOptions, file.source.options)
     assert options.unit == "cm"
     assert options.frame_rate == pytest.approx(16, rel=0.15)  # by their gait
-    assert "of a rate that the file does not tell" in said(found, "warning")["units"]
-    assert " 16" in said(found, "warning")["units"]
-    known = examine(found.path, rate=16.0)
-    assert said(known, "warning") == {}
-    assert cast(WalkwayOptions, known.source.options).frame_rate == 16.0
+    assert "of a rate that the file does not tell" in said(file, "warning")["units"]
+    assert " 16" in said(file, "warning")["units"]
+    stated = examine(file.path, rate=16.0)
+    assert said(stated, "warning") == {}
+    assert cast(WalkwayOptions, stated.source.options).frame_rate == 16.0
 
 
 def test_a_wrong_rate_is_told_by_peoples_gait_alone(tmp_path: Path) -> None:
@@ -208,17 +207,17 @@ def test_the_copied_eth_set_and_its_rate(tmp_path: Path) -> None:
     rows = table.assign(a=0.0, b=0.0)[["frame", "id", "x", "a", "y", "vx", "b", "vy"]]
     path = tmp_path / "obsmat.txt"
     path.write_text(rows.sort_values("frame").to_csv(sep=" ", header=False, index=False))
-    found = examine(path, rate=25.0)
-    assert found.meanings["agent"].column == "column 2"
-    assert found.meanings["y"].column == "column 5"
-    text_ = said(found)["time_scale"]
+    file = examine(path, rate=25.0)
+    assert file.meanings["agent"].column == "column 2"
+    assert file.meanings["y"].column == "column 5"
+    text_ = said(file)["time_scale"]
     assert "at the stated 25 frames/s, people walk 2.4" in text_
     assert "its own velocities say 1.4" in text_
     assert "15 frames/s fit" in text_
     # and the file that would be read says so
-    assert found.source.group == "pedpy"
+    assert file.source.group == "pedpy"
     speed = np.concatenate(
-        [np.linalg.norm(np.diff(s.x, axis=0), axis=-1).ravel() / s.dt for s in found.sequences]
+        [np.linalg.norm(np.diff(s.x, axis=0), axis=-1).ravel() / s.dt for s in file.sequences]
     )
     assert np.median(speed) == pytest.approx(1.47, rel=0.05)
 
@@ -227,14 +226,14 @@ def test_pairs_and_tidy_tables(tmp_path: Path) -> None:
     lead, follow = pair()
     pairs = pd.DataFrame({"t": lead["t"], "xFollower": follow["x"], "x_leader": lead["x"]})
     pairs = pairs.assign(v_follower=follow["v"], v_leader=lead["v"])
-    found = examine(saved(pairs, tmp_path, "pairs.csv"))
-    assert found.source.group == "pairs"
-    assert said(found) == {}
-    assert len(found.sequences) == 1
+    file = examine(saved(pairs, tmp_path, "pairs.csv"))
+    assert file.source.group == "pairs"
+    assert said(file) == {}
+    assert len(file.sequences) == 1
     tidy = cars().rename(columns={"veh": "agent", "t": "time"}).assign(sequence=0)
-    found = examine(saved(tidy[["sequence", "time", "agent", "x"]], tmp_path, "tidy.csv"))
-    assert found.source.group == "table"
-    assert len(found.sequences) == 1
+    file = examine(saved(tidy[["sequence", "time", "agent", "x"]], tmp_path, "tidy.csv"))
+    assert file.source.group == "table"
+    assert len(file.sequences) == 1
 
 
 def pair() -> tuple[pd.DataFrame, ...]:
@@ -246,7 +245,7 @@ def pair() -> tuple[pd.DataFrame, ...]:
 def spaced(units: dict[str, float]) -> pd.DataFrame:
     """Four pairs of spacings and speeds, numbered anew on either side of a division."""
     lead, follow = pair()
-    own = pd.DataFrame(
+    single_pair = pd.DataFrame(
         {
             "t": lead["t"],
             "spacing": (lead["x"] - follow["x"] - 4.5) / units["position"],
@@ -254,7 +253,9 @@ def spaced(units: dict[str, float]) -> pd.DataFrame:
             "leader_speed": lead["v"] / units["speed"],
         }
     )
-    parts = [own.assign(event=i, split=side) for i in range(2) for side in ("train", "test")]
+    parts = [
+        single_pair.assign(event=i, split=side) for i in range(2) for side in ("train", "test")
+    ]
     return pd.concat(parts)
 
 
@@ -263,10 +264,10 @@ def spaced(units: dict[str, float]) -> pd.DataFrame:
 def test_pairs_without_positions_and_their_units(tmp_path: Path, position: str, speed: str) -> None:
     """How spacings change with the speeds tells one unit by the other."""
     units = {"position": LENGTH_UNITS[position], "speed": SPEED_UNITS[speed]}
-    found = examine(saved(spaced(units), tmp_path, "pairs.csv"))
-    assert said(found) == said(found, "warning") == {}
-    assert (found.scale.position, found.scale.speed) == (position, speed)
-    options = found.source.options
+    file = examine(saved(spaced(units), tmp_path, "pairs.csv"))
+    assert said(file) == said(file, "warning") == {}
+    assert (file.scale.position, file.scale.speed) == (position, speed)
+    options = file.source.options
     assert isinstance(options, PairOptions)
     assert options.columns == {
         "time": "t",
@@ -275,10 +276,10 @@ def test_pairs_without_positions_and_their_units(tmp_path: Path, position: str, 
         "v_follower": "speed",
         "v_leader": "leader_speed",
     }
-    assert {s.name for s in found.sequences} == {"train/0", "train/1", "test/0", "test/1"}
-    assert found.sequences[0].v is not None
-    speeds = np.gradient(found.sequences[0].x[:, 0, 0], 0.1)
-    assert np.abs(speeds - found.sequences[0].v[:, 0, 0]).max() < 0.5
+    assert {s.name for s in file.sequences} == {"train/0", "train/1", "test/0", "test/1"}
+    assert file.sequences[0].v is not None
+    speeds = np.gradient(file.sequences[0].x[:, 0, 0], 0.1)
+    assert np.abs(speeds - file.sequences[0].v[:, 0, 0]).max() < 0.5
 
 
 def test_pairs_that_are_left_out_are_a_finding(tmp_path: Path) -> None:
@@ -316,13 +317,13 @@ def test_dates_and_epochs_are_recognised(tmp_path: Path, group: str, kind: str) 
         table = spaced({"position": 1.0, "speed": 1.0})
     clock = "time" if group == "table" else "t"
     table[clock] = DATES[kind](table[clock])
-    found = examine(saved(table, tmp_path, "t.csv"))
-    assert said(found) == {}
-    assert found.source.group == group
-    assert found.scale.time == (kind if kind in ("ms", "us", "ns") else "s")
-    assert found.source.options.time_unit == found.scale.time
-    assert found.rows.dt == pytest.approx(0.1, abs=1e-6)
-    assert found.sequences
+    file = examine(saved(table, tmp_path, "t.csv"))
+    assert said(file) == {}
+    assert file.source.group == group
+    assert file.scale.time == (kind if kind in ("ms", "us", "ns") else "s")
+    assert file.source.options.time_unit == file.scale.time
+    assert file.rows.dt == pytest.approx(0.1, abs=1e-6)
+    assert file.sequences
 
 
 @pytest.mark.parametrize("dates", [True, False])
@@ -331,9 +332,9 @@ def test_semicolons_and_commas(tmp_path: Path, dates: bool) -> None:
     table = cars()
     table["t"] = DATES["dates"](table["t"]) if dates else table["t"]
     table.to_csv(path, index=False, sep=";", decimal=",")
-    found = examine(path)
-    assert found.source.group == "vehicles"
-    (platoon,) = found.sequences
+    file = examine(path)
+    assert file.source.group == "vehicles"
+    (platoon,) = file.sequences
     assert platoon.n_agents == 12
     assert platoon.time[0] == 0.0
 
@@ -396,19 +397,19 @@ REAL = {
 @pytest.mark.real
 @pytest.mark.parametrize("name", REAL)
 def test_real_files_are_recognised(real_data: Path, name: str) -> None:
-    found = examine(real_data / name)
-    assert (found.source.group, found.scale.domain) == REAL[name]
-    assert found.sequences
-    assert "time_scale" not in said(found)
-    assert "reader" not in said(found)
+    file = examine(real_data / name)
+    assert (file.source.group, file.scale.domain) == REAL[name]
+    assert file.sequences
+    assert "time_scale" not in said(file)
+    assert "reader" not in said(file)
 
 
 @pytest.mark.real
 @pytest.mark.parametrize(("told", "wrong"), [(16.0, False), (25.0, True), (10.0, True)])
 def test_real_people_tell_their_rate(real_data: Path, told: float, wrong: bool) -> None:
     """HERMES took 16 frames in a second, as its archive says; nothing in the file does."""
-    found = examine(real_data / "juelich" / "bo-360-050-050.txt", rate=told)
-    assert ("time_scale" in said(found)) == wrong
+    file = examine(real_data / "juelich" / "bo-360-050-050.txt", rate=told)
+    assert ("time_scale" in said(file)) == wrong
 
 
 def test_random_damage_ends_in_words_or_in_findings(tmp_path: Path) -> None:
@@ -450,18 +451,18 @@ def test_people_on_an_oval_keep_the_rate_that_is_told(tmp_path: Path) -> None:
         x, y = 2.4 * np.cos(angle), 2.4 * np.sin(angle) + 0.02 * np.sin(2 * np.pi * 1.7 * k / 25)
         parts.append(pd.DataFrame({"id": i, "frame": k, "x": x, "y": y}))
     head = "# framerate: 25 fps\n# id frame x/m y/m z/m\n"
-    found = examine(text(pd.concat(parts), tmp_path, head))
-    assert "time_scale" not in said(found)
-    assert found.scale.rate == 25.0
+    file = examine(text(pd.concat(parts), tmp_path, head))
+    assert "time_scale" not in said(file)
+    assert file.scale.rate == 25.0
 
 
 def test_times_that_are_numbers_of_frames(tmp_path: Path) -> None:
     table = people(rate=2.5).rename(columns={"id": "ped"}).drop(columns=["vx", "vy"])
-    found = examine(saved(table.assign(timestamp=table.frame), tmp_path))
-    options = cast(WalkwayOptions, found.source.options)
+    file = examine(saved(table.assign(timestamp=table.frame), tmp_path))
+    options = cast(WalkwayOptions, file.source.options)
     assert (options.time_unit, options.frame_rate) == ("frame", 2.5)
     assert options.columns == {"agent": "ped", "time": "frame"}
-    assert found.sequences[0].dt == pytest.approx(0.4)
+    assert file.sequences[0].dt == pytest.approx(0.4)
 
 
 def test_people_sampled_coarsely_have_no_clock(tmp_path: Path) -> None:
@@ -472,9 +473,9 @@ def test_people_sampled_coarsely_have_no_clock(tmp_path: Path) -> None:
         pd.DataFrame({"id": i, "frame": k + 10 * i, "x": 0.4 * 1.3 * k, "y": i + y})
         for i in range(12)
     ]
-    found = examine(saved(pd.concat(parts), tmp_path), domain="crowd", rate=2.5)
-    assert "time_scale" not in said(found)
-    assert found.scale.rate == 2.5
+    file = examine(saved(pd.concat(parts), tmp_path), domain="crowd", rate=2.5)
+    assert "time_scale" not in said(file)
+    assert file.scale.rate == 2.5
 
 
 def test_names_in_the_last_comment_above_columns_parted_by_tabs(tmp_path: Path) -> None:
@@ -483,16 +484,16 @@ def test_names_in_the_last_comment_above_columns_parted_by_tabs(tmp_path: Path) 
     path.write_text(
         "#framerate: 16\n#ID\tFR\tX\tY\n" + table.to_csv(sep="\t", header=False, index=False)
     )
-    found = examine(path)
-    assert {m: one.column for m, one in found.meanings.items()} == {
+    file = examine(path)
+    assert {m: item.column for m, item in file.meanings.items()} == {
         "agent": "ID",
         "frame": "FR",
         "x": "X",
         "y": "Y",
     }
-    options = cast(WalkwayOptions, found.source.options)
+    options = cast(WalkwayOptions, file.source.options)
     assert (options.time_unit, options.frame_rate) == ("frame", 16.0)
-    assert {name for s in found.sequences for name in s.agents} <= set(map(str, range(1, 13)))
+    assert {name for s in file.sequences for name in s.agents} <= set(map(str, range(1, 13)))
 
 
 def test_a_rate_that_the_file_tells_is_read_and_doubted(tmp_path: Path) -> None:
@@ -501,10 +502,10 @@ def test_a_rate_that_the_file_tells_is_read_and_doubted(tmp_path: Path) -> None:
     table = people()[["id", "frame", "x", "y"]]
     rows = table.to_csv(sep="\t", header=False, index=False)
     path.write_text(f"#framerate: 30\n#id\tframe\tx\ty\n{rows}")
-    found = examine(path)
-    assert "time_scale" in said(found)
-    assert cast(WalkwayOptions, found.source.options).frame_rate == 30.0
-    assert found.sequences[0].dt == pytest.approx(1 / 30)
+    file = examine(path)
+    assert "time_scale" in said(file)
+    assert cast(WalkwayOptions, file.source.options).frame_rate == 30.0
+    assert file.sequences[0].dt == pytest.approx(1 / 30)
     line = recognised(path).line
     assert "times in frames of 1/30 s" in line
     assert re.search(r"as it tells; 1[56] frames/s fit", line)
@@ -519,11 +520,11 @@ def test_public_tables_of_people_are_read_as_they_are(
 ) -> None:
     if not (real_data / file).is_file():
         pytest.skip(f"{file} is not there")
-    found = examine(real_data / file)
-    options = cast(WalkwayOptions, found.source.options)
+    examination = examine(real_data / file)
+    options = cast(WalkwayOptions, examination.source.options)
     assert options.columns["agent"] == agent
     assert options.time_unit == "frame"
-    assert found.sequences
+    assert examination.sequences
 
 
 def test_the_window_that_noise_asks_for_reads_and_smooths(tmp_path: Path) -> None:
@@ -534,8 +535,10 @@ def test_the_window_that_noise_asks_for_reads_and_smooths(tmp_path: Path) -> Non
     window = re.search(r"data\.smooth=([\d.]+) \(s\)", text_)
     assert window is not None
     raw, smooth = (
-        nnode.sequences(path, data="vehicles", columns={"vehicle": "veh", "time": "t"}, **more)[0]
-        for more in ({}, {"smooth": float(window[1])})
+        nnode.sequences(
+            path, data="vehicles", columns={"vehicle": "veh", "time": "t"}, **smoothing
+        )[0]
+        for smoothing in ({}, {"smooth": float(window[1])})
     )
     true = table[table.veh == 0].set_index("t").v  # the leader, last in its platoon
     for s, low, high in ((raw, 1.0, np.inf), (smooth, 0.0, 0.25)):

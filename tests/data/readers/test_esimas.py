@@ -54,16 +54,16 @@ def test_holes_cut_and_uneven_times_are_interpolated(tmp_path: Path) -> None:
         tmp_path / "sequence_dataown.mat",
         [(x, time), (np.array([[0.0], [30.0]]) + 25 * late, late), (x[:, gone], time[gone])],
     )
-    found = read_esimas(path)
-    assert [(s.name, s.n_samples) for s in found] == [
+    result = read_esimas(path)
+    assert [(s.name, s.n_samples) for s in result] == [
         ("own/000", 12),
         ("own/001", 12),
         ("own/002_000", 5),
         ("own/002_001", 5),
     ]
-    assert all(s.agents == () for s in found)
-    np.testing.assert_allclose(found[1].x, found[0].x, atol=1e-9)
-    uneven, cut = found.notes
+    assert all(s.agents == () for s in result)
+    np.testing.assert_allclose(result[1].x, result[0].x, atol=1e-9)
+    uneven, cut = result.notes
     assert "times are uneven" in uneven
     assert "sequence own/002: not all vehicles are there at 2 of 12 times" in cut
 

@@ -125,8 +125,8 @@ def test_published_corridor(real_data: Path) -> None:
     s = sequences[40]
     frames = np.round(s.time * 25).astype(int)
     for i, agent in enumerate(s.agents):
-        own = raw[(raw[:, 0] == int(agent)) & np.isin(raw[:, 1], frames)]
-        np.testing.assert_allclose(s.x[:, i], own[:, 2:4] / 100)
+        person = raw[(raw[:, 0] == int(agent)) & np.isin(raw[:, 1], frames)]
+        np.testing.assert_allclose(s.x[:, i], person[:, 2:4] / 100)
 
 
 @pytest.mark.real
@@ -197,10 +197,10 @@ def test_too_few_people(corridor: Path) -> None:
 
 def test_preferred_velocities_are_those_before_a_sequence(tmp_path: Path) -> None:
     # 1 turns round at frame 25; 2 comes at frame 15, half a second before the second sequence
-    there = lines(0, 24, 1) + "".join(
+    away = lines(0, 24, 1) + "".join(
         f"1 {f} {-200 + 4 * (50 - f):.1f} 100 176\n" for f in range(25, 51)
     )
-    path = write(tmp_path / "turn.txt", HEADER + there + lines(15, 50, 2, y=200))
+    path = write(tmp_path / "turn.txt", HEADER + away + lines(15, 50, 2, y=200))
     first, second = read_juelich(path, JuelichOptions())
     assert first.preferred is None
     assert second.preferred is not None

@@ -107,9 +107,9 @@ def test_text_with_header_in_metres(tmp_path: Path) -> None:
     text += "".join(f"{i} {f} {x} {y} 0\n" for f, i, x, y, *_ in ROWS)
     (tmp_path / "run.txt").write_text(text)
     (tmp_path / "area.wkt").write_text(ROOM)
-    found = read(tmp_path / "run.txt", tmp_path / "area.wkt")
+    result = read(tmp_path / "run.txt", tmp_path / "area.wkt")
     same = read(database(tmp_path / "run.sqlite"))
-    for a, b in zip(found, same, strict=True):
+    for a, b in zip(result, same, strict=True):
         np.testing.assert_allclose(a.x, b.x)
         np.testing.assert_allclose(a.time, b.time)
         np.testing.assert_array_equal(a.walls, b.walls)
@@ -135,8 +135,8 @@ def test_the_area_lies_left_of_every_edge(room: shapely.Polygon) -> None:
     walls = walls_of(room.wkt, "")
     along = walls[:, 2:] - walls[:, :2]
     left = np.stack([-along[:, 1], along[:, 0]], -1) / np.linalg.norm(along, axis=1)[:, None]
-    beside = (walls[:, :2] + walls[:, 2:]) / 2 + 1e-3 * left
-    assert shapely.contains_xy(room, *beside.T).all()
+    points = (walls[:, :2] + walls[:, 2:]) / 2 + 1e-3 * left
+    assert shapely.contains_xy(room, *points.T).all()
     assert np.linalg.norm(along, axis=1).sum() == pytest.approx(room.length)
 
 
@@ -157,8 +157,10 @@ def test_text_that_is_no_area(wkt: str, words: list[str]) -> None:
 
 
 def test_several_polygons() -> None:
-    both = "GEOMETRYCOLLECTION (POLYGON ((0 0, 1 0, 1 1, 0 0)), POLYGON ((5 5, 6 5, 6 6, 5 5)))"
-    assert len(walls_of(both, "")) == 6
+    collection = (
+        "GEOMETRYCOLLECTION (POLYGON ((0 0, 1 0, 1 1, 0 0)), POLYGON ((5 5, 6 5, 6 6, 5 5)))"
+    )
+    assert len(walls_of(collection, "")) == 6
 
 
 @pytest.mark.parametrize(
@@ -236,10 +238,10 @@ def test_damage_ends_in_an_error_of_the_package(
     path = tmp_path / "damaged.sqlite"
     path.write_bytes(whole[:cut])
     try:
-        found = read(path)
+        result = read(path)
     except (DataError, ConfigError):
         return
-    assert all(np.isfinite(s.x).all() for s in found)
+    assert all(np.isfinite(s.x).all() for s in result)
 
 
 def test_a_table_of_people(tmp_path: Path) -> None:
@@ -256,10 +258,10 @@ def test_a_table_of_people(tmp_path: Path) -> None:
     options = WalkwayOptions(
         path=str(path), columns=columns, position_unit="cm", time_unit="ms", t_seq=1.0
     )
-    found = read_walkway(path, options)
-    assert len(found) >= 4
-    assert "are interpolated to steps of 0.2 s" in found.notes[0]
-    for s in found[1:-1]:  # at both ends somebody begins later, or ends before
+    result = read_walkway(path, options)
+    assert len(result) >= 4
+    assert "are interpolated to steps of 0.2 s" in result.notes[0]
+    for s in result[1:-1]:  # at both ends somebody begins later, or ends before
         assert s.agents == ("person 0", "person 1", "person 2")
         np.testing.assert_allclose(s.x[:, :, 1], np.tile([0.0, 0.8, 1.6], (6, 1)), atol=1e-9)
         np.testing.assert_allclose(np.diff(s.x[:, :, 0], axis=0), 0.26, atol=1e-9)

@@ -29,9 +29,9 @@ def test_the_published_file(tmp_path: Path) -> None:
     assert s.kind == ("2", "2", "3", "2", "2")
     np.testing.assert_allclose(s.length, 15 * FOOT)
     np.testing.assert_allclose(np.diff(s.time), 0.2)
-    own = table[table.Vehicle_ID == 4].set_index("Frame_ID").loc[(10 * s.time).round().astype(int)]
-    np.testing.assert_allclose(s.x[:, 1, 0], own.Local_Y * FOOT, atol=1e-9)
-    np.testing.assert_allclose(s.v[:, 1, 0], own.v_Vel * FOOT, atol=1e-9)
+    rows = table[table.Vehicle_ID == 4].set_index("Frame_ID").loc[(10 * s.time).round().astype(int)]
+    np.testing.assert_allclose(s.x[:, 1, 0], rows.Local_Y * FOOT, atol=1e-9)
+    np.testing.assert_allclose(s.v[:, 1, 0], rows.v_Vel * FOOT, atol=1e-9)
 
 
 def test_locations_and_periods_are_recordings(tmp_path: Path) -> None:
@@ -55,9 +55,9 @@ def test_older_files_have_neither_names_nor_location(tmp_path: Path, name: str) 
     old, new = read(quarter(tmp_path / name, table)), read(published(tmp_path / "new.csv", table))
     assert old[0].recording == "trajectories-0400-0415_1600_lane1"
     assert len(old) == len(new)
-    for one, other in zip(old, new, strict=True):
-        np.testing.assert_array_equal(one.x, other.x)
-        assert one.agents == other.agents
+    for sequence, other in zip(old, new, strict=True):
+        np.testing.assert_array_equal(sequence.x, other.x)
+        assert sequence.agents == other.agents
 
 
 def test_capitals_thousands_and_rows_that_stand_there_twice(tmp_path: Path) -> None:
@@ -66,9 +66,9 @@ def test_capitals_thousands_and_rows_that_stand_there_twice(tmp_path: Path) -> N
     table.columns = [name.lower() for name in COLUMNS]
     for column in ("global_x", "local_y"):
         table[column] = [f"{value:,.3f}" for value in table[column]]
-    found = read(published(tmp_path / "b.csv", table, table.iloc[:50]))
-    assert len(found) == len(expected)
-    np.testing.assert_allclose(found[0].x, expected[0].x, atol=1e-9)
+    result = read(published(tmp_path / "b.csv", table, table.iloc[:50]))
+    assert len(result) == len(expected)
+    np.testing.assert_allclose(result[0].x, expected[0].x, atol=1e-9)
 
 
 def test_streets_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -88,9 +88,9 @@ def test_a_platoon_ends_where_a_vehicle_changes_lane(tmp_path: Path) -> None:
     agents = {
         (s.recording[-5:], s.agents, s.time[0]) for s in read(published(tmp_path / "a", table))
     }
-    first = {own for lane, own, start in agents if lane == "lane1" and start < 5}
-    during = {own for lane, own, start in agents if lane == "lane1" and 5 < start < 15}
-    after = {own for lane, own, start in agents if lane == "lane1" and start > 15}
+    first = {cars for lane, cars, start in agents if lane == "lane1" and start < 5}
+    during = {cars for lane, cars, start in agents if lane == "lane1" and 5 < start < 15}
+    after = {cars for lane, cars, start in agents if lane == "lane1" and start > 15}
     assert first == {("6", "5", "4", "3", "2", "1")}
     assert during == {("6", "5", "4")}  # the two ahead of the place are too few
     assert after == {("6", "5", "4", "2", "1")}
@@ -146,8 +146,8 @@ def test_the_reconstructed_table_is_known_by_its_columns(real_data: Path) -> Non
     path = real_data / "ngsim" / "i80_lanes_1_2.csv"
     columns = {"vehicle": "veh", "time": "t", "speed": "v", "kind": "cls"}
     expected = read_vehicles(path, VehicleTableOptions(columns=columns, window=10.0))
-    found = read(path)
-    assert len(found) == 61
-    for one, other in zip(found, expected, strict=True):
-        assert (one.name, one.agents) == (other.name, other.agents)
-        np.testing.assert_array_equal(one.x, other.x)
+    result = read(path)
+    assert len(result) == 61
+    for sequence, other in zip(result, expected, strict=True):
+        assert (sequence.name, sequence.agents) == (other.name, other.agents)
+        np.testing.assert_array_equal(sequence.x, other.x)

@@ -91,9 +91,9 @@ def test_a_platoon_is_cut_where_a_vehicle_is_not_known(tmp_path: Path) -> None:
     assert (first.n_agents, first.time[-1]) == (4, pytest.approx(119.9))
     assert second.agents == ("TESLA_2", "SMART")
     np.testing.assert_allclose(second.x[0, 1, 0], SPEED * 20)
-    found = read(path, window=5.0, dt=0.5)
-    assert [s.n_agents for s in found] == [4, 4, 4, 2, 2, 2]
-    assert {s.n_samples for s in found} == {11}
+    result = read(path, window=5.0, dt=0.5)
+    assert [s.n_agents for s in result] == [4, 4, 4, 2, 2, 2]
+    assert {s.n_samples for s in result} == {11}
     without = table.drop(columns=["Speed2", "E2", "N2", "IVS1", "IVS2"]).iloc[:200]
     (s,) = read(save(tmp_path / "b.csv", without))
     assert s.agents == ("TESLA_4", "BMW")
@@ -115,10 +115,10 @@ def test_gaps_that_are_none_count_as_holes(
     table.loc[100:150, "IVS3"] = -1.0
     path = save(tmp_path / "a.csv", table)
     with caplog.at_level(logging.INFO):
-        found = read(path)
-    assert [s.n_agents for s in found] == [4, 3, 4]
-    assert [s.filled for s in found] == [3, 0, 0]
-    np.testing.assert_allclose(np.diff(found[0].x[:, 2:, 0], axis=1), GAP[0] + 5.0)
+        result = read(path)
+    assert [s.n_agents for s in result] == [4, 3, 4]
+    assert [s.filled for s in result] == [3, 0, 0]
+    np.testing.assert_allclose(np.diff(result[0].x[:, 2:, 0], axis=1), GAP[0] + 5.0)
     assert "3 of 301 gaps of TESLA_2 to SMART" in caplog.text
     assert np.ptp(read(path, max_error=None)[0].x[:, 3] - read(path, max_error=None)[0].x[:, 2]) > 2
 
@@ -208,22 +208,24 @@ def test_zalazone(real_data: Path, tmp_path: Path) -> None:
     assert len({s.recording for s in store}) == 6
     (s,) = (s for s in store if s.recording == "short_setting_dynamic_part14")
     table = pd.read_csv(folder / f"{s.recording}.csv", skiprows=5).set_index("Time")
-    own = table.loc[np.round(s.time, 1)]
+    gaps_of_run = table.loc[np.round(s.time, 1)]
     assert s.length is not None
     gaps = np.diff(s.x[:, :, 0], axis=1)[:, ::-1] - s.length[1:]
-    measured = own[[f"IVS{i}" for i in range(1, 10)]].to_numpy()
-    known = np.isfinite(measured)
-    np.testing.assert_allclose(gaps[known], measured[known], atol=1e-9)
+    measured = gaps_of_run[[f"IVS{i}" for i in range(1, 10)]].to_numpy()
+    stated = np.isfinite(measured)
+    np.testing.assert_allclose(gaps[stated], measured[stated], atol=1e-9)
 
 
 @pytest.mark.real
 def test_astazero(real_data: Path) -> None:
     path = real_data / "openacc" / "astazero.parquet"
     table = pd.read_parquet(path)
-    found = read(path)
-    assert len(found) == table.run.nunique() == 7
-    for s in found:
-        own = table[table.run == s.recording].pivot(index="t", columns="position", values="gap")
+    result = read(path)
+    assert len(result) == table.run.nunique() == 7
+    for s in result:
+        gaps_of_run = table[table.run == s.recording].pivot(
+            index="t", columns="position", values="gap"
+        )
         assert s.length is not None
         gaps = np.diff(s.x[:, :, 0], axis=1)[:, ::-1] - s.length[1:]
-        np.testing.assert_allclose(gaps, own[[2, 3, 4, 5]].to_numpy(), atol=1e-6)
+        np.testing.assert_allclose(gaps, gaps_of_run[[2, 3, 4, 5]].to_numpy(), atol=1e-6)

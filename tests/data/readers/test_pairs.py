@@ -28,7 +28,7 @@ FOOT = 0.3048
 CONF = Path(__file__).parents[3] / "conf" / "data"
 
 
-def drive(first: int = 0, last: int = 50, unit: float = 1.0, **more: object) -> pd.DataFrame:
+def drive(first: int = 0, last: int = 50, unit: float = 1.0, **further: object) -> pd.DataFrame:
     """A follower at 10 m/s, 20 m of it behind a leader of 4 m at 11 m/s, in ``unit`` m."""
     k = np.arange(first, last + 1)
     t = k * 0.1
@@ -41,7 +41,7 @@ def drive(first: int = 0, last: int = 50, unit: float = 1.0, **more: object) -> 
             "x_leader": lead / unit,
             "v_leader": 11.0 / unit,
             "spacing": (lead - x - 4.0) / unit,
-            **more,
+            **further,
         }
     )
 
@@ -53,18 +53,18 @@ def configured(name: str, path: Path | str, source: Path | None = None) -> PairO
     """The options of a shipped configuration."""
     said = OmegaConf.load(CONF / f"{name}.yaml")
     said.pop("defaults")
-    own = OmegaConf.merge(OmegaConf.structured(PairOptions), said, {"path": str(path)})
-    own["source"] = None if source is None else str(source)
-    options = OmegaConf.to_object(own)
+    given = OmegaConf.merge(OmegaConf.structured(PairOptions), said, {"path": str(path)})
+    given["source"] = None if source is None else str(source)
+    options = OmegaConf.to_object(given)
     assert isinstance(options, PairOptions)
     return options
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_pair_is_a_platoon_of_two(tmp_path: Path, suffix: str) -> None:
-    more = {"follower": 7, "leader": 5, "run": "a", "leader_kind": "CAV", "split": "Test"}
+    further = {"follower": 7, "leader": 5, "run": "a", "leader_kind": "CAV", "split": "Test"}
     (s,) = read(
-        saved(tmp_path / f"one{suffix}", drive(unit=FOOT, **more)),
+        saved(tmp_path / f"one{suffix}", drive(unit=FOOT, **further)),
         position_unit="ft",
         speed_unit="ft/s",
         kinds={"CAV": "automated"},
@@ -83,13 +83,13 @@ def test_a_pair_is_a_platoon_of_two(tmp_path: Path, suffix: str) -> None:
 def test_pairs_of_one_table_in_any_order_with_a_given_length(tmp_path: Path) -> None:
     parts = [drive(pair=p, leader_length=4.5).drop(columns="spacing") for p in (3, 1)]
     table = pd.concat(parts).sample(frac=1.0, random_state=1)
-    found = read(saved(tmp_path / "all.csv", table), window=1.0)
-    assert len(found) == 10
-    assert {s.name for s in found} == {f"pairs/{p}_{k:03d}" for p in (1, 3) for k in range(5)}
-    assert {s.n_samples for s in found} == {11}
-    assert all(s.length is not None and s.length[1] == 4.5 for s in found)
+    result = read(saved(tmp_path / "all.csv", table), window=1.0)
+    assert len(result) == 10
+    assert {s.name for s in result} == {f"pairs/{p}_{k:03d}" for p in (1, 3) for k in range(5)}
+    assert {s.n_samples for s in result} == {11}
+    assert all(s.length is not None and s.length[1] == 4.5 for s in result)
     # vehicles without a name are called after their pair, so that its windows are one cluster
-    assert {s.agents for s in found} == {(f"{p} follower", f"{p} leader") for p in (1, 3)}
+    assert {s.agents for s in result} == {(f"{p} follower", f"{p} leader") for p in (1, 3)}
 
 
 def test_gaps_split_a_pair_or_are_refused(tmp_path: Path) -> None:
@@ -106,10 +106,10 @@ def test_uneven_times_of_pairs_are_interpolated_and_told(tmp_path: Path) -> None
     table["time"] += np.random.default_rng(2).uniform(-0.02, 0.02, 51)
     table["x_follower"], table["x_leader"] = 10 * table.time, 24 + 11 * table.time
     path = saved(tmp_path / "one.csv", table.drop(columns="spacing"))
-    found = read(path, dt=0.1)
-    assert isinstance(found, Reading)
-    (s,) = found
-    assert "are interpolated to steps of 0.1 s" in found.notes[0]
+    result = read(path, dt=0.1)
+    assert isinstance(result, Reading)
+    (s,) = result
+    assert "are interpolated to steps of 0.1 s" in result.notes[0]
     np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time, atol=1e-9)
     np.testing.assert_allclose(s.x[:, 1, 0], 24 + 11 * s.time, atol=1e-9)
 
@@ -185,11 +185,11 @@ def test_files_as_they_are_published(tmp_path: Path) -> None:
     }
     saved(tmp_path / "manifest.csv", pd.DataFrame(listed))
     options = configured("ngsim_pairs", tmp_path)
-    two, one = read_pairs(pair_files(options), options)
-    assert {s.recording for s in (one, two)} == {"0400pm-0415pm"}
+    two, first_pair = read_pairs(pair_files(options), options)
+    assert {s.recording for s in (first_pair, two)} == {"0400pm-0415pm"}
     options.lane = 2
     assert [s.agents for s in read_pairs(pair_files(options), options)] == [("254", "253")]
-    assert (one.name, one.split) == ("0400pm-0415pm/f254_l253_00014", "test")
+    assert (first_pair.name, first_pair.split) == ("0400pm-0415pm/f254_l253_00014", "test")
     assert (two.agents, two.split) == (("13", "15"), "train")
     np.testing.assert_allclose(two.x[-1, :, 0], [50.0, 79.0])
     assert two.length is not None
@@ -202,20 +202,20 @@ def test_files_as_they_are_published(tmp_path: Path) -> None:
     names = {"time": "timestamp"} | {
         f"{q}_{who.lower()}": f"{q}{who}Real" for q in "xv" for who in ("Leader", "Follower")
     }
-    own = drive(follower_id=16, leader_id=6, run_no=1).rename(columns=names)
-    saved(tmp_path / "Data" / "CAV" / "run-1-veh-16-pair-7.csv", own)
+    given = drive(follower_id=16, leader_id=6, run_no=1).rename(columns=names)
+    saved(tmp_path / "Data" / "CAV" / "run-1-veh-16-pair-7.csv", given)
     options = configured("tgsim", tmp_path / "Data")
     (s,) = read_pairs(pair_files(options), options)
     assert (s.name, s.agents, s.kind) == ("1/run-1-veh-16-pair-7", ("16", "6"), ("HV", "CAV"))
 
 
-def spaced(pair: object, spacing: float = 20.0, k: int = 51, **more: object) -> pd.DataFrame:
+def spaced(pair: object, spacing: float = 20.0, k: int = 51, **further: object) -> pd.DataFrame:
     """A follower at 10 m/s behind a leader whose speed falls evenly from 12 to 9 m/s."""
     t = 0.1 * np.arange(k)
     v = 12.0 - 0.6 * t
     gap = spacing + (12.0 * t - 0.3 * t**2) - 10.0 * t
-    own = {"pair": pair, "time": t, "spacing": gap, "v_follower": 10.0, "v_leader": v}
-    return pd.DataFrame({**own, **more})
+    given = {"pair": pair, "time": t, "spacing": gap, "v_follower": 10.0, "v_leader": v}
+    return pd.DataFrame({**given, **further})
 
 
 def test_positions_follow_from_spacing_and_speeds(tmp_path: Path) -> None:
@@ -264,19 +264,19 @@ def test_without_positions_the_spacing_needs_both_speeds(tmp_path: Path) -> None
 
 def test_anonymous_pairs_are_a_cluster_each(tmp_path: Path) -> None:
     parts = [spaced(i, 20.0 + i) for i in range(12)]
-    found = read(saved(tmp_path / "p.csv", *parts), window=1.0)
-    assert len(found) == 60
-    label = clusters(index_of(found))
+    result = read(saved(tmp_path / "p.csv", *parts), window=1.0)
+    assert len(result) == 60
+    label = clusters(index_of(result))
     assert label.max() + 1 == 12
     # windows of one pair are one
-    names = np.array([s.name.partition("_")[0] for s in found])
+    names = np.array([s.name.partition("_")[0] for s in result])
     assert all(len(set(label[names == name])) == 1 for name in names)
 
 
 def test_pairs_that_name_one_vehicle_share_that_one(tmp_path: Path) -> None:
     parts = [spaced(i, follower=i // 2) for i in range(6)]
-    found = read(saved(tmp_path / "p.csv", *parts))
-    assert clusters(index_of(found)).tolist() == [0, 0, 1, 1, 2, 2]
+    result = read(saved(tmp_path / "p.csv", *parts))
+    assert clusters(index_of(result)).tolist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_no_pair_is_lost_without_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -325,10 +325,10 @@ def test_the_published_division_is_taken(tmp_path: Path) -> None:
     ]
     store = prepare(PairOptions(path=str(saved(tmp_path / "p.csv", *parts))), tmp_path / "store")
     for mode in (SplitMode.auto, SplitMode.published):
-        found = split(store, SplitOptions(mode=mode))
-        assert (found.train, found.heldout, found.dropped) == ([0, 1, 3], [2], [4])
-        assert found.mode == "published"
-        assert "1 that train share an agent" in found.note
+        result = split(store, SplitOptions(mode=mode))
+        assert (result.train, result.heldout, result.dropped) == ([0, 1, 3], [2], [4])
+        assert result.mode == "published"
+        assert "1 that train share an agent" in result.note
     drawn = split(store, SplitOptions(mode=SplitMode.random, heldout=0.4))
     assert drawn.mode == "random"
     assert split(store, SplitOptions(heldout=0)).train == [0, 1, 2, 3, 4]
@@ -340,38 +340,38 @@ def test_the_published_division_is_taken(tmp_path: Path) -> None:
 @pytest.mark.real
 def test_pairs_of_ngsim(real_data: Path) -> None:
     options = configured("ngsim_pairs", "ngsim_pairs", real_data)
-    found = read_pairs(pair_files(options), options)
+    result = read_pairs(pair_files(options), options)
     table = pd.read_parquet(real_data / "ngsim_pairs" / "i80_pairs.parquet")
-    assert len(found) == 120
-    assert sum(s.n_samples for s in found) == len(table) == 85283
-    assert sorted(s.split for s in found) == ["test"] * 20 + ["train"] * 100
-    for s in found:
-        own = table[table.pair == int(s.name.rpartition("/")[2])]
+    assert len(result) == 120
+    assert sum(s.n_samples for s in result) == len(table) == 85283
+    assert sorted(s.split for s in result) == ["test"] * 20 + ["train"] * 100
+    for s in result:
+        given = table[table.pair == int(s.name.rpartition("/")[2])]
         assert s.length is not None
         gap = s.x[:, 1, 0] - s.x[:, 0, 0] - s.length[1]
-        np.testing.assert_allclose(gap, own.spacing, atol=1e-3)
-        np.testing.assert_allclose(s.v[:, 0, 0], own.v_follower)
+        np.testing.assert_allclose(gap, given.spacing, atol=1e-3)
+        np.testing.assert_allclose(s.v[:, 0, 0], given.v_follower)
     # pairs that share a vehicle within a quarter of an hour, counted by hand
     shared: dict[tuple[str, int], set[int]] = {}
-    for pair, own in table.groupby("pair"):
-        for vehicle in (own.follower.iloc[0], own.leader.iloc[0]):
-            shared.setdefault((own.run.iloc[0], vehicle), set()).add(int(str(pair)))
+    for pair, given in table.groupby("pair"):
+        for vehicle in (given.follower.iloc[0], given.leader.iloc[0]):
+            shared.setdefault((given.run.iloc[0], vehicle), set()).add(int(str(pair)))
     groups = [{pair} for pair in range(120)]
     for members in shared.values():
         joined = [group for group in groups if group & members]
         groups = [g for g in groups if not g & members] + [set().union(*joined)]
-    assert clusters(index_of(found)).max() + 1 == len(groups) == 114
+    assert clusters(index_of(result)).max() + 1 == len(groups) == 114
 
 
 @pytest.mark.real
 def test_pairs_of_tgsim(real_data: Path) -> None:
     options = configured("tgsim", "tgsim", real_data)
-    found = read_pairs(pair_files(options), options)
-    kinds = [s.kind for s in found]
+    result = read_pairs(pair_files(options), options)
+    kinds = [s.kind for s in result]
     assert (kinds.count(("HV", "HV")), kinds.count(("HV", "CAV"))) == (139, 49)
     # the spacings were made with vehicles of 5 m
-    assert all(s.length is not None and abs(s.length[1] - 5.0) < 1e-9 for s in found)
-    assert clusters(index_of(found)).max() + 1 == len({s.recording for s in found}) == 10
+    assert all(s.length is not None and abs(s.length[1] - 5.0) < 1e-9 for s in result)
+    assert clusters(index_of(result)).max() + 1 == len({s.recording for s in result}) == 10
 
 
 EVENTS = {"pair": "event", "v_follower": "speed", "v_leader": "leader_speed"}
@@ -386,18 +386,18 @@ WAYMO = {"time": "t", "pair": "event", "run": "split"}
 def test_published_pairs_without_positions(
     real_data: Path, file: str, columns: dict[str, str], number: int
 ) -> None:
-    found = read(real_data / file, columns=columns)
+    result = read(real_data / file, columns=columns)
     table = pd.read_parquet(real_data / file)
-    assert len(found) == clusters(index_of(found)).max() + 1 == number
-    assert sum(s.n_samples for s in found) == len(table)
+    assert len(result) == clusters(index_of(result)).max() + 1 == number
+    assert sum(s.n_samples for s in result) == len(table)
     names = [columns["pair"], *(["split"] if "split" in table else [])]
-    rows = {"/".join(map(str, key[::-1])): own for key, own in table.groupby(names, sort=False)}
-    for s in found:
+    rows = {"/".join(map(str, key[::-1])): given for key, given in table.groupby(names, sort=False)}
+    for s in result:
         assert s.length is not None
         assert s.v is not None
-        own = rows[s.name.removeprefix("pairs/")]
-        np.testing.assert_allclose(s.x[:, 1, 0] - s.x[:, 0, 0] - 5.0, own.spacing, atol=1e-9)
-        np.testing.assert_array_equal(s.v[:, 1, 0], own[columns.get("v_leader", "v_leader")])
+        given = rows[s.name.removeprefix("pairs/")]
+        np.testing.assert_allclose(s.x[:, 1, 0] - s.x[:, 0, 0] - 5.0, given.spacing, atol=1e-9)
+        np.testing.assert_array_equal(s.v[:, 1, 0], given[columns.get("v_leader", "v_leader")])
         # the follower's position, of which only the spacing is measured, has its measured speed
         moved = cumulative_trapezoid(s.v[:, 0, 0], s.time, initial=0.0)
         assert np.abs(s.x[:, 0, 0] - s.x[0, 0, 0] - moved).max() < 2.0

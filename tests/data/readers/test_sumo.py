@@ -20,21 +20,26 @@ from tests.data import tables
 HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<!-- by SUMO -->\n<fcd-export>\n'
 
 
-def car(name: str, pos: float, lane: str = "e_0", more: str = "") -> str:
-    known = f'id="{name}" x="0" y="0" type="car" speed="10.00" pos="{pos}" lane="{lane}"{more}'
-    return f"<vehicle {known}/>\n"
+def car(name: str, pos: float, lane: str = "e_0", attributes: str = "") -> str:
+    stated = (
+        f'id="{name}" x="0" y="0" type="car" speed="10.00" pos="{pos}" lane="{lane}"{attributes}'
+    )
+    return f"<vehicle {stated}/>\n"
 
 
 def step(time: object, *inside: str) -> str:
     return f'<timestep time="{time}">\n{"".join(inside)}</timestep>\n'
 
 
-def steps(n: int = 11, dt: float = 0.2, more: str = "", lane: str = "e_0") -> list[str]:
+def steps(n: int = 11, dt: float = 0.2, attributes: str = "", lane: str = "e_0") -> list[str]:
     """Three cars at 10 m/s on one lane, the last of them beside a person."""
     return [
         step(
             f"{dt * k:.2f}",
-            *(car(v, x0 + 10 * dt * k, lane, more) for v, x0 in (("a", 90), ("b", 50), ("c", 0))),
+            *(
+                car(v, x0 + 10 * dt * k, lane, attributes)
+                for v, x0 in (("a", 90), ("b", 50), ("c", 0))
+            ),
             '<person id="p" x="1" y="1" speed="1" pos="2" edge="e"/>\n',
         )
         for k in range(n)
@@ -59,7 +64,7 @@ def test_a_platoon(tmp_path: Path) -> None:
 
 
 def test_length_and_names_of_types(tmp_path: Path) -> None:
-    path = write(tmp_path / "fcd.xml", *steps(more=' length="4.5"'))
+    path = write(tmp_path / "fcd.xml", *steps(attributes=' length="4.5"'))
     (s,) = read(path, kinds={"car": "passenger car"})
     assert s.kind == ("passenger car",) * 3
     np.testing.assert_array_equal(s.length, [4.5] * 3)
@@ -173,7 +178,7 @@ def test_damage_ends_in_an_error_of_the_package(tmp_path: Path, data: st.DataObj
     path = tmp_path / "damaged.xml"
     path.write_bytes(whole[: data.draw(st.integers(at, len(whole)))])
     try:
-        found = read(path)
+        result = read(path)
     except NNodeError:
         return
-    assert all(np.isfinite(s.x).all() for s in found)
+    assert all(np.isfinite(s.x).all() for s in result)

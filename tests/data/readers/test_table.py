@@ -16,9 +16,9 @@ from tests.data import tables
 from tests.data.tables import saved
 
 
-def rows(sequence: object, agent: object, x: np.ndarray, t0: float = 0.0, **more: object):
+def rows(sequence: object, agent: object, x: np.ndarray, t0: float = 0.0, **further: object):
     time = t0 + 0.1 * np.arange(len(x))
-    return pd.DataFrame({"sequence": sequence, "time": time, "agent": agent, "x": x, **more})
+    return pd.DataFrame({"sequence": sequence, "time": time, "agent": agent, "x": x, **further})
 
 
 def read(tmp_path: Path, *parts: pd.DataFrame, suffix: str = ".csv", **options: object) -> Reading:
@@ -55,15 +55,19 @@ def test_the_order_of_rows_changes_nothing(tmp_path: Path, domain: str) -> None:
         for n in range(12)
     ]
     table = pd.concat(parts)
-    found = read(tmp_path, table, domain=domain)
-    assert [s.name for s in found] == [f"own/s{s}" for s in range(12)]
+    result = read(tmp_path, table, domain=domain)
+    assert [s.name for s in result] == [f"own/s{s}" for s in range(12)]
     for seed in range(3):
-        again = read(tmp_path, table.sample(frac=1.0, random_state=seed), domain=domain)
-        for own, other in zip(again, found, strict=True):
-            assert (own.name, own.agents, own.kind) == (other.name, other.agents, other.kind)
-            np.testing.assert_array_equal(own.x, other.x)
-            np.testing.assert_array_equal(own.time, other.time)
-            np.testing.assert_array_equal(own.length, other.length)
+        repeated = read(tmp_path, table.sample(frac=1.0, random_state=seed), domain=domain)
+        for actual, other in zip(repeated, result, strict=True):
+            assert (actual.name, actual.agents, actual.kind) == (
+                other.name,
+                other.agents,
+                other.kind,
+            )
+            np.testing.assert_array_equal(actual.x, other.x)
+            np.testing.assert_array_equal(actual.time, other.time)
+            np.testing.assert_array_equal(actual.length, other.length)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -154,10 +158,10 @@ def test_uneven_times_are_interpolated_and_told(tmp_path: Path, common: bool) ->
     time = table.time + (np.tile(late, 3) if common else late)
     # the positions are those at the uneven times
     x = 15 * time + 6 * np.sin(0.5 * time) + 30 * table.agent.str[1:].astype(int)
-    found = read(tmp_path, table.assign(time=time, x=x))
-    assert isinstance(found, Reading)
-    (s,) = found
-    (note,) = found.notes
+    result = read(tmp_path, table.assign(time=time, x=x))
+    assert isinstance(result, Reading)
+    (s,) = result
+    (note,) = result.notes
     assert "times are uneven" in note
     assert "are interpolated to steps of 0.1 s" in note
     exact = 15 * s.time + 6 * np.sin(0.5 * s.time)
@@ -188,13 +192,13 @@ def test_a_platoon_begins_when_all_are_there(tmp_path: Path) -> None:
 def test_a_long_hole_cuts_a_platoon_in_two(tmp_path: Path, whose: str) -> None:
     table = driven()
     hole = table.time.between(3.95, 5.05) & ((table.agent == whose) | (whose == "all"))
-    found = read(tmp_path, table[~hole], table.assign(sequence="t"))
-    before, behind, sound = found
-    assert [s.name for s in found] == ["own/s_000", "own/s_001", "own/t"]
+    result = read(tmp_path, table[~hole], table.assign(sequence="t"))
+    before, behind, sound = result
+    assert [s.name for s in result] == ["own/s_000", "own/s_001", "own/t"]
     assert (before.time[-1], behind.time[0]) == (pytest.approx(3.9), pytest.approx(5.1))
     assert sound.n_samples == 80
-    assert not any(find_faults(s, "traffic") for s in found)
-    (note,) = found.notes
+    assert not any(find_faults(s, "traffic") for s in result)
+    (note,) = result.notes
     assert "sequence own/s: not all vehicles are there at 11 of 80 times" in note
 
 
@@ -236,10 +240,10 @@ def test_properties_belong_to_the_agent(tmp_path: Path) -> None:
     ],
 )
 def test_bad_tables(
-    tmp_path: Path, more: dict, domain: str, error: type[Exception], message: str
+    tmp_path: Path, further: dict, domain: str, error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        read(tmp_path, rows("s", "a", LINE, **more), domain=domain)
+        read(tmp_path, rows("s", "a", LINE, **further), domain=domain)
 
 
 def test_missing_column_names_those_that_exist(tmp_path: Path) -> None:

@@ -74,13 +74,13 @@ UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9}
 @pytest.mark.parametrize("make", SOURCES)
 def test_dates_become_seconds_since_the_first(make: Callable[[], pd.DataFrame], kind: str) -> None:
     table = make()
-    found = sequences(table.assign(time=DATES[kind](table.time)))
+    result = sequences(table.assign(time=DATES[kind](table.time)))
     expected = sequences(table)
-    assert found.manifest["dt"] == STEP
-    assert len(found) == len(expected)
-    for own, other in zip(found, expected, strict=True):
-        np.testing.assert_allclose(own.time, other.time, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(own.x, other.x, rtol=0, atol=1e-9)
+    assert result.manifest["dt"] == STEP
+    assert len(result) == len(expected)
+    for actual, other in zip(result, expected, strict=True):
+        np.testing.assert_allclose(actual.time, other.time, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(actual.x, other.x, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -88,8 +88,8 @@ def test_dates_in_files(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"t{suffix}"
     table = tidy().assign(time=stamps(tidy().time))
     table.to_csv(path, index=False) if suffix == ".csv" else table.to_parquet(path)
-    (found,) = sequences(path)
-    np.testing.assert_allclose(found.time, STEP * np.arange(SAMPLES), atol=1e-9)
+    (result,) = sequences(path)
+    np.testing.assert_allclose(result.time, STEP * np.arange(SAMPLES), atol=1e-9)
 
 
 @pytest.mark.parametrize("unit", UNITS)
@@ -104,13 +104,13 @@ def test_epochs_are_recognised_or_refused_with_the_unit_that_reads_them(
     else:  # the units of a tidy table are those that are documented, or given
         with pytest.raises(DataError, match=rf"time_unit={unit}"):
             sequences(epoch)
-    found = sequences(epoch, time_unit=unit)
-    assert found.manifest["dt"] == pytest.approx(STEP, rel=1e-6)
+    result = sequences(epoch, time_unit=unit)
+    assert result.manifest["dt"] == pytest.approx(STEP, rel=1e-6)
     x = [s.x for s in sequences(table)]
     # the grid of vehicles begins at a whole number of steps since 1970
     shift = 1e-5 if make is vehicles else 1e-9
-    for own, other in zip(found, x, strict=True):
-        np.testing.assert_allclose(own.x, other, rtol=0, atol=shift)
+    for actual, other in zip(result, x, strict=True):
+        np.testing.assert_allclose(actual.x, other, rtol=0, atol=shift)
 
 
 def test_seconds_stay_as_they_are() -> None:
@@ -143,12 +143,12 @@ def test_whatever_takes_data_refuses_times_in_another_unit(scale: float) -> None
     # sequences of one's own, which no reader has seen
     (good,) = sequences(drive())
     bad = [Sequence(name=n, recording=n, time=good.time * scale, x=good.x) for n in "abcd"]
-    own = r"sequence [abcd]: samples are .* s apart"
-    with pytest.raises(DataError, match=own):
+    message = r"sequence [abcd]: samples are .* s apart"
+    with pytest.raises(DataError, match=message):
         collate(bad)
-    with pytest.raises(DataError, match=own):
+    with pytest.raises(DataError, match=message):
         Calibrator("lin").fit(bad)
-    with pytest.raises(DataError, match=own):
+    with pytest.raises(DataError, match=message):
         Sequences(bad)
 
 
@@ -184,6 +184,6 @@ def test_positions_are_no_dates() -> None:
 @pytest.mark.parametrize("data", ["table", "pairs"])
 def test_an_unknown_unit_lists_the_known_ones(data: str) -> None:
     table = tidy() if data == "table" else pairs()
-    own = {"domain": "traffic"} if data == "table" else {}
+    options = {"domain": "traffic"} if data == "table" else {}
     with pytest.raises(ConfigError, match="time_unit=h: expected one of s, ms, us, ns"):
-        sequences(table, data=data, time_unit="h", **own)
+        sequences(table, data=data, time_unit="h", **options)

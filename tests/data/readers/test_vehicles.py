@@ -15,16 +15,16 @@ from tests.data import tables
 from tests.data.tables import saved
 
 
-def drive(vehicle: object, start: float, end: float, x0: float, **more: object) -> pd.DataFrame:
+def drive(vehicle: object, start: float, end: float, x0: float, **further: object) -> pd.DataFrame:
     """A vehicle in view from ``start`` to ``end`` s at 10 m/s, at x0 + 10 t, every 0.1 s."""
     time = np.round(np.arange(start, end + 0.05, 0.1), 6)
-    return pd.DataFrame({"vehicle": vehicle, "time": time, "x": x0 + 10 * time, **more})
+    return pd.DataFrame({"vehicle": vehicle, "time": time, "x": x0 + 10 * time, **further})
 
 
-def cars(end: float, **more: object) -> pd.DataFrame:
+def cars(end: float, **further: object) -> pd.DataFrame:
     """Three vehicles in view from the start, 30 m apart."""
     places = (("a", 60), ("b", 30), ("c", 0))
-    return pd.concat([drive(name, 0, end, x0, **more) for name, x0 in places])
+    return pd.concat([drive(name, 0, end, x0, **further) for name, x0 in places])
 
 
 read = partial(tables.read, VehicleTableOptions)
@@ -44,11 +44,11 @@ def test_order_times_and_positions(platoon: Path) -> None:
 
 
 def test_the_order_of_rows_changes_nothing(platoon: Path) -> None:
-    found = read(platoon, window=1.0)
+    result = read(platoon, window=1.0)
     saved(platoon, pd.read_csv(platoon).sample(frac=1.0, random_state=0))
-    for own, other in zip(read(platoon, window=1.0), found, strict=True):
-        assert (own.name, own.agents) == (other.name, other.agents)
-        np.testing.assert_array_equal(own.x, other.x)
+    for actual, other in zip(read(platoon, window=1.0), result, strict=True):
+        assert (actual.name, actual.agents) == (other.name, other.agents)
+        np.testing.assert_array_equal(actual.x, other.x)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -94,14 +94,14 @@ def test_uneven_times_are_told_and_a_coarser_grid_is_not(tmp_path: Path) -> None
 
 
 def test_a_grid_that_is_finer_than_the_file_is_told(tmp_path: Path) -> None:
-    found = read(saved(tmp_path / "road.csv", cars(9)), dt=0.05)
-    assert "no multiples of 0.05 s" in found.notes[0]
+    result = read(saved(tmp_path / "road.csv", cars(9)), dt=0.05)
+    assert "no multiples of 0.05 s" in result.notes[0]
 
 
 def test_recordings_and_sequences_together_tell_rows_apart(tmp_path: Path) -> None:
     parts = [cars(4, recording=r, sequence=s) for r in "xy" for s in (1, 2)]
-    found = read(saved(tmp_path / "road.csv", *parts))
-    assert [s.recording for s in found] == ["x 1", "x 2", "y 1", "y 2"]
+    result = read(saved(tmp_path / "road.csv", *parts))
+    assert [s.recording for s in result] == ["x 1", "x 2", "y 1", "y 2"]
 
 
 def test_maximal_intervals(tmp_path: Path) -> None:
@@ -211,8 +211,8 @@ def test_reconstructed_motorway(real_data: Path) -> None:
             back, front = paths[int(follower)], paths[int(leader)]
             between = paths.gt(back, axis=0) & paths.lt(front, axis=0)
             assert not between.to_numpy().any()
-        one = inside[inside.veh == int(s.agents[0])]
-        expected = np.interp(s.time, one.t, one.x)
+        rearmost = inside[inside.veh == int(s.agents[0])]
+        expected = np.interp(s.time, rearmost.t, rearmost.x)
         np.testing.assert_allclose(s.x[:, 0, 0], expected, atol=1e-6)
 
 
@@ -287,8 +287,8 @@ def test_pairs_end_where_somebody_comes_between(tmp_path: Path) -> None:
     d = drive("d", 0, 10, 45, lane=2)
     d.loc[(d.time > 3.95) & (d.time < 6.05), "lane"] = 1
     path = saved(tmp_path / "road.csv", cars(10, lane=1), d, drive("e", 8, 10, -30, lane=1))
-    found = {(s.agents, round(s.time[0], 6), round(s.time[-1], 6)) for s in read(path, pairs=True)}
-    assert found == {
+    result = {(s.agents, round(s.time[0], 6), round(s.time[-1], 6)) for s in read(path, pairs=True)}
+    assert result == {
         (("b", "a"), 0.0, 3.8),
         (("c", "b"), 0.0, 10.0),
         (("b", "d"), 4.0, 6.0),
