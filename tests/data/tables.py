@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from hypothesis import strategies as st
 
 from nnode.data.cut import Reading
 from nnode.data.options import DataOptions
@@ -59,3 +60,12 @@ def read(kind: type[DataOptions], path: Path, /, **options: object) -> Reading:
     """The sequences that the reader of some options makes of a file."""
     made = kind(path=str(path), **options)  # type: ignore[call-arg, arg-type]
     return FORMATS[kind].sequences(FORMATS[kind].files(made), made)
+
+
+def damaged(data: st.DataObject, sound: bytes, start: int, most: int) -> bytes:
+    """A file of which up to ``most`` bytes behind ``start`` are others, and whose end may lack."""
+    whole = bytearray(sound)
+    at = data.draw(st.integers(start, len(whole) - 1))
+    size = data.draw(st.integers(0, most))
+    whole[at : at + size] = data.draw(st.binary(min_size=size, max_size=size))
+    return bytes(whole[: data.draw(st.integers(at, len(whole)))])

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nnode.data.clusters import index_of
 from nnode.data.options import SplitMode, SplitOptions
+from nnode.data.readers.esimas import EsimasOptions, esimas_files, read_esimas
+from nnode.data.readers.juelich import JuelichOptions, read_juelich
 from nnode.data.sequence import Sequence
 from nnode.data.split import Split, split
 from nnode.data.store import write_store
@@ -175,16 +177,10 @@ def test_a_store_is_split_by_its_index(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("family", ["sequence_data", "sequence_data_"])
-def test_real_platoons_are_held_out_in_groups_close_in_time(real_data: Path, family: str) -> None:
-    index = []
-    for camera in range(1, 6):
-        for number in (1, 2):
-            name = f"{camera}-1_{number}"
-            cell = scipy.io.loadmat(real_data / "esimas" / f"{family}{name}.mat")["sequences"]
-            for item in cell.ravel():
-                time = item["Tarr"][0, 0].ravel()
-                index.append(entry(float(time[0]), float(time[-1]), recording=name))
+@pytest.mark.parametrize("family", [2, 3])
+def test_real_platoons_are_held_out_in_groups_close_in_time(real_data: Path, family: int) -> None:
+    files = esimas_files(EsimasOptions(source=str(real_data), min_vehicles=family))
+    index = index_of(s for path in files.values() for s in read_esimas(path))
     result = split(index, SplitOptions(heldout=0.2))
     assert result.mode == "random"
     assert len(result.heldout) == pytest.approx(0.2 * len(index), abs=2)
@@ -197,14 +193,8 @@ def test_real_platoons_are_held_out_in_groups_close_in_time(real_data: Path, fam
 
 @pytest.mark.real
 def test_real_corridor_is_held_out_as_a_block(real_data: Path) -> None:
-    table = np.loadtxt(real_data / "juelich" / "bi_corr_400_b_03.txt", usecols=(0, 1))
-    index = []
-    for second in range(int(table[:, 1].max()) // 25):
-        window = table[(table[:, 1] >= 25 * second) & (table[:, 1] <= 25 * second + 25)]
-        who, count = np.unique(window[:, 0], return_counts=True)
-        whole = [f"{int(i)}" for i in who[count == 26]]
-        if whole:
-            index.append(entry(float(second), second + 1.0, *whole))
+    path = real_data / "juelich" / "bi_corr_400_b_03.txt"
+    index = index_of(read_juelich(path, JuelichOptions()))
     result = split(index, SplitOptions(heldout=0.2))
     assert_sound(index, result)
     assert result.mode == "block"

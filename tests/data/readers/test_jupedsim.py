@@ -26,6 +26,7 @@ from nnode.data.readers.jupedsim import (
 )
 from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
+from tests.data.tables import damaged
 
 ROOM = "POLYGON ((0 0, 10 0, 10 4, 0 4, 0 0), (4 1, 5 1, 5 2, 4 2, 4 1))"
 ROWS = [(f, i, 1 + 0.12 * f, float(i), 1.0, 0.0) for f in range(21) for i in (1, 2)]
@@ -230,13 +231,8 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def test_damage_ends_in_an_error_of_the_package(
     tmp_path: Path, sound: bytes, data: st.DataObject
 ) -> None:
-    whole = bytearray(sound)
-    at = data.draw(st.integers(16, len(whole) - 1))
-    size = data.draw(st.integers(0, 64))
-    whole[at : at + size] = data.draw(st.binary(min_size=size, max_size=size))
-    cut = data.draw(st.integers(at, len(whole)))
     path = tmp_path / "damaged.sqlite"
-    path.write_bytes(whole[:cut])
+    path.write_bytes(damaged(data, sound, 16, 64))
     try:
         result = read(path)
     except (DataError, ConfigError):

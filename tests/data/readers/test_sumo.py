@@ -16,6 +16,7 @@ from nnode.data.prepare import prepare
 from nnode.data.readers.sumo import SumoOptions, sumo_files
 from nnode.errors import ConfigError, DataError, NNodeError
 from tests.data import tables
+from tests.data.tables import damaged
 
 HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<!-- by SUMO -->\n<fcd-export>\n'
 
@@ -169,14 +170,10 @@ def test_a_torn_gzip_file(tmp_path: Path) -> None:
     max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 def test_damage_ends_in_an_error_of_the_package(tmp_path: Path, data: st.DataObject) -> None:
-    whole = bytearray(write(tmp_path / "whole.xml", *steps()).read_bytes())
-    if data.draw(st.booleans()):
-        whole = bytearray(gzip.compress(bytes(whole)))
-    at = data.draw(st.integers(0, len(whole) - 1))
-    size = data.draw(st.integers(0, 16))
-    whole[at : at + size] = data.draw(st.binary(min_size=size, max_size=size))
+    whole = write(tmp_path / "whole.xml", *steps()).read_bytes()
+    whole = gzip.compress(whole) if data.draw(st.booleans()) else whole
     path = tmp_path / "damaged.xml"
-    path.write_bytes(whole[: data.draw(st.integers(at, len(whole)))])
+    path.write_bytes(damaged(data, whole, 0, 16))
     try:
         result = read(path)
     except NNodeError:
