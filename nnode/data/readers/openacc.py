@@ -288,7 +288,9 @@ def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
         ConfigError: a ``dt`` or ``window`` that is no whole number of steps.
         DataError: times that are not equally spaced, or a vehicle twice at one time.
     """
-    start, step, (speed, spacing) = _equally_spaced(rows, rows.v, rows.spacing)
+    assert rows.v is not None
+    assert rows.spacing is not None
+    start, step, (speed, spacing) = _equally_spaced(rows, rows.v[:, 0], rows.spacing)
     most = int(options.fill / step + 1e-6)  # samples that may be missing
     v = _filled(speed, most)
     sound = _sound(rows, spacing, np.diff(v, axis=1), step, options.max_error)
@@ -333,10 +335,8 @@ def by_spacing(rows: Trajectories, options: OpenAccOptions) -> list[Sequence]:
     return sequences
 
 
-def _equally_spaced(
-    rows: Trajectories, *columns: np.ndarray | None
-) -> tuple[float, float, list[np.ndarray]]:
-    """Time of the first sample, step (s), and columns ``(K, N)``, NaN where there is no row."""
+def _equally_spaced(rows: Trajectories, *columns: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """Time of the first sample, step (s), and each column as ``(K, N)``, NaN without a row."""
     time, at = np.unique(np.round(rows.time, 6), return_inverse=True)
     agent, names = pd.factorize(rows.agent)
     if len(time) < 2:
@@ -363,26 +363,17 @@ def _equally_spaced(
             f"{rows.path}: run {rows.name} has two rows of one position at one time; expected one "
             "row per vehicle and time"
         )
-    wide_columns = []
-    for column in columns:
-        wide = np.full(shape, np.nan)
-        if column is not None:
-            wide.ravel()[cell] = column.ravel()
-        wide_columns.append(wide)
-    return float(time[0]), step, wide_columns
+    wide = np.full((len(columns), shape[0] * shape[1]), np.nan)
+    wide[:, cell] = columns
+    return float(time[0]), step, wide.reshape(-1, *shape)
 
 
 def _filled(values: np.ndarray, most: int) -> np.ndarray:
     """``(K, N)`` values with holes of at most ``most`` samples interpolated."""
-    full = values.copy()
-    for column in full.T:
-        missing, measured = (np.flatnonzero(np.isnan(column) == where) for where in (True, False))
-        after = np.searchsorted(measured, missing)
-        inside = (after > 0) & (after < len(measured))
-        missing, after = missing[inside], after[inside]
-        short = missing[measured[after] - measured[after - 1] <= most + 1]
-        column[short] = np.interp(short, measured, column[measured]) if short.size else 0.0
-    return full
+    sample = pd.DataFrame(np.where(np.isnan(values), np.nan, np.arange(len(values))[:, None]))
+    short = sample.bfill() - sample.ffill() <= most + 1
+    whole = pd.DataFrame(values).interpolate(limit_area="inside")
+    return whole.where(short).to_numpy()
 
 
 def _sound(
