@@ -9,7 +9,7 @@ median counts fully; outside, it falls off like a normal density of its logarith
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -289,10 +289,13 @@ def scales(
         rate: frames per second that the file or the user states.
         speeds: whether the file has speeds.
     """
+    clocks: list[tuple[str, float | None]] = [(unit, None) for unit in TIME_UNITS]
+    if frames:
+        clocks += [("frame", each) for each in dict.fromkeys([*([rate] if rate else []), *RATES])]
     scored = []
     for domain, values in measured.items():
         for position, (time, frame_rate), speed in product(
-            LENGTH_UNITS, _times(frames, rate), SPEED_UNITS if speeds else ("m/s",)
+            LENGTH_UNITS, clocks, SPEED_UNITS if speeds else ("m/s",)
         ):
             candidate = Scale(domain, position, time, speed, frame_rate)
             score = _expected(position, stated.get("position")) + _expected(
@@ -315,14 +318,6 @@ def certainty(probability: float) -> str:
     if probability >= SURE:
         return "sure"
     return "likely" if probability >= LIKELY else "a guess"
-
-
-def _times(frames: bool, rate: float | None) -> Iterator[tuple[str, float | None]]:
-    for unit in TIME_UNITS:
-        yield unit, None
-    if frames:
-        for each in dict.fromkeys([*([rate] if rate else []), *RATES]):
-            yield "frame", each
 
 
 def _expected(unit: str, stated: str | None) -> float:

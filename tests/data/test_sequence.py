@@ -48,8 +48,6 @@ def test_select_keeps_everything_of_the_chosen_agents() -> None:
     assert kept.agents == ("p", "r")
     assert kept.kind == ("car", "car")
     assert kept.group is None
-    assert kept.length is not None
-    assert kept.destination is not None
     np.testing.assert_array_equal(kept.length, [4.0, 5.0])
     np.testing.assert_array_equal(kept.destination, [[1.0], [3.0]])
     np.testing.assert_array_equal(kept.x, item.x[:, [0, 2]])

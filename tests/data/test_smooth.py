@@ -117,8 +117,7 @@ def test_records_are_smoothed_apart_and_nobody_rolls_back(tmp_path: Path) -> Non
     parts = [pd.DataFrame({"vehicle": i, "time": time, "x": 50.0 * i + noise[i]}) for i in range(2)]
     options = VehicleTableOptions(min_vehicles=2, smooth=2.0)
     (s,) = read_vehicles(saved(tmp_path / "t.csv", *parts), options)
-    assert s.v is not None
-    assert (s.v >= 0).all()
+    assert (s.velocity() >= 0).all()
     assert np.abs(s.x[:, :, 0] - [0, 50]).max() < 1
 
 

@@ -137,13 +137,6 @@ def test_a_store_without_sequences_is_a_store(tmp_path: Path) -> None:
     assert list(store) == []
 
 
-def test_the_same_sequences_give_the_same_bytes(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_store(tmp_path / name, [crowd("c/1"), crowd("c/2", seed=3)], {"seed": 1})
-    for file in (TABLE, MANIFEST):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
-
-
 def test_numpy_and_paths_in_a_manifest_become_plain(tmp_path: Path) -> None:
     manifest = {"n": np.int64(3), "x": np.array([1.0, 2.0]), "file": Path("a") / "b"}
     store = write_store(tmp_path, [bare("a")], manifest)

@@ -178,16 +178,15 @@ def has_columns(source: pd.DataFrame | str | Path, group: str, given: Mapping[st
         raw = _raw(source)
     except NNodeError:
         return True
-    return raw.table is None or _fits(group, _names(raw, given))
+    if raw.table is None:
+        return True
+    names = _names(raw, given)
+    return names >= NEEDED[group][1] or (group == "pairs" and names >= SPACED)
 
 
 def _names(raw: Raw, given: Mapping[str, Any]) -> set[str]:
     """Columns under their own names, and the meanings of those that are given."""
     return set(map(str, raw.frame.columns)) | set(given.get("columns") or {})
-
-
-def _fits(group: str, names: set[str]) -> bool:
-    return names >= NEEDED[group][1] or (group == "pairs" and names >= SPACED)
 
 
 def _exact(raw: Raw, given: Mapping[str, Any]) -> str | None:

@@ -85,7 +85,7 @@ class Scaled:
 
 def scaled(
     raw: Raw,
-    meanings: Mapping[str, Meaning],
+    meanings: dict[str, Meaning],
     domain: Domain | None,
     rate: float | None,
     told_units: Mapping[str, str] | None = None,
@@ -100,7 +100,10 @@ def scaled(
     Raises:
         DataError: a column that is needed was not recognised, or nothing moves.
     """
-    meanings = _counted(raw, _of_pairs(raw, dict(meanings)))
+    meanings = _of_pairs(raw, dict(meanings))
+    clocks = _Columns(raw, meanings).numbers("time", "frame")
+    if len(clocks) == 2 and np.array_equal(clocks[0], clocks[1], equal_nan=True):
+        del meanings["time"]  # it is the number of the frame
     table = _rows(_Columns(raw, meanings))
     clock = clock_of(meanings)
     rows = table.in_order()
@@ -153,14 +156,6 @@ class _Columns:
         """Those columns of names that the table has."""
         held = (self.meanings[m].column for m in meanings if m in self.meanings)
         return [self.raw.cells.names(column, empty=empty) for column in held]
-
-
-def _counted(raw: Raw, meanings: dict[str, Meaning]) -> dict[str, Meaning]:
-    """Meanings without a time that is nothing but the number of the frame."""
-    clocks = _Columns(raw, meanings).numbers("time", "frame")
-    if len(clocks) == 2 and np.array_equal(clocks[0], clocks[1], equal_nan=True):
-        del meanings["time"]
-    return meanings
 
 
 def _domains(

@@ -87,9 +87,8 @@ def test_a_clock_that_is_wrong_is_told_by_speeds_in_the_file(tmp_path: Path, fac
     table["t"] *= factor
     file = examine(saved(table, tmp_path))
     text = said(file)["time_scale"]
-    drive = re.search(r"by their positions vehicles drive ([\d.]+) m/s", text)
-    assert drive is not None
-    assert float(drive[1]) == pytest.approx(12 / factor, rel=0.01)
+    (speed,) = re.findall(r"by their positions vehicles drive ([\d.]+) m/s", text)
+    assert float(speed) == pytest.approx(12 / factor, rel=0.01)
     assert f"times multiplied by {1 / factor:.3g} would agree" in text
 
 
@@ -208,9 +207,8 @@ def test_people_in_centimetres_whose_rate_nobody_tells(tmp_path: Path) -> None:
 def test_a_wrong_rate_is_told_by_peoples_gait_alone(tmp_path: Path) -> None:
     head = "# framerate: 30 fps\n# id frame x/m y/m z/m\n"
     text_ = said(examine(text(people(), tmp_path, head)))["time_scale"]
-    walk = re.search(r"at the stated 30 frames/s, people walk ([\d.]+) m/s", text_)
-    assert walk is not None
-    assert float(walk[1]) == pytest.approx(1.3 * 30 / 16, rel=0.1)
+    (speed,) = re.findall(r"at the stated 30 frames/s, people walk ([\d.]+) m/s", text_)
+    assert float(speed) == pytest.approx(1.3 * 30 / 16, rel=0.1)
     assert "16 frames/s fit" in text_ or "15 frames/s fit" in text_
 
 
@@ -293,9 +291,8 @@ def test_pairs_without_positions_and_their_units(tmp_path: Path, position: str, 
         "v_leader": "leader_speed",
     }
     assert {s.name for s in file.sequences} == {"train/0", "train/1", "test/0", "test/1"}
-    assert file.sequences[0].v is not None
-    speeds = np.gradient(file.sequences[0].x[:, 0, 0], 0.1)
-    assert np.abs(speeds - file.sequences[0].v[:, 0, 0]).max() < 0.5
+    first = file.sequences[0]
+    assert np.abs(np.gradient(first.x[:, 0, 0], 0.1) - first.velocity()[:, 0, 0]).max() < 0.5
 
 
 def test_pairs_that_are_left_out_are_a_finding(tmp_path: Path) -> None:
@@ -540,13 +537,12 @@ def test_the_window_that_noise_asks_for_reads_and_smooths(tmp_path: Path) -> Non
     noisy = table.assign(x=table.x + 0.3 * np.random.default_rng(2).standard_normal(len(table)))
     path = saved(noisy.drop(columns="v"), tmp_path)
     text_ = said(examine(path), "warning")["noise"]
-    window = re.search(r"data\.smooth=([\d.]+) \(s\)", text_)
-    assert window is not None
+    (window,) = re.findall(r"data\.smooth=([\d.]+) \(s\)", text_)
     raw, smooth = (
         nnode.sequences(
             path, data="vehicles", columns={"vehicle": "veh", "time": "t"}, **smoothing
         )[0]
-        for smoothing in ({}, {"smooth": float(window[1])})
+        for smoothing in ({}, {"smooth": float(window)})
     )
     true = table[table.veh == 0].set_index("t").v  # the leader, last in its platoon
     for s, low, high in ((raw, 1.0, np.inf), (smooth, 0.0, 0.25)):

@@ -75,9 +75,7 @@ def test_a_pair_is_a_platoon_of_two(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time, atol=1e-9)
     np.testing.assert_allclose(s.x[:, 1, 0], 24 + 11 * s.time, atol=1e-9)
     np.testing.assert_allclose(s.v[:, :, 0], np.tile([10.0, 11.0], (51, 1)))
-    assert s.length is not None
-    assert np.isnan(s.length[0])
-    np.testing.assert_allclose(s.length[1], 4.0)
+    np.testing.assert_allclose(s.length, [np.nan, 4.0])
 
 
 def test_pairs_of_one_table_in_any_order_with_a_given_length(tmp_path: Path) -> None:
@@ -192,8 +190,7 @@ def test_files_as_they_are_published(tmp_path: Path) -> None:
     assert (first_pair.name, first_pair.split) == ("0400pm-0415pm/f254_l253_00014", "test")
     assert (two.agents, two.split) == (("13", "15"), "train")
     np.testing.assert_allclose(two.x[-1, :, 0], [50.0, 79.0])
-    assert two.length is not None
-    np.testing.assert_allclose(two.length[1], 4.0)
+    np.testing.assert_allclose(two.length, [np.nan, 4.0])
 
     (tmp_path / listed["path"][0]).unlink()
     with pytest.raises(DataError, match=r"manifest\.csv, line 2: there is no file"):
@@ -221,21 +218,16 @@ def spaced(pair: object, spacing: float = 20.0, k: int = 51, **further: object) 
 def test_positions_follow_from_spacing_and_speeds(tmp_path: Path) -> None:
     table = spaced(1)
     (s,) = read(saved(tmp_path / "p.csv", table))
-    assert s.length is not None
-    assert s.v is not None
     # the trapezium rule is exact for a speed that changes evenly
     np.testing.assert_allclose(s.x[:, 1, 0], 12.0 * s.time - 0.3 * s.time**2, atol=1e-9)
-    gap = s.x[:, 1, 0] - s.x[:, 0, 0] - s.length[1]
-    np.testing.assert_allclose(gap, table.spacing, atol=1e-9)
+    np.testing.assert_array_equal(s.length, [np.nan, 5.0])
+    np.testing.assert_allclose(s.x[:, 1, 0] - s.x[:, 0, 0] - 5.0, table.spacing, atol=1e-9)
     np.testing.assert_allclose(np.diff(s.x[:, 0, 0]), 1.0, atol=1e-9)
-    np.testing.assert_array_equal(s.v[:, :, 0], table[["v_follower", "v_leader"]])
-    assert s.length[1] == 5.0
-    assert np.isnan(s.length[0])
+    np.testing.assert_array_equal(s.velocity()[:, :, 0], table[["v_follower", "v_leader"]])
 
     # the length of a leader changes where fronts are, and no gap
     (longer,) = read(saved(tmp_path / "q.csv", spaced(1, leader_length=12.0)))
-    assert longer.length is not None
-    assert longer.length[1] == 12.0
+    np.testing.assert_array_equal(longer.length, [np.nan, 12.0])
     np.testing.assert_allclose(longer.x[:, 0] - s.x[:, 0], -7.0)
     (unknown,) = read(saved(tmp_path / "p.csv", spaced(1)), length=None)
     assert unknown.length is None
@@ -394,14 +386,12 @@ def test_published_pairs_without_positions(
     names = [columns["pair"], *(["split"] if "split" in table else [])]
     rows = {"/".join(map(str, key[::-1])): given for key, given in table.groupby(names, sort=False)}
     for s in result:
-        assert s.length is not None
-        assert s.v is not None
         given = rows[s.name.removeprefix("pairs/")]
         np.testing.assert_allclose(s.x[:, 1, 0] - s.x[:, 0, 0] - 5.0, given.spacing, atol=1e-9)
         speeds = [columns.get(name, name) for name in ("v_follower", "v_leader")]
-        np.testing.assert_array_equal(s.v[:, :, 0], given[speeds])
+        np.testing.assert_array_equal(s.velocity()[:, :, 0], given[speeds])
         # the follower's position, of which only the spacing is measured, has its measured speed
-        moved = cumulative_trapezoid(s.v[:, 0, 0], s.time, initial=0.0)
+        moved = cumulative_trapezoid(s.velocity()[:, 0, 0], s.time, initial=0.0)
         assert np.abs(s.x[:, 0, 0] - s.x[0, 0, 0] - moved).max() < 2.0
         assert find_faults(s, "traffic") == []
 
@@ -414,10 +404,9 @@ def test_a_published_idm_gives_the_published_error_of_spacings(real_data: Path) 
     for s in read(real_data / "waymo_pairs" / "hv_av_2.parquet", columns=WAYMO):
         if s.split != "test":
             continue
-        assert s.length is not None
-        assert s.v is not None
-        spacing = s.x[:, 1, 0] - s.x[:, 0, 0] - s.length[1]
-        (follower, leader), v = s.v[:, :, 0].T, s.v[0, 0, 0]
+        spacing = s.x[:, 1, 0] - s.x[:, 0, 0] - 5.0
+        follower, leader = s.velocity()[:, :, 0].T
+        v = follower[0]
         rear = spacing + cumulative_trapezoid(follower, s.time, initial=0.0)
         place, gaps = 0.0, [spacing[0]]
         for k in range(s.n_samples - 1):
@@ -435,9 +424,8 @@ def _gap_error(s: Sequence, p: dict[str, float], dt: float = 0.1) -> float:
     """Root mean square error of the gap (m) of a follower by the IDM behind its measured leader, as
     ``published.json`` says: acceleration held during a step, bounded, an exact stop."""
     assert s.length is not None
-    assert s.v is not None
-    rear, ahead = s.x[:, 1, 0] - s.length[1], s.v[:, 1, 0]
-    x, v = s.x[0, 0, 0], s.v[0, 0, 0]
+    rear, (follower, ahead) = s.x[:, 1, 0] - s.length[1], s.velocity()[:, :, 0].T
+    x, v = s.x[0, 0, 0], follower[0]
     errors = []
     for k in range(s.n_samples):
         errors.append(s.x[k, 0, 0] - x)
