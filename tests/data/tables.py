@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from hypothesis import strategies as st
+from scipy.io import savemat
 
 from nnode.data.cut import Reading
 from nnode.data.options import DataOptions
@@ -53,6 +54,15 @@ def saved(path: Path, *tables: pd.DataFrame) -> Path:
         table.to_parquet(path)
     else:
         table.to_csv(path, index=False)
+    return path
+
+
+def esimas(path: Path, *platoons: tuple[np.ndarray, np.ndarray], packed: bool = False) -> Path:
+    """Positions ``(cars, K)`` and times ``(K,)`` of platoons, in the layout of ESIMAS."""
+    cells = np.empty((len(platoons), 1), dtype=object)
+    for i, (x, time) in enumerate(platoons):
+        cells[i, 0] = {"Xarr": x, "Tarr": time}
+    savemat(path, {"sequences": cells}, do_compression=packed)
     return path
 
 

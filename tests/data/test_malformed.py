@@ -22,38 +22,29 @@ from nnode.data.readers.matlab import Other, read_matlab
 from nnode.data.readers.table import TableOptions, read_table
 from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.errors import DataError, NNodeError
+from tests.data.tables import esimas
 
-
-def saved(path: Path, *, packed: bool, **values: object) -> Path:
-    savemat(path, values, do_compression=packed)
-    return path
-
-
-def cells() -> np.ndarray:
-    result = np.empty((1, 2), dtype=object)
-    for i in range(2):
-        result[0, i] = {"Xarr": np.arange(6.0).reshape(2, 3) + i, "Tarr": np.arange(3)[None]}
-    return result
+PLATOONS = [(np.arange(6.0).reshape(2, 3) + i, np.arange(3)[None]) for i in range(2)]
 
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_matlab_values_of_all_kinds(tmp_path: Path, packed: bool) -> None:
-    path = saved(
-        tmp_path / "a.mat",
-        packed=packed,
-        cells=cells(),
-        small=np.array([[1, 2]], np.uint8),
-        pair=np.array([(1.0, 2)], dtype=[("a", "f8"), ("b", "i4")]),
-        text="words",
-        z=np.array([1j]),
-        many=np.array([(1.0,), (2.0,)], dtype=[("a", "f8")]),
-        empty=np.zeros((0, 3)),
-    )
-    result = read_matlab(path)
-    for i in range(2):
-        np.testing.assert_array_equal(
-            result["cells"][i]["Xarr"], np.arange(6.0).reshape(2, 3) + i, strict=True
-        )
+    cells = np.empty((1, 2), dtype=object)
+    cells[0] = [{"x": x, "time": time} for x, time in PLATOONS]
+    values = {
+        "cells": cells,
+        "small": np.array([[1, 2]], np.uint8),
+        "pair": np.array([(1.0, 2)], dtype=[("a", "f8"), ("b", "i4")]),
+        "text": "words",
+        "z": np.array([1j]),
+        "many": np.array([(1.0,), (2.0,)], dtype=[("a", "f8")]),
+        "empty": np.zeros((0, 3)),
+    }
+    savemat(tmp_path / "a.mat", values, do_compression=packed)
+    result = read_matlab(tmp_path / "a.mat")
+    for cell, (x, time) in zip(result["cells"], PLATOONS, strict=True):
+        np.testing.assert_array_equal(cell["x"], x, strict=True)
+        np.testing.assert_array_equal(cell["time"], time)
     np.testing.assert_array_equal(result["small"], [[1, 2]])
     assert result["pair"] == {"a": [[1.0]], "b": [[2]]}
     assert [element["a"].item() for element in result["many"]] == [1.0, 2.0]
@@ -66,7 +57,7 @@ def test_matlab_values_of_all_kinds(tmp_path: Path, packed: bool) -> None:
 @pytest.mark.parametrize("packed", [False, True])
 def test_single_bits_of_a_matlab_file_is_read_or_refused(tmp_path: Path, packed: bool) -> None:
     path = tmp_path / "sequence_datax.mat"
-    sound = saved(path, packed=packed, sequences=cells()).read_bytes()
+    sound = esimas(path, *PLATOONS, packed=packed).read_bytes()
     refused = 0
     for bit in range(8 * 124, 8 * len(sound), 1 if packed else 7):  # 7: in every byte
         data = bytearray(sound)
@@ -84,7 +75,7 @@ def test_a_matlab_file_that_swells_is_refused(
 ) -> None:
     monkeypatch.setattr(matlab, "MOST_BYTES", 1 << 20)
     path = tmp_path / "sequence_datax.mat"
-    head = saved(path, packed=False, sequences=cells()).read_bytes()[:128]
+    head = esimas(path, *PLATOONS).read_bytes()[:128]
     bomb = zlib.compress(bytes(1 << 24))
     path.write_bytes(head + struct.pack("<II", 15, len(bomb)) + bomb)
     with pytest.raises(DataError, match="truncated, or has more than 1048576 bytes"):

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.io import savemat
 
 import nnode.data.prepare as module
 from nnode.data.options import DataOptions, Faults, SplitOptions
@@ -22,7 +21,7 @@ from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.data.store import Store
 from nnode.errors import ConfigError, DataError, FaultError
 from nnode.plots.quality import plot_faults
-from tests.data.tables import saved, tidy
+from tests.data.tables import esimas, saved, tidy
 
 TIME = 0.2 * np.arange(6)
 CLEAN = np.array([[0.0], [30.0], [60.0]]) + 25 * TIME
@@ -34,10 +33,8 @@ def raw(
     folder: Path, *positions: np.ndarray, recording: str = "demo", time: np.ndarray = TIME
 ) -> EsimasOptions:
     folder.mkdir(exist_ok=True)
-    cells = np.empty((len(positions), 1), dtype=object)
-    for i, x in enumerate(positions):
-        cells[i, 0] = {"Xarr": x, "Tarr": time[: x.shape[1]]}
-    savemat(folder / f"sequence_data{recording}.mat", {"sequences": cells})
+    platoons = ((x, time[: x.shape[1]]) for x in positions)
+    esimas(folder / f"sequence_data{recording}.mat", *platoons)
     return EsimasOptions(source=str(folder))
 
 

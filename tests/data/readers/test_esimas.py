@@ -10,21 +10,14 @@ from scipy.io import loadmat, savemat
 
 from nnode.data.readers.esimas import EsimasOptions, esimas_files, read_esimas
 from nnode.errors import ConfigError, DataError
-
-
-def write(path: Path, platoons: list[tuple[np.ndarray, np.ndarray]]) -> Path:
-    cells = np.empty((len(platoons), 1), dtype=object)
-    for i, (x, time) in enumerate(platoons):
-        cells[i, 0] = {"Xarr": x, "Tarr": time}
-    savemat(path, {"sequences": cells})
-    return path
+from tests.data.tables import esimas
 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     time = 3.0 + 0.2 * np.arange(4)
     x = np.array([[0.0], [30.0], [55.0]]) + 25 * (time - 3)
-    return write(tmp_path / "sequence_datademo.mat", [(x, time), (x[:2, :3], time[:3])])
+    return esimas(tmp_path / "sequence_datademo.mat", (x, time), (x[:2, :3], time[:3]))
 
 
 def test_reads_positions_times_and_names(recording: Path) -> None:
@@ -50,9 +43,11 @@ def test_holes_cut_and_uneven_times_are_interpolated(tmp_path: Path) -> None:
     x = np.array([[0.0], [30.0]]) + 25 * time
     late = time + np.where(np.arange(12) == 5, 0.05, 0.0)
     gone = np.delete(np.arange(12), [5, 6])
-    path = write(
+    path = esimas(
         tmp_path / "sequence_dataown.mat",
-        [(x, time), (np.array([[0.0], [30.0]]) + 25 * late, late), (x[:, gone], time[gone])],
+        (x, time),
+        (np.array([[0.0], [30.0]]) + 25 * late, late),
+        (x[:, gone], time[gone]),
     )
     result = read_esimas(path)
     assert [(s.name, s.n_samples) for s in result] == [
@@ -97,7 +92,7 @@ def test_other_recordings_of_a_folder(recording: Path) -> None:
 
 
 def test_families_are_not_mixed_up(recording: Path) -> None:
-    write(recording.with_name("sequence_data_demo.mat"), [(np.ones((2, 3)), np.arange(3.0))])
+    esimas(recording.with_name("sequence_data_demo.mat"), (np.ones((2, 3)), np.arange(3.0)))
     source = str(recording.parent)
     three = esimas_files(EsimasOptions(source=source))
     two = esimas_files(EsimasOptions(source=source, min_vehicles=2))
@@ -151,11 +146,9 @@ def test_other_content(tmp_path: Path) -> None:
     savemat(path, {"sequences": np.ones((2, 2))})
     with pytest.raises(DataError, match=r"sequence 0: expected a struct"):
         read_esimas(path)
-    write(path, [(np.ones((2, 3)), np.arange(3.0)), (np.ones((2, 3)), np.arange(4.0))])
+    esimas(path, (np.ones((2, 3)), np.arange(3.0)), (np.ones((2, 3)), np.arange(4.0)))
     with pytest.raises(DataError, match=r"sequence 1: expected Xarr .* found \(2, 3\) and \(4,\)"):
         read_esimas(path)
-    cells = np.empty((1, 1), dtype=object)
-    cells[0, 0] = {"Xarr": "text", "Tarr": np.arange(3.0)}
-    savemat(path, {"sequences": cells})
+    esimas(path, (np.array("text"), np.arange(3.0)))
     with pytest.raises(DataError, match="Xarr holds no plain numbers"):
         read_esimas(path)

@@ -15,12 +15,13 @@ from nnode.data.readers.columns import Table
 from nnode.data.sequence import Sequence, collate
 from nnode.data.sequences import Sequences
 from nnode.errors import ConfigError, DataError
+from tests.data.tables import saved
 
 STEP, SAMPLES = 0.2, 40
 START = pd.Timestamp("2020-01-01 08:00")
 
 
-def drive() -> pd.DataFrame:
+def tidy() -> pd.DataFrame:
     """Three vehicles, 25 m apart, at about 15 m/s, every 0.2 s."""
     k, n = (axis.ravel() for axis in np.meshgrid(np.arange(SAMPLES), np.arange(3), indexing="ij"))
     x = 25.0 * n + 3.0 * k + 0.3 * np.sin(k / 4 + n)
@@ -28,21 +29,17 @@ def drive() -> pd.DataFrame:
     return pd.DataFrame({"sequence": "s", "time": time, "agent": [f"c{i}" for i in n], "x": x})
 
 
-def tidy() -> pd.DataFrame:
-    return drive()
-
-
 def crowd() -> pd.DataFrame:
-    table = drive()
+    table = tidy()
     return table.assign(x=table.x / 10, y=0.0)
 
 
 def vehicles() -> pd.DataFrame:
-    return drive().drop(columns="sequence").rename(columns={"agent": "vehicle"})
+    return tidy().drop(columns="sequence").rename(columns={"agent": "vehicle"})
 
 
 def pairs() -> pd.DataFrame:
-    x = drive().pivot(index="time", columns="agent", values="x")
+    x = tidy().pivot(index="time", columns="agent", values="x")
     return pd.DataFrame({"time": x.index, "x_follower": x.c0.values, "x_leader": x.c1.values})
 
 
@@ -85,10 +82,8 @@ def test_dates_become_seconds_since_the_first(make: Callable[[], pd.DataFrame], 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_dates_in_files(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"t{suffix}"
     table = tidy().assign(time=stamps(tidy().time))
-    table.to_csv(path, index=False) if suffix == ".csv" else table.to_parquet(path)
-    (result,) = sequences(path)
+    (result,) = sequences(saved(tmp_path / f"t{suffix}", table))
     np.testing.assert_allclose(result.time, STEP * np.arange(SAMPLES), atol=1e-9)
 
 
@@ -124,7 +119,7 @@ def test_short_sequences_since_1970_have_one_interval() -> None:
     """Seconds since 1970 are rounded to 2e-7 s: intervals of 0.02 s would differ by 1e-5."""
     parts = []
     for i in range(20):
-        rows = drive()[drive().time < 0.5]
+        rows = tidy()[tidy().time < 0.5]
         time = rows.time / 10 + 7.31 * i
         parts.append(rows.assign(sequence=f"s{i}", time=time, x=rows.x / 10))
     table = pd.concat(parts)
@@ -134,14 +129,14 @@ def test_short_sequences_since_1970_have_one_interval() -> None:
 
 @pytest.mark.parametrize("scale", [1e3, 1e6, 1e9, 1 / 3600, 1 / 86400])
 def test_whatever_takes_data_refuses_times_in_another_unit(scale: float) -> None:
-    table = drive().assign(time=drive().time * scale)
+    table = tidy().assign(time=tidy().time * scale)
     read = r"data=table: samples are .* s apart; expected at least 0\.001 s"
     with pytest.raises(DataError, match=read):
         Calibrator("lin").fit(table)
     with pytest.raises(DataError, match=read):
         diagnose(table)
     # sequences of one's own, which no reader has seen
-    (good,) = sequences(drive())
+    (good,) = sequences(tidy())
     bad = [Sequence(name=n, recording=n, time=good.time * scale, x=good.x) for n in "abcd"]
     message = r"sequence [abcd]: samples are .* s apart"
     with pytest.raises(DataError, match=message):
