@@ -2,7 +2,8 @@
 
 Written for files that may be damaged: every size is checked against the bytes that are there
 before anything is made of it, in plain Python, so that no input ends the process or fills the
-memory.
+memory. ``scipy.io.loadmat`` ends the process with a segmentation fault for some files in which a
+single bit is wrong (SciPy 1.17.1).
 
 Source: MathWorks, "MAT-File Format", chapter 1 (level 5).
 """
