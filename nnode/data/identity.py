@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -163,7 +164,7 @@ def _neighbours(tracks: list[_Track | None], error: float) -> tuple[_Pairs, _Pai
     for i, track in enumerate(tracks):
         if track is not None and track.place:
             k = np.arange(len(track.x))
-            columns = {
+            columns: dict[str, Any] = {
                 "name": np.tile(list(track.place), len(k)),
                 "time": np.repeat(track.first + k, len(track.place)),
                 "sequence": i,
@@ -175,9 +176,10 @@ def _neighbours(tracks: list[_Track | None], error: float) -> tuple[_Pairs, _Pai
         return [], []
     table = pd.concat(parts)
     places = table.columns[:-4].to_list()
-    table = table[np.isfinite(table[places]).all(axis=1)]
-    table["name"] = pd.factorize(table["name"])[0]
-    table = table.sort_values(["name", "time", *places, "sequence"])
+    table = table[np.isfinite(table[places].to_numpy()).all(axis=1)]
+    table = table.assign(name=pd.factorize(table["name"])[0]).sort_values(
+        ["name", "time", *places, "sequence"]
+    )
     row, next_row = table[:-1].reset_index(), table[1:].reset_index()
     sequences = np.stack([row["sequence"], next_row["sequence"]], axis=1)
     met = (row["name"] == next_row["name"]) & (row["time"] == next_row["time"])

@@ -400,12 +400,12 @@ def _overlaps(view: _View) -> Iterator[Fault]:
     for pair, sample, number, smallest in spans.sort_values(
         ("sample", "min"), kind="stable"
     ).itertuples(name=None):
-        i, j = map(int, pair)
+        a, b = map(int, pair)
         text = (
-            f"{view.who(i)} and {view.who(j)} are down to {smallest:.2f} m apart at {number} of "
+            f"{view.who(a)} and {view.who(b)} are down to {smallest:.2f} m apart at {number} of "
             f"{len(x)} samples, less than {limit:g} m"
         )
-        yield view.fault("overlap", (i, j), int(sample), text)
+        yield view.fault("overlap", (a, b), int(sample), text)
 
 
 @dataclass(frozen=True)

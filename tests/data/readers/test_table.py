@@ -224,7 +224,7 @@ def test_properties_belong_to_the_agent(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "domain", "error", "message"),
+    ("further", "domain", "error", "message"),
     [
         ({"y": 1.0}, "traffic", DataError, "needs the positions x alone"),
         ({}, "crowd", DataError, "needs the positions x and y"),
