@@ -293,28 +293,39 @@ def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
     return [short[name] for name in drivers]
 
 
-def _bias_corrected(population: Population, seed: int, pairs: int) -> Population:
-    """Correct the parameters for their bias in simulations of the model, first with the estimates,
-    then with the corrected parameters.
+def simulated_biases(population: Population, seed: int, pairs: int) -> tuple[np.ndarray, Estimate]:
+    """``(pairs, P)`` biases of the parameters in simulations of the model, first with the
+    estimates, then with the corrected parameters; and the estimate corrected by their mean.
 
     The linearisation at the modes and the errors of smoothed leaders bias the estimates. Standard
     deviations are not corrected: their bias is smaller than the Monte Carlo error of a correction.
+
+    Args:
+        seed, pairs: see :func:`nnode.population.followers.score_biases`.
+
+    Raises:
+        SimulationError: drawn drivers leave the road.
     """
     model, before = population.model, population.estimate
     corrected = before
     for _ in range(CORRECTIONS):
-        try:
-            bias = score_biases(model, PushNoise(), corrected, seed, pairs).mean(0)
-        except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
-            log.warning(
-                "parameters are not corrected for their bias: simulated drivers left the road"
-            )
-            return population
-        bias = np.clip(bias, -LONGEST, LONGEST)
-        theta = np.clip(before.theta - bias, model.low, model.high)
+        biases = np.clip(
+            score_biases(model, PushNoise(), corrected, seed, pairs), -LONGEST, LONGEST
+        )
+        theta = np.clip(before.theta - biases.mean(0), model.low, model.high)
         corrected = fit_deviations(model, PushNoise(), theta, before.variances)
-    corrected = replace(corrected, converged=before.converged)
-    return replace(population, estimate=corrected, bias=before.theta - corrected.theta)
+    return biases, replace(corrected, converged=before.converged)
+
+
+def _bias_corrected(population: Population, seed: int, pairs: int) -> Population:
+    """The estimate, corrected for the bias of its parameters; the same if simulations diverge."""
+    try:
+        _, corrected = simulated_biases(population, seed, pairs)
+    except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
+        log.warning("parameters are not corrected for their bias: simulated drivers left the road")
+        return population
+    bias = population.estimate.theta - corrected.theta
+    return replace(population, estimate=corrected, bias=bias)
 
 
 def _estimated(
@@ -393,16 +404,19 @@ def _with_lasting_errors(best: Population) -> Population:
 
 
 def _with_random_effects(best: Population) -> Population:
-    """Forward selection of random effects.
+    """Forward selection of random effects, then backward elimination.
 
     Random effects are added while twice the log marginal likelihood rises by more than the
     logarithm of the number of drivers (BIC, Schwarz 1978). Candidates are ranked by the marginal
     likelihood of the samples as linearised without them, with refitted variances; then the best two
-    are estimated.
+    are estimated. Then those are removed without which the likelihood falls by less. They were
+    needed only before others were added, or imitated an effect that the model lacked before.
     """
     price = _price(len(best.model.paths.names))
     while (better := _next_random_effect(best, price)) is not None:
         best = better
+    while (smaller := _without_least_needed(best, price)) is not None:
+        best = smaller
     return best
 
 
@@ -443,6 +457,25 @@ def _continued(population: Population, steps: int = STEPS) -> Population:
     last = population.estimate
     modes = last.agents, last.start
     return _estimated(population.model, last.theta, last.variances, *modes, steps)
+
+
+def _without_least_needed(best: Population, price: float) -> Population | None:
+    """The estimate without the random effect that raises the likelihood least; None if all raise it
+    enough."""
+    before, limit = best.estimate, best.marginal.loglik - price
+    reduced = list[tuple[float, str, Variances]]()
+    for place, name in enumerate(best.random):
+        data = replace(before.data, random=np.delete(before.data.random, place))
+        loglik, variances = _refitted(best, data, _without_random_effect(before.variances, place))
+        reduced.append((loglik, name, variances))
+    loglik, removed, variances = max(reduced, default=(-math.inf, "", before.variances))
+    if loglik < limit:
+        return None
+    place = best.random.index(removed)
+    model = best.model.with_random(name for name in best.random if name != removed)
+    agents = np.delete(before.agents, place, 1)
+    fit = _estimated(model, before.theta, variances, agents, before.start)
+    return fit if fit.marginal.loglik >= limit else None
 
 
 def _linearised_loglik(best: Population, name: str) -> float:
@@ -511,3 +544,10 @@ def _with_random_effect(variances: Variances) -> Variances:
         low=np.insert(variances.low, at, LEAST_SPREAD),
         high=np.insert(variances.high, at, MOST_SPREAD),
     )
+
+
+def _without_random_effect(variances: Variances, place: int) -> Variances:
+    """Variances without one of the random effects."""
+    at = len(variances.noise) + place
+    low, high = np.delete(variances.low, at), np.delete(variances.high, at)
+    return replace(variances, spread=np.delete(variances.spread, place), low=low, high=high)

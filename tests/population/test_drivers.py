@@ -19,7 +19,7 @@ from nnode.model.effects import Effect
 from nnode.model.effects.lane import Inertia, ReactionDelay, SpeedZone
 from nnode.model.term import Interval
 from nnode.population import followers
-from nnode.population.drivers import Population, fit_drivers
+from nnode.population.drivers import Population, fit_drivers, refit
 from nnode.population.followers import longest_step, paths_of
 from nnode.population.intervals import deviation_intervals, influence
 from nnode.population.likelihood import NOISE, PushNoise
@@ -54,7 +54,7 @@ def law(**bounds: Interval) -> Traffic:
 
 
 @pytest.fixture(scope="module")
-def found() -> Population:
+def population() -> Population:
     """Drivers whose v0 differs."""
     sequences, _ = platoons(0.15, 1)
     return fit_drivers(law(), paths_of(sequences, 0.2), ["v0"], pairs=0)
@@ -62,20 +62,20 @@ def found() -> Population:
 
 def test_drivers_who_differ_are_found_and_told_apart() -> None:
     sequences, v0 = platoons(0.15, 1)
-    found = fit_drivers(law(), paths_of(sequences, 0.2))
-    assert len(found.estimate.variances.noise) == 3  # white errors do not last
-    assert found.random == ["lin.v0"]
-    own = found.estimate.agents[:, 0]
+    population = fit_drivers(law(), paths_of(sequences, 0.2))
+    assert len(population.estimate.variances.noise) == 3  # white errors do not last
+    assert population.random == ["lin.v0"]
+    own = population.estimate.agents[:, 0]
     assert np.corrcoef(own, np.log(v0).ravel())[0, 1] > 0.9
-    spread, drawn = found.estimate.variances.spread[0], np.log(v0).std()
+    spread, drawn = population.estimate.variances.spread[0], np.log(v0).std()
     assert spread == pytest.approx(drawn, rel=0.2)
-    error = 1 / np.sqrt(np.diag(found.marginal.information))
+    error = 1 / np.sqrt(np.diag(population.marginal.information))
     truth = np.array([np.log(v0).mean(), np.log(LENGTH)])
-    assert (np.abs(found.estimate.theta - truth) < 4 * error).all()
-    half = influence(found, found.model.paths.sequence)[0].half_widths()
-    assert (np.abs(found.estimate.theta - truth) < half).all()
+    assert (np.abs(population.estimate.theta - truth) < 4 * error).all()
+    half = influence(population, population.model.paths.sequence)[0].half_widths()
+    assert (np.abs(population.estimate.theta - truth) < half).all()
     assert (half < 0.1).all()
-    push, lasting, _, differ, start = deviation_intervals(found)
+    push, lasting, _, differ, start = deviation_intervals(population)
     for (low, high), true in ((push, 0.2), (lasting, 4.0), (differ, drawn)):
         assert low < true < high < 2.5 * low
     assert np.isnan(start).all()  # it is given
@@ -83,14 +83,21 @@ def test_drivers_who_differ_are_found_and_told_apart() -> None:
 
 def test_drivers_alike_do_not_differ() -> None:
     sequences, _ = platoons(0.0, 2)
-    found = fit_drivers(law(), paths_of(sequences, 0.2), pairs=0)
-    assert found.random == []
-    sigma, _, error = found.estimate.variances.noise
+    population = fit_drivers(law(), paths_of(sequences, 0.2), pairs=0)
+    assert population.random == []
+    sigma, _, error = population.estimate.variances.noise
     assert sigma == pytest.approx(0.2, rel=0.2)
     assert error == pytest.approx(ERROR, rel=0.1)
 
 
 @pytest.mark.thorough
+def test_differences_that_are_not_needed_are_removed() -> None:
+    sequences, _ = platoons(0.15, 1)
+    paths = paths_of(sequences, 0.2)
+    superfluous = fit_drivers(law(), paths, ["L", "v0"], pairs=0)
+    assert refit(superfluous, law(), paths, fixed=False).random == ["lin.v0"]
+
+
 @pytest.mark.parametrize(
     ("name", "drivers"), [("lin", "auto"), ("idm", ["T", "v0"]), ("idm", "auto")]
 )
@@ -99,18 +106,18 @@ def test_errors_that_last_are_found_and_told_apart_from_pushes(
 ) -> None:
     table = benchmark_platoons(name, "none", 0.15, 21, 16, nature="lasting")
     system = Traffic([make_law(name)], leader="measured").double()
-    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), drivers, pairs=0)
+    population = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), drivers, pairs=0)
     true = [PUSH[name], LASTS, None, 0.06, 1.0]
-    for what, noise, value in zip(NOISE, found.estimate.variances.noise, true, strict=True):
+    for what, noise, value in zip(NOISE, population.estimate.variances.noise, true, strict=True):
         assert value is None or noise == pytest.approx(value, rel=0.5), what
 
 
 def test_errors_of_leaders_are_neither_pushes_nor_errors_that_last() -> None:
     table = benchmark_platoons("lin", "none", 0.15, 7606, 16, error=0.3)
     system = Traffic([make_law("lin")], leader="measured").double()
-    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), pairs=0)
-    assert len(found.estimate.variances.noise) == 3  # the leaders' errors last, the own do not
-    push, lasts = deviation_intervals(found)[:2]
+    population = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), pairs=0)
+    assert len(population.estimate.variances.noise) == 3  # the leaders' errors last, the own do not
+    push, lasts = deviation_intervals(population)[:2]
     assert push[0] < PUSH["lin"] < push[1]
     assert lasts[0] < LASTS < lasts[1]
 
@@ -118,9 +125,9 @@ def test_errors_of_leaders_are_neither_pushes_nor_errors_that_last() -> None:
 def test_a_memory_is_no_error_that_lasts() -> None:
     table = benchmark_platoons("lin", "inertia", 0.15, 9101, 16)
     system = Traffic([make_law("lin"), Inertia(tau_v=0.3)], leader="measured").double()
-    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), ["v0"], pairs=0)
-    assert len(found.estimate.variances.noise) == 3
-    push = deviation_intervals(found)[0]
+    population = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), ["v0"], pairs=0)
+    assert len(population.estimate.variances.noise) == 3
+    push = deviation_intervals(population)[0]
     assert push[0] < PUSH["lin"] < push[1]
 
 
@@ -139,15 +146,17 @@ def test_steps_are_as_short_as_the_model_needs() -> None:
 
 def test_pushes_that_do_not_exist_have_an_interval_from_zero() -> None:
     sequences = following(lambda x, law, lead: law, number=8, seconds=30.0, noise=ERROR, seed=5)
-    found = fit_drivers(law(), paths_of(sequences, 0.2), "none", pairs=0)
-    push, lasting, *_ = deviation_intervals(found)
+    population = fit_drivers(law(), paths_of(sequences, 0.2), "none", pairs=0)
+    push, lasting, *_ = deviation_intervals(population)
     assert push[0] == 0.0
-    assert found.estimate.variances.noise[0] < push[1] < 0.1
+    assert population.estimate.variances.noise[0] < push[1] < 0.1
     assert np.isnan(lasting).all()
 
 
-def test_errors_that_may_not_exist_leave_the_intervals_of_the_others(found: Population) -> None:
-    before = found.estimate.variances
+def test_errors_that_may_not_exist_leave_the_intervals_of_the_others(
+    population: Population,
+) -> None:
+    before = population.estimate.variances
     low, high = before.low.copy(), before.high.copy()
     tiny = replace(
         before,
@@ -155,8 +164,8 @@ def test_errors_that_may_not_exist_leave_the_intervals_of_the_others(found: Popu
         low=np.insert(low, 3, [0.001, 0.1]),
         high=np.insert(high, 3, [1.0, 5.0]),
     )
-    beside = replace(found, estimate=replace(found.estimate, variances=tiny))
-    ends, without = deviation_intervals(beside), deviation_intervals(found)
+    beside = replace(population, estimate=replace(population.estimate, variances=tiny))
+    ends, without = deviation_intervals(beside), deviation_intervals(population)
     np.testing.assert_allclose(ends[[0, 1, 5]], without[[0, 1, 3]], rtol=1e-3)
     assert ends[3, 0] == 0.0
     assert 0.003 < ends[3, 1] < ERROR
@@ -164,10 +173,12 @@ def test_errors_that_may_not_exist_leave_the_intervals_of_the_others(found: Popu
 
 
 def test_simulations_with_a_driver_who_passes_the_vehicle_ahead_are_replaced(
-    found: Population,
+    population: Population,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    simulated = partial(followers.simulated_pairs, found.model, PushNoise(), found.estimate)
+    simulated = partial(
+        followers.simulated_pairs, population.model, PushNoise(), population.estimate
+    )
     (usual,) = simulated(seed=1, pairs=1)
     draws = followers.antithetic_draws
 
@@ -185,19 +196,19 @@ def test_simulations_with_a_driver_who_passes_the_vehicle_ahead_are_replaced(
 def test_simulated_drivers_start_at_the_gaps_that_they_keep() -> None:
     table = benchmark_platoons("idm", "none", 0.15, 7606, 16)
     system = Traffic([make_law("idm")], leader="measured").double()
-    found = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), ["T"], pairs=0)
-    deviations = found.estimate.agents.shape
+    population = fit_drivers(system, paths_of(list(nnode.sequences(table)), 0.2), ["T"], pairs=0)
+    deviations = population.estimate.agents.shape
 
     def mean_gap(sign: float) -> float:
         """At the start, of drivers whose T deviates by one standard deviation."""
-        paths = found.model.simulated_paths(
-            found.estimate, lambda shape: np.full(shape, sign * (shape == deviations))
+        paths = population.model.simulated_paths(
+            population.estimate, lambda shape: np.full(shape, sign * (shape == deviations))
         )
         return float((paths.ahead_at_samples[0, 0] - paths.x[:, 0]).mean())
 
-    change = (mean_gap(1.0) - mean_gap(-1.0)) / (2 * found.estimate.variances.spread[0])
+    change = (mean_gap(1.0) - mean_gap(-1.0)) / (2 * population.estimate.variances.spread[0])
     # a gap contains v T, and benchmark drivers start at the gaps that they keep
-    assert change == pytest.approx(T * found.model.paths.start[1].mean(), rel=0.2)
+    assert change == pytest.approx(T * population.model.paths.start[1].mean(), rel=0.2)
 
 
 def test_paths_that_are_too_short_to_show_errors_have_no_errors_of_leaders() -> None:
@@ -210,10 +221,10 @@ def test_paths_that_are_too_short_to_show_errors_have_no_errors_of_leaders() -> 
 def test_with_v0_at_its_bound_l_is_the_most_likely_one_there() -> None:
     sequences, _ = platoons(0.15, 4)
     below_most = law(v0=Interval(0.0, 24.0))
-    found = fit_drivers(below_most, paths_of(sequences, 0.2), "none", pairs=0).estimate
-    assert found.converged
-    assert np.exp(found.theta[0]) == pytest.approx(24.0)
-    products = found.marginal.agents.sum(0)
+    population = fit_drivers(below_most, paths_of(sequences, 0.2), "none", pairs=0).estimate
+    assert population.converged
+    assert np.exp(population.theta[0]) == pytest.approx(24.0)
+    products = population.marginal.agents.sum(0)
     slope = products[1:, 0]  # of the log likelihood
     assert slope[0] > 0
     assert abs(slope[1]) < 0.02 * np.sqrt(products[2, 2])
@@ -237,6 +248,6 @@ def test_positions_apart_in_time_have_the_same_starts_and_parameters() -> None:
     np.testing.assert_allclose(
         apart.starting_from(everything).start, every.starting_from(everything).start
     )
-    found = fit_drivers(law(), apart, "none")
-    deviation = 1 / np.sqrt(np.diag(found.marginal.information))
-    assert (np.abs(found.estimate.theta - np.log([V0, LENGTH])) < 4 * deviation).all()
+    population = fit_drivers(law(), apart, "none")
+    deviation = 1 / np.sqrt(np.diag(population.marginal.information))
+    assert (np.abs(population.estimate.theta - np.log([V0, LENGTH])) < 4 * deviation).all()

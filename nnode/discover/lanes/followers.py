@@ -46,6 +46,7 @@ from nnode.population.drivers import (
     fit_drivers,
     initial_variances,
     refit,
+    simulated_biases,
     with_smaller_errors,
 )
 from nnode.population.estimate import fit_deviations
@@ -55,7 +56,6 @@ from nnode.population.followers import (
     Paths,
     Push,
     paths_of,
-    score_biases,
     simulated_pairs,
 )
 from nnode.population.likelihood import PushNoise, Whitening, marginal
@@ -325,10 +325,10 @@ class FollowersEngine(TrafficEngine):
 
     def biases(self, system: System, row: Tensor, seed: int) -> np.ndarray:
         """``(R, K)`` biases of a model's parameters, in their units, see
-        :func:`~nnode.population.followers.score_biases`."""
+        :func:`~nnode.population.drivers.simulated_biases`."""
         population = self._deviations_under(system, row)
         model, theta = population.model, population.estimate.theta
-        biases = score_biases(model, PushNoise(), population.estimate, seed, PAIRS)
+        biases, _ = simulated_biases(population, seed, PAIRS)
         return model.natural(theta) - model.natural(theta - biases)
 
     def _deviations_under(self, system: System, row: Tensor) -> Population:
