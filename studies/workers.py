@@ -20,6 +20,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
+import numpy as np
 import torch
 
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
@@ -60,7 +61,7 @@ def attempt(call: Callable[[], Call]) -> Outcome:
         result = function(**arguments)
         if not isinstance(result, dict):
             raise TypeError(f"{function.__qualname__} returned {type(result).__name__}, not a dict")
-        text = json.dumps(result, ensure_ascii=False, allow_nan=True)
+        text = json.dumps(result, ensure_ascii=False, allow_nan=True, default=_plain)
         return Outcome(text, seconds=time.perf_counter() - start)
     except Interrupted:
         raise
@@ -69,6 +70,13 @@ def attempt(call: Callable[[], Call]) -> Outcome:
     except Exception as error:
         text = f"{type(error).__name__}: {error}"
         return Outcome(error=text, trace=traceback.format_exc())
+
+
+def _plain(value: object) -> Any:
+    """Arrays and NumPy's numbers as JSON has them."""
+    if isinstance(value, np.ndarray | np.generic | torch.Tensor):
+        return value.tolist()
+    raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
 
 
 def calls_here(

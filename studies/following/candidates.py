@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,48 +39,50 @@ _REMEMBERING: dict[str, Any] = {
 }
 
 
-def ballistic(law: Mapping[str, Any]) -> dict[str, Any]:
-    """A law's description with the steps of the published comparisons, ballistic ones of 0.1 s
-    (Treiber & Kanagaraj 2015), in place of Runge and Kutta's; maps keep their own steps."""
-    return {**law, "step": "ballistic"} if law.get("step") == "rk4" else dict(law)
-
-
 @dataclass(frozen=True)
 class Candidate:
-    """A law of :data:`nnode.model.laws.CAR_FOLLOWING_LAWS` and what is added to it.
+    """A law, and what is added to it.
 
     Attributes:
         law: its name.
         effects: of the catalogue.
         network: neurons of a network beside the law; None: none, or the law's own.
+        description: of the law; None: that of :data:`nnode.model.laws.CAR_FOLLOWING_LAWS`.
     """
 
     law: str
     effects: tuple[str, ...] = ()
     network: int | None = None
-    given: Mapping[str, Any] | None = field(default=None, compare=False)
-
-    @property
-    def name(self) -> str:
-        """As pages show it."""
-        beside = () if self.network is None or self.given else (f"network {self.network}",)
-        return " + ".join((self.law, *self.effects, *beside)).replace("_", " ")
+    description: Mapping[str, Any] | None = None
 
     def system(self, seed: int = 0) -> System:
-        """The model behind a measured leader; weights of a network depend on the seed."""
+        """The model behind a measured leader; weights of a network depend on the seed.
+
+        In place of Runge and Kutta's steps it has those of the published comparisons, ballistic
+        ones of 0.1 s (Treiber & Kanagaraj 2015). Maps keep their own steps.
+        """
+        law = dict(self.description or CAR_FOLLOWING_LAWS[self.law])
+        if law.get("step") == "rk4":
+            law["step"] = "ballistic"
         return build_model(
             {
                 "term": "formula",
                 "name": self.law,
                 "leader": "measured",
-                "law": ballistic(
-                    CAR_FOLLOWING_LAWS[self.law] if self.given is None else self.given
-                ),
+                "law": law,
                 "network": NEURONS.get(self.law, self.network),
                 "effects": [{"name": effect} for effect in self.effects],
             },
             seed=seed,
         )
+
+
+def candidate(name: str) -> Candidate:
+    """The law and the effects of a name such as ``idm + reaction delay + network 4``."""
+    law, *added = name.replace(" ", "_").split("_+_")
+    neurons = [int(part.removeprefix("network_")) for part in added if "network" in part]
+    effects = tuple(part for part in added if "network" not in part)
+    return Candidate(law, effects, *neurons)
 
 
 def published_law(name: str, values: dict[str, float]) -> dict[str, Any]:
@@ -106,40 +108,46 @@ def key(name: str) -> str:
     return name.replace(" + ", "-").replace(" ", "_")
 
 
-def _effects(law: str, *effects: str) -> list[Candidate]:
-    return [Candidate(law, tuple(effect.split("+"))) for effect in effects]
-
-
-#: Two vehicles ahead are not in pairs: looking further ahead is no candidate.
+#: Names to candidates. More than one leader is no candidate, because a pair has one.
 EVERY: dict[str, Candidate] = {
-    one.name: one
-    for one in (
-        *(Candidate(name) for name in CAR_FOLLOWING_LAWS),
-        *_effects("idm", "memory", "inertia", "reaction_delay"),
-        *_effects("helly", "memory", "inertia", "reaction_delay"),
-        *_effects("gipps", "memory"),
-        *_effects("krauss", "memory"),
-        *_effects("fvdm", "reaction_delay"),
-        *_effects("idm", "memory+inertia", "memory+reaction_delay"),
-        *_effects("helly", "memory+inertia", "memory+reaction_delay"),
-        Candidate("idm", network=4),
-        Candidate("idm", ("memory",), 4),
-        Candidate("helly", ("memory",), 4),
-        Candidate("remembering_network", network=4, given=_REMEMBERING),
-    )
+    **{
+        name: candidate(name)
+        for name in (
+            *CAR_FOLLOWING_LAWS,
+            "idm + memory",
+            "idm + inertia",
+            "idm + reaction delay",
+            "helly + memory",
+            "helly + inertia",
+            "helly + reaction delay",
+            "gipps + memory",
+            "krauss + memory",
+            "fvdm + reaction delay",
+            "idm + memory + inertia",
+            "idm + memory + reaction delay",
+            "helly + memory + inertia",
+            "helly + memory + reaction delay",
+            "idm + network 4",
+            "idm + memory + network 4",
+            "helly + memory + network 4",
+        )
+    },
+    "remembering network": Candidate(
+        "remembering_network", network=4, description=_REMEMBERING
+    ),
 }
 
 #: What others are compared with.
 REFERENCE = "idm"
 
 
-def starts(candidate: Candidate, cost: ResidualProblem, number: int, seed: int) -> np.ndarray:
+def starts(model: Candidate, cost: ResidualProblem, number: int, seed: int) -> np.ndarray:
     """``(number, P)`` rows: the shelf's own values, then random ones within the limits.
 
     Weights of networks are drawn as models draw them, those beside a law start at 0 in their
     last layer.
     """
-    systems = (candidate.system(seed + i) for i in range(number))
+    systems = (model.system(seed + i) for i in range(number))
     rows = (ParameterVector(system, cost.vector.places).row.numpy() for system in systems)
     return random_starts(cost, rows, seed)
 

@@ -103,30 +103,24 @@ def profiles(
     return figure
 
 
-def equilibria(
-    speeds: np.ndarray,
-    gaps: Mapping[str, np.ndarray],
-    measured: tuple[np.ndarray, np.ndarray],
-    length: float,
-) -> Figure:
+def equilibria(gaps: pd.DataFrame, measured: pd.DataFrame, length: float) -> Figure:
     """Equilibrium gap by speed, and flow by density, of laws over nearly even driving.
 
     Args:
-        speeds: m/s.
-        gaps: law to equilibrium gaps, m.
-        measured: speeds (m/s) and gaps (m) of samples at nearly even driving.
+        gaps: equilibrium gaps (m), a column per law, indexed by speed (m/s).
+        measured: samples at nearly even driving: speed ``v`` (m/s) and ``gap`` (m).
         length: of a vehicle, m.
     """
     figure = new_figure(8.6, 3.5)
     left, right = figure.subplots(1, 2)
-    v, s = measured
+    speeds, v, s = gaps.index.to_numpy(), measured["v"], measured["gap"]
     for ax, x, y in ((left, v, s), (right, 1e3 / (s + length), 3.6e3 * v / (s + length))):
         ax.plot(x, y, ".", color=GREY, markersize=1.5, alpha=0.25, rasterized=True)
     for i, (name, gap) in enumerate(gaps.items()):
         style = {**curve_style(i), "marker": "", "linewidth": 1.5}
         left.plot(speeds, gap, **style, label=name)
         right.plot(1e3 / (gap + length), 3.6e3 * speeds / (gap + length), **style)
-    left.set(xlim=(0, float(speeds.max())), ylim=(0, float(np.quantile(s, 0.998))))
+    left.set(xlim=(0, speeds.max()), ylim=(0, s.quantile(0.998)))
     right.set(xlim=(0, 180), ylim=(0, 3000))
     dress(left, x="speed (m/s)", y="gap (m)")
     dress(right, x="density (vehicles/km)", y="flow (vehicles/h)")

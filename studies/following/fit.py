@@ -8,7 +8,6 @@ import numpy as np
 
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.intervals import at_bounds
-from nnode.calibrate.least_squares import Minimum
 from nnode.calibrate.pooling import best_alone
 from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.clusters import folds as by_cluster
@@ -19,8 +18,14 @@ from studies.following.candidates import EVERY, Candidate, decay, published_law,
 
 Result = dict[str, Any]
 
-#: What is reported, whichever of them is minimised.
-OBJECTIVES = ("spacing", "gap", "relative_gap", "log_gap", "speed")
+#: What is reported, whichever of them is minimised, with its unit.
+OBJECTIVES = {
+    "spacing": "gap, RMSE (m)",
+    "gap": "gap, MSE (m²)",
+    "relative_gap": "relative gap, MSE",
+    "log_gap": "log of the gap, MSE",
+    "speed": "speed, MSE (m²/s²)",
+}
 #: A calibration ends after so many steps, or when one lowers the cost by less than this share.
 STEPS, TOLERANCE = 60, 1e-7
 
@@ -36,14 +41,13 @@ def calibrated(
     restarts: int,
     seed: int,
     weights: np.ndarray | None = None,
-) -> tuple[Minimum, list[float]]:
-    """The best of several starts, and the costs of all, penalty included."""
+) -> np.ndarray:
+    """``(P,)`` parameters of the best of several starts, penalty included."""
     fits = [
         pooled(cost, row, weights, penalty=decay(cost), steps=STEPS, tolerance=TOLERANCE)
         for row in starts(candidate, cost, restarts, seed)
     ]
-    all_costs = [float(fit.cost) for fit in fits]
-    return fits[int(np.argmin(all_costs))], all_costs
+    return min(fits, key=lambda fit: float(fit.cost)).row
 
 
 def named(cost: ResidualProblem, row: np.ndarray) -> dict[str, float]:
@@ -61,58 +65,56 @@ def at_limits(cost: ResidualProblem, row: np.ndarray) -> list[str]:
     return [name for name, bound in zip(named(cost, row), bounds, strict=True) if bound]
 
 
+def _costs_by_objective(name: str, folder: str) -> dict[str, ResidualProblem]:
+    """The costs of a candidate on the training pairs, by objective."""
+    batch = data.batch(folder)
+    return {one: costs_of(EVERY[name], batch, one) for one in OBJECTIVES}
+
+
 def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int) -> Result:
     """Calibrate on all training pairs, and, from half the starts, on those outside each fold.
 
     Returns:
-        Costs by objective of all training pairs, and of those that were held out.
+        Costs of all training pairs, and costs by objective of those that were held out.
     """
-    candidate, batch = EVERY[name], data.batch(folder)
+    candidate, costs = EVERY[name], _costs_by_objective(name, folder)
+    cost = costs["spacing"]
     label = data.labels(data.pairs(folder))
     fold = by_cluster(label, folds, seed)
-    cost = costs_of(candidate, batch)
-    others = {one: costs_of(candidate, batch, one) for one in OBJECTIVES}
-    whole, start_costs = calibrated(candidate, cost, restarts, seed)
-    held = {one: np.zeros(len(batch)) for one in OBJECTIVES}
+    whole = calibrated(candidate, cost, restarts, seed)
+    heldout = {one: np.zeros(len(label)) for one in OBJECTIVES}
     for k in range(folds):
         weights = (fold != k) / (fold != k).sum()
-        row = calibrated(candidate, cost, max(1, restarts // 2), seed, weights)[0].row
-        for one, values in held.items():
-            values[fold == k] = others[one].costs(row)[fold == k]
+        row = calibrated(candidate, cost, max(1, restarts // 2), seed, weights)
+        for one, values in heldout.items():
+            values[fold == k] = costs[one].costs(row)[fold == k]
     return {
-        "parameters": named(cost, whole.row),
-        "row": whole.row.tolist(),
-        "limits": at_limits(cost, whole.row),
-        "starts": start_costs,
-        "train": {one: others[one].costs(whole.row).tolist() for one in OBJECTIVES},
-        "heldout": {one: values.tolist() for one, values in held.items()},
-        "clusters": label.tolist(),
+        "parameters": named(cost, whole),
+        "row": whole,
+        "limits": at_limits(cost, whole),
+        "train": cost.costs(whole),
+        "heldout": heldout,
+        "clusters": label,
     }
 
 
 def floor(folder: str, name: str, restarts: int, seed: int) -> Result:
     """Every training pair with parameters of its own."""
-    candidate, batch = EVERY[name], data.batch(folder)
-    cost = costs_of(candidate, batch)
-    centre = calibrated(candidate, cost, 1, seed)[0].row
+    candidate = EVERY[name]
+    cost = costs_of(candidate, data.batch(folder))
+    centre = calibrated(candidate, cost, 1, seed)
     rows, costs = best_alone(cost, (centre, *starts(candidate, cost, restarts, seed)))
-    return {
-        "names": list(named(cost, centre)),
-        "rows": rows.tolist(),
-        "costs": costs.tolist(),
-        "limits": [at_limits(cost, row) for row in rows],
-    }
+    return {"costs": costs, "limits": [at_limits(cost, row) for row in rows]}
 
 
 def objectives(folder: str, name: str, restarts: int, seed: int) -> Result:
     """All objectives on the training pairs, whichever is minimised."""
-    candidate, batch = EVERY[name], data.batch(folder)
-    costs = {one: costs_of(candidate, batch, one) for one in OBJECTIVES}
+    costs = _costs_by_objective(name, folder)
     by_objective: Result = {}
     for one, cost in costs.items():
-        row = calibrated(candidate, cost, restarts, seed)[0].row
+        row = calibrated(EVERY[name], cost, restarts, seed)
         by_objective[one] = {
-            "reached": {other: float(costs[other].costs(row).mean()) for other in OBJECTIVES},
+            "reached": {other: costs[other].costs(row).mean() for other in OBJECTIVES},
             "parameters": named(cost, row),
             "limits": at_limits(cost, row),
         }
@@ -121,21 +123,19 @@ def objectives(folder: str, name: str, restarts: int, seed: int) -> Result:
 
 def tested(folder: str, name: str, row: list[float]) -> Result:
     """Costs of the test pairs."""
-    batch = data.batch(folder, test=True)
-    return {
-        one: costs_of(EVERY[name], batch, one).costs(np.array(row)).tolist() for one in OBJECTIVES
-    }
+    cost = costs_of(EVERY[name], data.batch(folder, test=True))
+    return {"costs": cost.costs(np.array(row))}
 
 
 def reproduced(folder: str) -> Result:
     """Costs of the test pairs, m, of the published parameters; the first sample counts as well."""
     batch = data.batch(folder, test=True)
-    seen = batch.valid[:, :, 0].sum(0).numpy()
-    first = np.sqrt((seen - 1) / seen)
+    samples = batch.valid[:, :, 0].sum(0).numpy()
+    first = np.sqrt((samples - 1) / samples)
     errors: Result = {}
     for law, parameters in printed.parameters.items():
         for k, objective in enumerate(printed.objectives):
             values = {name: each[k] for name, each in parameters.items()}
-            cost = costs_of(Candidate(law, given=published_law(law, values)), batch)
-            errors[f"{law} {objective}"] = (cost.costs(cost.start) * first).tolist()
+            cost = costs_of(Candidate(law, description=published_law(law, values)), batch)
+            errors[f"{law} {objective}"] = cost.costs(cost.start) * first
     return errors

@@ -28,34 +28,25 @@ def by_leader(folder: str, name: str, restarts: int, seed: int) -> Result:
         out, ``both`` calibrated on all of its other clusters.
     """
     pairs = sequences(folder)
-    batch = collate(pairs)
     kind = np.array([pair.kind[1] if pair.kind else "" for pair in pairs])
     label = data.labels(pairs)
-    cost = costs_of(EVERY[name], batch)
-    sides = {"both": np.ones(len(pairs), dtype=bool), **{k: kind == k for k in KINDS}}
-
-    def fitted(keep: np.ndarray, restarts: int) -> np.ndarray:
-        return calibrated(EVERY[name], cost, restarts, seed, keep / keep.sum())[0].row
-
-    whole = {side: fitted(keep, restarts) for side, keep in sides.items()}
-    without: dict[str, list[list[float]]] = {side: [] for side in sides}
-    heldout = {side: np.zeros(len(pairs)) for side in sides}
-    for g in range(int(label.max()) + 1):
-        for side, keep in sides.items():
-            row = fitted(keep & (label != g), 1)
-            without[side].append(row.tolist())
-            heldout[side][label == g] = cost.costs(row)[label == g]
-    speed = [float(np.mean(pair.velocity()[:, 0])) for pair in pairs]
-    return {
-        "names": list(named(cost, whole["both"])),
-        "kinds": kind.tolist(),
-        "clusters": label.tolist(),
-        "rows": {side: row.tolist() for side, row in whole.items()},
-        "without": without,
-        "costs": {side: cost.costs(row).tolist() for side, row in whole.items()},
-        "heldout": {side: values.tolist() for side, values in heldout.items()},
-        "speed": speed,
-        "gap": [float(data.gap_of(pair).mean()) for pair in pairs],
+    cost = costs_of(EVERY[name], collate(pairs))
+    result: Result = {"rows": {}, "without": {}, "heldout": {}}
+    for side in ("both", *KINDS):
+        keep = np.full(len(pairs), side == "both") | (kind == side)
+        result["rows"][side] = calibrated(EVERY[name], cost, restarts, seed, keep / keep.sum())
+        result["without"][side] = without = []
+        result["heldout"][side] = heldout = np.zeros(len(pairs))
+        for g in range(label.max() + 1):
+            kept = keep & (label != g)
+            without.append(calibrated(EVERY[name], cost, 1, seed, kept / kept.sum()))
+            heldout[label == g] = cost.costs(without[-1])[label == g]
+    return result | {
+        "names": list(named(cost, cost.start)),
+        "kinds": kind,
+        "clusters": label,
+        "speed": [np.mean(pair.velocity()[:, 0]) for pair in pairs],
+        "gap": [data.gap_of(pair).mean() for pair in pairs],
     }
 
 

@@ -12,24 +12,19 @@ from nnode.calibrate.pooling import best_alone
 from nnode.calibrate.problem import ResidualProblem
 from nnode.data.sequence import Batch, Sequence, collate
 from studies.following import data, printed
-from studies.following.candidates import Candidate, decay, published_law, starts
+from studies.following.candidates import Candidate, candidate, decay, published_law, starts
 from studies.following.data import gap_of
 from studies.following.fit import STEPS, TOLERANCE, at_limits, costs_of, named
 from studies.stores import sequences
 
 Result = dict[str, Any]
 
-#: Laws that are tried on commercial cars, and what is added to those that say an acceleration.
-LAWS = ("idm", "gipps", "ovm", "fvdm", "helly", "krauss", "newell", "a2", "a4")
-LATE = ("inertia", "reaction_delay")
-CANDIDATES = {
-    one.name: one
-    for law in LAWS
-    for one in (
-        Candidate(law),
-        *(Candidate(law, (e,)) for e in LATE if law not in ("krauss", "newell", "a2", "a4")),
-    )
-}
+#: Laws that are tried on commercial cars, those of accelerations also with what delays them.
+ACCELERATIONS = ("idm", "gipps", "ovm", "fvdm", "helly")
+CANDIDATES = [
+    *(f"{law}{added}" for law in ACCELERATIONS for added in ("", " + inertia", " + reaction delay")),
+    *("krauss", "newell", "a2", "a4"),
+]
 
 
 def followers(folder: str, run: str | None = None) -> list[Sequence]:
@@ -42,14 +37,15 @@ def followers(folder: str, run: str | None = None) -> list[Sequence]:
     ]
 
 
-def own_rows(
-    candidate: Candidate, batch: Batch, restarts: int, seed: int
-) -> tuple[ResidualProblem, np.ndarray, np.ndarray]:
-    """Every pair by itself: the cost, ``(B, P)`` best rows of several starts, ``(B,)`` costs."""
-    cost = costs_of(candidate, batch)
-    begin = starts(candidate, cost, restarts, seed)
+def separate_rows(
+    name: str, batch: Batch, restarts: int, seed: int
+) -> tuple[ResidualProblem, np.ndarray]:
+    """The cost, and ``(B, P)`` the best rows of several starts, separately for every pair."""
+    law = candidate(name)
+    cost = costs_of(law, batch)
+    begin = starts(law, cost, restarts, seed)
     rows, _ = best_alone(cost, begin, steps=STEPS, tolerance=TOLERANCE, penalty=decay(cost))
-    return cost, rows, cost.costs(rows)
+    return cost, rows
 
 
 def reproduced(folder: str) -> Result:
@@ -59,10 +55,10 @@ def reproduced(folder: str) -> Result:
     for pair in followers(folder, printed.platoon):
         make = pair.agents[0]
         values = printed.platoon_parameters[make]
-        law = Candidate("ovm", given=published_law("ovm", values))
+        law = Candidate("ovm", description=published_law("ovm", values))
         last_part = pair.part(printed.first, 1.0)
         cost = costs_of(law, collate([last_part]))
-        by_make["law"][make] = float(cost.costs(cost.start)[0])
+        by_make["law"][make] = cost.costs(cost.start)[0]
         by_make["stopped"][make] = collided(last_part, values)
     return by_make
 
@@ -98,37 +94,32 @@ def compare(folder: str, name: str, restarts: int, seed: int) -> Result:
         By follower ``chosen``: errors on the last 30 % of the first part, calibrated on what
         stands before; ``train`` and ``heldout``: calibrated on the whole first part. m.
     """
-    candidate = CANDIDATES[name]
-    pairs = followers(folder, printed.platoon)
-    first = printed.first
+    pairs, first = followers(folder, printed.platoon), printed.first
 
     def share(low: float, high: float) -> Batch:
         return collate([pair.part(low, high) for pair in pairs])
 
-    _, rows, _ = own_rows(candidate, share(0.0, first**2), restarts, seed)
-    chosen = costs_of(candidate, share(first**2, first)).costs(rows)
-    cost, rows, train = own_rows(candidate, share(0.0, first), restarts, seed)
-    heldout = costs_of(candidate, share(first, 1.0)).costs(rows)
+    _, rows = separate_rows(name, share(0.0, first**2), restarts, seed)
+    chosen = costs_of(candidate(name), share(first**2, first)).costs(rows)
+    cost, rows = separate_rows(name, share(0.0, first), restarts, seed)
     return {
         "makes": [pair.agents[0] for pair in pairs],
-        "chosen": chosen.tolist(),
-        "train": train.tolist(),
-        "heldout": heldout.tolist(),
-        "parameters": [named(cost, row) for row in rows],
+        "chosen": chosen,
+        "train": cost.costs(rows),
+        "heldout": costs_of(candidate(name), share(first, 1.0)).costs(rows),
         "limits": [at_limits(cost, row) for row in rows],
     }
 
 
 def every_run(folder: str, name: str, restarts: int, seed: int) -> Result:
     """One law on every follower of every run, each by itself."""
-    candidate = CANDIDATES[name]
     pairs = followers(folder)
-    cost, rows, costs = own_rows(candidate, collate(pairs), restarts, seed)
+    cost, rows = separate_rows(name, collate(pairs), restarts, seed)
     return {
         "runs": [pair.recording for pair in pairs],
         "makes": [pair.agents[0] for pair in pairs],
         "settings": [str(pair.group[0]) if pair.group else "" for pair in pairs],
-        "costs": costs.tolist(),
+        "costs": cost.costs(rows),
         "parameters": [named(cost, row) for row in rows],
         "limits": [at_limits(cost, row) for row in rows],
     }

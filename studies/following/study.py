@@ -9,10 +9,11 @@ import pandas as pd
 
 from nnode.data.store import Store
 from nnode.pages.page import Block
-from studies.following import fit, inference, leaders, platoons
-from studies.following.candidates import EVERY, REFERENCE, key
+from studies.following import fit, inference, leaders, platoons, printed
+from studies.following.candidates import DECAY, EVERY, REFERENCE, key
 from studies.following.data import LEADERS, PAIRS, PLATOONS, stores
-from studies.following.results import Study
+from studies.following.fit import OBJECTIVES
+from studies.following.results import EVEN, SWING, Study
 from studies.frame import computed
 from studies.options import FollowingStudyOptions
 from studies.page import page
@@ -43,13 +44,30 @@ def run(options: FollowingStudyOptions, folder: Path) -> list[Block]:
         return computed(tasks, folder, options, prepared, title)
 
     study = Study(options, prepared, run_all(training(options, prepared), "cross-validation"))
-    more = run_all(after(study), "test, precision, platoons")
-    study.results = pd.concat([study.results, more])
-    return page("following", study.tables(), study.figures(), prepared.values(), **study.values())
+    results = run_all(after(study), "test, precision, platoons")
+    study.results = pd.concat([study.results, results])
+    return blocks(study)
+
+
+def blocks(study: Study) -> list[Block]:
+    """The page."""
+    return page(
+        "following",
+        study,
+        study.stores.values(),
+        reference=REFERENCE,
+        key=key,
+        decay=DECAY,
+        left=[name for name in EVERY if name not in study.order],
+        objectives=list(OBJECTIVES),
+        even=EVEN,
+        swing=SWING,
+        run=printed.platoon,
+    )
 
 
 def training(options: FollowingStudyOptions, prepared: Mapping[str, Store]) -> list[Task]:
-    """What chooses a law: nothing here sees a test pair."""
+    """What chooses a law: nothing here depends on a test pair."""
     where = {"folder": str(prepared[PAIRS].folder), "folds": options.folds}
     where |= {"restarts": options.restarts, "seed": options.seed}
     return [
@@ -72,7 +90,7 @@ def after(study: Study) -> list[Task]:
     )
     search = {"restarts": options.restarts, "seed": options.seed}
     idm = {"name": REFERENCE, **search}
-    rows = study.of("cross_validate")["row"]
+    rows = study.calibrated["row"]
     folds = {"row": rows[REFERENCE], "folds": options.folds}
     tasks = [
         Task("reproduced-pairs", fit.reproduced, pairs),
@@ -82,8 +100,8 @@ def after(study: Study) -> list[Task]:
         Task("leaders", leaders.by_leader, road | idm, cost=6.0),
         Task("runs", platoons.every_run, track | idm, cost=8.0),
     ]
-    for name in study.names:
-        own = pairs | {"name": name, "row": rows[name]}
+    for name, row in rows.items():
+        own = pairs | {"name": name, "row": row}
         tasks.append(Task(f"test-{key(name)}", fit.tested, own))
         if name in study.chosen:
             where = pairs | {"name": name} | search

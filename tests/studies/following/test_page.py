@@ -16,10 +16,9 @@ from studies.following.candidates import EVERY, key
 from studies.following.data import LEADERS, PAIRS, PLATOONS
 from studies.following.fit import OBJECTIVES, named
 from studies.following.results import Study
-from studies.following.study import after, training
+from studies.following.study import after, blocks, training
 from studies.frame import tidy
 from studies.options import FollowingStudyOptions
-from studies.page import page
 from studies.runner import Task
 from tests.studies.following.test_fit import driven
 
@@ -52,10 +51,10 @@ def invented() -> dict[str, dict[str, Any]]:
             "parameters": values,
             "limits": [],
             "clusters": [0, 0, 1, 1, 2, 2],
-            "train": {o: (noise + held - 0.5).tolist() for o in OBJECTIVES},
+            "train": (noise + held - 0.5).tolist(),
             "heldout": {o: (noise + held).tolist() for o in OBJECTIVES},
         }
-        found[f"test-{key(name)}"] = {o: (noise + test).tolist() for o in OBJECTIVES}
+        found[f"test-{key(name)}"] = {"costs": (noise + test).tolist()}
         found[f"objectives-{key(name)}"] = {
             o: {
                 "reached": {x: 1.0 + (x != o) for x in OBJECTIVES},
@@ -144,8 +143,8 @@ def study(monkeypatch: pytest.MonkeyPatch) -> Study:
 
 @pytest.mark.thorough
 def test_tables_hold_what_was_found(study: Study, tmp_path: Path) -> None:
-    blocks = page("following", study.tables(), study.figures(), **study.values())
-    tables = {b.name: b.frame for b in blocks if isinstance(b, TableBlock)}
+    placed = blocks(study)
+    tables = {b.name: b.frame for b in placed if isinstance(b, TableBlock)}
     assert study.order == ["idm + memory", "helly", "idm"] == list(tables["candidates"].index)
     away = tables["candidates"].loc["idm + memory", ["minus idm", "from", "to"]]
     assert list(away) == pytest.approx([-1.0, -1.0, -1.0])
@@ -160,7 +159,7 @@ def test_tables_hold_what_was_found(study: Study, tmp_path: Path) -> None:
     assert tables["time_gaps"].loc["ACC, min", "median"] == pytest.approx(0.9)
     ends = tables["leaders"][["from", "to"]].astype(float).prod(axis=1)
     assert list(ends.index[ends > 0]) == ["T", "a", "b"]
-    paths = write_page(blocks, tmp_path, title="Car following")
+    paths = write_page(placed, tmp_path, title="Car following")
     assert all(path.stat().st_size for path in paths)
 
 
