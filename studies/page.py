@@ -1,11 +1,11 @@
-"""A study's page: a template in Markdown that places tables, figures and a player.
+"""A study's page: a template in Markdown that places tables, figures and a player of sequences.
 
-A template ``studies/<name>/page.md.j2`` is text with headings of level 2 to 4. The results of the study
-are its variable ``study``. A block call makes a table or a figure, and its body is the caption::
+A template ``studies/<name>/page.md.j2`` is text with headings of level 2 to 4. The results of the
+study are its variable ``study``. A call makes a table or a figure, and its body is the caption::
 
-    {% call table("costs", study.costs(), digits={"p": 3}, least=["held out"]) %}Cost (m² s).{% endcall %}
-    {% call figure("laws", study.draw_laws(), "Ten panels of speed against gap.") %}Speed.{% endcall %}
-    {{ place(study.replay()) }}
+    {% call table("costs", study.costs(), digits={"p": 3}) %}Mean cost (m² s).{% endcall %}
+    {% call figure("laws", study.draw_laws(), "Ten panels of curves.") %}Speed by gap.{% endcall %}
+    {% call player(study.scenes(), 100) %}Pairs as simulated by idm.{% endcall %}
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 from nnode.data.store import Store
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
+from nnode.pages.replay import ReplayBlock, Scene
 from nnode.pages.tables import DIGITS, number
 
 #: Lines that are a heading, or that stand for a placed block.
@@ -67,6 +68,14 @@ def page(
     def figure(name: str, drawn: Figure, alt: str, *, caller: Callable[[], str]) -> str:
         return place(FigureBlock(name, drawn, _line(caller()), alt))
 
+    def player(scenes: list[Scene], total: int, *, caller: Callable[[], str]) -> str:
+        caption = (
+            f"{_line(caller())} Outlines are measured agents. Arrows lead from the simulated to "
+            "the measured position. The player opens on the sequence with the median error."
+        )
+        alt = f"Player of {len(scenes)} sequences: agents as measured and as simulated."
+        return place(ReplayBlock("replay", scenes, caption, alt, total=total))
+
     environment = Environment(
         loader=PackageLoader("studies", name),
         undefined=StrictUndefined,
@@ -76,7 +85,7 @@ def page(
     )
     environment.filters["digits"] = number
     text = environment.get_template("page.md.j2").render(
-        table=table, figure=figure, place=place, study=study, **constants
+        table=table, figure=figure, player=player, study=study, **constants
     )
     blocks: list[Block] = []
     for part in map(str.strip, _SEPARATE.split(text)):

@@ -61,8 +61,8 @@ def fit(
     )
     each = costs(model, row, batch)
     return {
-        "row": row.tolist(),
-        "J": float(each.mean()),
+        "row": row,
+        "J": each.mean(),
         "evaluations": evaluations,
         "train": _by_name(batch, each),
         "heldout": _of(model, row, chosen(folder, held)) if held else {},
@@ -85,7 +85,7 @@ def resample(folder: str, row: list[float], draws: int, first: int, last: int, s
         refit, _ = calibrate(
             "sf", batch, np.array(row), grow=False, weights=weights[drawn], steps=REFIT
         )
-        rows.append(refit.tolist())
+        rows.append(refit)
     return {"rows": rows}
 
 
@@ -104,13 +104,8 @@ def transfer(folder: str, rows: dict[str, list[float]]) -> Result:
     by_recording: Result = {}
     for recording in dict.fromkeys(s.recording for s in every):
         batch = collate(s for s in every if s.recording == recording)
-        by_recording[recording] = {
-            "people": batch.agent.sum(1).tolist(),
-            "costs": {
-                **{kind: _of(KINDS[kind], row, batch) for kind, row in rows.items()},
-                **_simple(batch),
-            },
-        }
+        costs_by_kind = {kind: _of(KINDS[kind], row, batch) for kind, row in rows.items()}
+        by_recording[recording] = {**costs_by_kind, **_simple(batch)}
     return {"runs": by_recording}
 
 

@@ -132,9 +132,7 @@ EVERY: dict[str, Candidate] = {
             "helly + memory + network 4",
         )
     },
-    "remembering network": Candidate(
-        "remembering_network", network=4, description=_REMEMBERING
-    ),
+    "remembering network": Candidate("remembering_network", network=4, description=_REMEMBERING),
 }
 
 #: What others are compared with.

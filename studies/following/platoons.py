@@ -22,7 +22,11 @@ Result = dict[str, Any]
 #: Laws that are tried on commercial cars, those of accelerations also with what delays them.
 ACCELERATIONS = ("idm", "gipps", "ovm", "fvdm", "helly")
 CANDIDATES = [
-    *(f"{law}{added}" for law in ACCELERATIONS for added in ("", " + inertia", " + reaction delay")),
+    *(
+        f"{law}{added}"
+        for law in ACCELERATIONS
+        for added in ("", " + inertia", " + reaction delay")
+    ),
     *("krauss", "newell", "a2", "a4"),
 ]
 

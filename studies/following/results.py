@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
 from nnode.model.system import System
-from nnode.pages.replay import ReplayBlock
+from nnode.pages.replay import Scene
 from nnode.plots.style import thinned
 from studies.following import data, figures, leaders, printed, stability
 from studies.following.candidates import EVERY, REFERENCE
@@ -22,7 +22,7 @@ from studies.following.data import gap_of
 from studies.following.fit import OBJECTIVES, costs_of
 from studies.frame import by_number, by_unit, differences, versus
 from studies.options import FollowingStudyOptions
-from studies.replay import player, scenes
+from studies.replay import scenes
 
 #: Speeds at which platoons are examined, m/s; the drawn speed, and the drawn period, s.
 SPEEDS, SWING = (3.0, 6.0, 9.0, 12.0), (6.0, 60.0)
@@ -188,7 +188,9 @@ class Study:
             ]
         if len(row) > MANY:
             return table
-        return table.assign(**{f"r({n})": r for n, r in zip(table.index, one["correlation"], strict=True)})
+        return table.assign(
+            **{f"r({n})": r for n, r in zip(table.index, one["correlation"], strict=True)}
+        )
 
     def profiled(self, name: str) -> bool:
         """Whether the profiles of a candidate are drawn."""
@@ -343,7 +345,11 @@ class Study:
     def equilibrium_gaps(self) -> pd.DataFrame:
         table = self.equilibria(SPEEDS, self.figured)
         v, gap = self.even_driving["v"], self.even_driving["gap"]
-        for name, q in (("measured, median", 0.5), ("quarter below", 0.25), ("quarter above", 0.75)):
+        for name, q in (
+            ("measured, median", 0.5),
+            ("quarter below", 0.25),
+            ("quarter above", 0.75),
+        ):
             table[name] = [gap[(v - speed).abs() < 0.5].quantile(q) for speed in SPEEDS]
         return table
 
@@ -354,7 +360,7 @@ class Study:
 
     @cached_property
     def slopes(self) -> dict[tuple[str, float], tuple[float, stability.Slopes]]:
-        """Equilibrium gap and slopes there by candidate and speed, where there is an equilibrium."""
+        """Equilibrium gap, and slopes there, by candidate and speed; only where it exists."""
         gaps = self.equilibria(SPEEDS, self.continuous)
         return {
             (name, v): (gap, stability.slopes(self.systems[name], gap, v, self.length))
@@ -392,14 +398,10 @@ class Study:
                 along[name] = (swing / swing[0], theory ** np.arange(len(swing)))
         return figures.amplification(gains, stability.FREQUENCIES, along)
 
-    def replay(self) -> ReplayBlock:
-        pairs = self.pairs(test=True)
+    def scenes(self) -> list[Scene]:
+        """Test pairs of the player."""
         systems = {name: self.systems[name] for name in self.chosen}
-        what = (
-            f"Test pairs with the measured leader, as measured and as simulated by "
-            f"{' and '.join(systems)}, which are calibrated to all training pairs."
-        )
-        return player(scenes(thinned(pairs, FEW), systems), what, len(pairs))
+        return scenes(thinned(self.pairs(test=True), FEW), systems)
 
 
 def _units(names: list[str]) -> list[str]:

@@ -61,15 +61,21 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
             one = {"law": law, "desired": "direction", **where}
             every.append(Task(f"{law}-{name}", walking.fit, one, cost=10.0))
     results = computed(every, folder, options, prepared, "prediction study")
-    distances = errors_by_run(results.query("task != 'follow'"), SIMPLE | PEOPLE)
-    tables = {"following": _following(results, options.seed)}
-    tables |= {what: _by_scene(distances, what) for what in ("ade", "fde")}
-    people = distances.groupby("run", sort=False)["people"].first().to_dict()
-    times = {"people": people, "seen": SEEN, "ahead": AHEAD, "step": STEP}
-    return page("prediction", tables, {}, prepared.values(), **times)
+    distances = errors_by_run(results["errors"].dropna(), SIMPLE | PEOPLE)
+    return page(
+        "prediction",
+        stores=prepared.values(),
+        following=following(results, options.seed),
+        ade=by_scene(distances, "ade"),
+        fde=by_scene(distances, "fde"),
+        people=distances.groupby("run", sort=False)["people"].first().to_dict(),
+        seen=SEEN,
+        ahead=AHEAD,
+        step=STEP,
+    )
 
 
-def _following(results: pd.DataFrame, seed: int) -> pd.DataFrame:
+def following(results: pd.DataFrame, seed: int) -> pd.DataFrame:
     """Errors of spacings by law, published ones last."""
     rows: dict[str, dict[str, Any]] = {}
     for one in results.query("task == 'follow'").to_dict("records"):
@@ -89,7 +95,7 @@ def _following(results: pd.DataFrame, seed: int) -> pd.DataFrame:
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("law")
 
 
-def _by_scene(distances: pd.DataFrame, what: str) -> pd.DataFrame:
+def by_scene(distances: pd.DataFrame, what: str) -> pd.DataFrame:
     """A distance (m) by law and held-out scene, the published one last."""
     order = distances["law"].unique(), distances["run"].unique()
     table = distances.pivot(index="law", columns="run", values=what).loc[*order]

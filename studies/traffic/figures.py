@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from nnode.data.sequence import Sequence as Recorded
+from nnode.pages.replay import Scene
 from nnode.plots.style import GREY, SMALL_FONT, curve_style, dress, legend_above, new_figure
 from studies.figures import error_bars
 
@@ -44,7 +44,6 @@ def leader_speeds(speeds: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -
 
 
 def law_panels(
-    gaps: Sequence[float],
     speeds: Mapping[str, pd.DataFrame],
     bands: Mapping[str, Mapping[str, np.ndarray]],
     measured: Mapping[str, np.ndarray],
@@ -52,9 +51,8 @@ def law_panels(
     """Speed against gap, one panel per recording, all models.
 
     Args:
-        gaps: m.
-        speeds: recording to m/s, a column per model.
-        bands: recording to model to ``(2, G)`` ends of the interval, m/s.
+        speeds: recording to m/s, a column per model, indexed by the gap, m.
+        bands: recording to model to ``(2, G)`` ends of the interval, m/s; may be empty.
         measured: recording to measured gaps, m; a bar below shows their middle 90 %.
 
     Source: Göttlich & Totzeck, figure (interactionForce).
@@ -62,16 +60,18 @@ def law_panels(
     rows = -(-len(speeds) // 5)
     figure = new_figure(11.0, 2.5 * rows + 0.4)
     axes = figure.subplots(rows, 5, sharex=True, sharey=True, squeeze=False)
-    models: list[str] = []
+    handles: list[Line2D] = []
     for n, (name, table) in enumerate(speeds.items()):
-        ax = axes.flat[n]
-        models = [str(model) for model in table.columns]
-        for i, model in enumerate(models):
+        ax, handles = axes.flat[n], []
+        for i, (model, speed) in enumerate(table.items()):
             style = {**curve_style(i), "marker": ""}
-            ax.plot(gaps, table[model].clip(-1e3, 1e3), linewidth=1.2, **style)
-            if model in bands.get(name, {}):
-                low, high = np.clip(bands[name][model], -1e3, 1e3)
-                ax.fill_between(gaps, low, high, color=style["color"], alpha=0.10, linewidth=0)
+            ax.plot(table.index, speed.clip(-1e3, 1e3), linewidth=1.2, **style)
+            handles.append(Line2D([], [], **style, label=model))
+            if name in bands:
+                low, high = np.clip(bands[name][str(model)], -1e3, 1e3)
+                ax.fill_between(
+                    table.index, low, high, color=style["color"], alpha=0.10, linewidth=0
+                )
         span = np.quantile(measured[name], [0.05, 0.95])
         ax.plot(span, [LIMITS[0] + 1.5] * 2, color=GREY, linewidth=4, solid_capstyle="butt")
         last = n // 5 == rows - 1
@@ -83,10 +83,7 @@ def law_panels(
         )
     for ax in axes.flat[len(speeds) :]:
         ax.set_axis_off()
-    axes[0, 0].set(xlim=(min(gaps), max(gaps)), ylim=LIMITS)
-    handles = [
-        Line2D([], [], **{**curve_style(i), "marker": ""}, label=m) for i, m in enumerate(models)
-    ]
+    axes[0, 0].set(xlim=(table.index.min(), table.index.max()), ylim=LIMITS)
     handles.append(Line2D([], [], color=GREY, linewidth=4, label="middle 90 % of measured gaps"))
     legend_above(figure, handles, len(handles))
     return figure
@@ -109,23 +106,21 @@ def descents(curves: Mapping[str, np.ndarray]) -> Figure:
     return figure
 
 
-def space_time(
-    sequence: Recorded, simulated: Mapping[str, np.ndarray], marked: Sequence[tuple[int, float]]
-) -> Figure:
+def space_time(scene: Scene, marked: Sequence[tuple[int, float]]) -> Figure:
     """One traffic sequence: measured positions and simulated ones.
 
     Args:
-        simulated: model to ``(K, N)`` positions, m.
         marked: vehicles and times (s) at which a fault of the measurement was found.
     """
     figure = new_figure(6.4, 3.8)
     ax = figure.subplots()
+    sequence = scene.sequence
     t = sequence.time - sequence.time[0]
     handles = [Line2D([], [], color=GREY, marker="o", markersize=4, label="measured")]
     ax.plot(t, sequence.x[:, :, 0], color=GREY, marker="o", markersize=4, linewidth=1)
-    for i, (name, x) in enumerate(simulated.items()):
+    for i, (name, x) in enumerate(scene.simulated.items()):
         style = {**curve_style(i), "marker": ""}
-        ax.plot(t, x, **style, linewidth=1.3)
+        ax.plot(t, x[:, :, 0], **style, linewidth=1.3)
         handles.append(Line2D([], [], **style, label=name))
     for agent, time in marked:
         k = int(np.abs(sequence.time - time).argmin())

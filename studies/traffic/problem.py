@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -79,21 +80,16 @@ class Problem:
         Networks start uniform on [-1, 1] in one half of the runs, on up to five times that in
         the other; laws anywhere in a plausible range.
         """
-        cost = self.cost(COARSE, torch.float64)
-        rows = torch.stack(
-            [ParameterVector(self.system(1000 * seed + r)).row for r in range(number)]
-        )
+        vectors = [ParameterVector(self.system(1000 * seed + r)) for r in range(number)]
+        rows = torch.stack([vector.row for vector in vectors])
         draw = torch.Generator().manual_seed(seed)
         share = torch.rand(number, 2, generator=draw, dtype=torch.float64)
-        if not wide:
-            return rows
-        if self.options["term"] != "network_speed":
-            place = {name.rsplit(".")[-1]: i for i, name in enumerate(cost.vector.names)}
+        names = [name.removeprefix("terms.0.") for name in vectors[0].names]
+        if wide and "L" in names:
             for i, (name, (low, high)) in enumerate((("v0", SPEEDS), ("L", LENGTHS))):
-                rows[1:, place[name]] = low + (high - low) * share[1:, i]
-        elif self.options["box"] is None:
-            inner = torch.ones(rows.shape[1], dtype=torch.bool)
-            inner[cost.vector.names.index("terms.0.v0")] = False
+                rows[1:, names.index(name)] = low + (high - low) * share[1:, i]
+        elif wide and self.options["box"] is None:
+            inner = torch.tensor([name != "v0" for name in names])
             factor = torch.where(torch.arange(number) < number // 2, 1.0, WIDEN ** share[:, 0])
             rows[:, inner] *= factor[:, None]
         return rows
@@ -104,15 +100,13 @@ class Problem:
         Steep laws make Euler's method unstable at coarse steps, so that a find of the first
         search is judged at ``dt`` alone.
         """
-        coarse, fine = self.cost(COARSE, torch.float32), self.cost(dt, torch.float32)
-        low, high = coarse.low, coarse.high
-        coarse_minima = minimise(coarse, starts, low, high, iterations=iterations)
+        fine = self.cost(dt, torch.float32)
+        coarse_minima = minimised(self.cost(COARSE, torch.float32), starts, iterations)
         judged = fine.costs(coarse_minima.rows).mean(1)
         best = judged.argsort()[:FOLLOWED]
-        near = minimise(fine, coarse_minima.rows[best], low, high, iterations=iterations // 2)
+        near = minimised(fine, coarse_minima.rows[best], iterations // 2)
         exact = self.cost(dt, torch.float64)
-        last = near.rows[[near.best]]
-        return minimise(exact, last, low, high, iterations=iterations // 2), judged
+        return minimised(exact, near.rows[[near.best]], iterations // 2), judged
 
     def search_folds(self, fold: np.ndarray, starts: Tensor, dt: float, iterations: int) -> Tensor:
         """``(F, K)`` best finds without the sequences of each fold, all folds side by side.
@@ -125,28 +119,31 @@ class Problem:
         kept = torch.from_numpy(np.arange(number)[:, None] != fold).double()
         weights = (kept / kept.sum(1, keepdim=True)).repeat_interleave(len(starts), 0)
         coarse, fine = self.cost(COARSE, torch.float32), self.cost(dt, torch.float32)
-        low, high = coarse.low, coarse.high
-        coarse_minima = minimise(
-            lambda r: coarse(r, weights),
-            starts.repeat(number, 1),
-            low,
-            high,
-            iterations=iterations,
-        )
+        coarse_minima = minimised(coarse, starts.repeat(number, 1), iterations, weights)
         each = fine.costs(coarse_minima.rows)
         judged = torch.where(weights > 0, each * weights, 0.0).sum(1).reshape(number, -1)
         few = min(FOLLOWED // 2, len(starts))
         best = judged.argsort(1)[:, :few] + len(starts) * torch.arange(number)[:, None]
         chosen = best.flatten()
-        near = minimise(
-            lambda r: fine(r, weights[chosen]),
-            coarse_minima.rows[chosen],
-            low,
-            high,
-            iterations=iterations // 2,
-        )
+        near = minimised(fine, coarse_minima.rows[chosen], iterations // 2, weights[chosen])
         last = near.costs.reshape(number, few).argmin(1) + few * torch.arange(number)
         return near.rows[last]
+
+
+def minimised(
+    cost: EnsembleCost,
+    starts: Tensor,
+    iterations: int,
+    weights: Tensor | None = None,
+    inverse: Tensor | None = None,
+) -> Minima:
+    """The minima of a cost within its bounds, see :func:`nnode.calibrate.bfgs.minimise`.
+
+    Args:
+        weights: of the sequences; None takes the mean.
+    """
+    evaluate = partial(cost, weights=weights)
+    return minimise(evaluate, starts, cost.low, cost.high, iterations=iterations, inverse=inverse)
 
 
 def speeds(system: System) -> list[float]:
@@ -157,8 +154,8 @@ def speeds(system: System) -> list[float]:
 
 
 def named(cost: EnsembleCost, row: Tensor) -> dict[str, Any]:
-    """A row as nested lists by parameter; names without the term they belong to."""
+    """A row ``(1, K)`` as nested lists by parameter; names without the term they belong to."""
     return {
         name.removeprefix("terms.0."): value[0].double().tolist()
-        for name, value in cost.vector.runs(row[None]).items()
+        for name, value in cost.vector.runs(row).items()
     }

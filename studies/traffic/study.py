@@ -19,7 +19,7 @@ from studies.options import TrafficStudyOptions
 from studies.page import page
 from studies.runner import Task
 from studies.traffic import printed, tasks
-from studies.traffic.results import LAWS, MODELS, NETWORKS, Study
+from studies.traffic.results import GRADIENT, LAWS, MODELS, NETWORKS, Study
 
 TITLE = "Traffic: five models on ten recordings"
 SUBTITLE = (
@@ -61,7 +61,7 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
         more = more[more["cost"] < more["before"]]
         results = pd.concat([results.drop(more.index), more]).loc[results.index]
     study = Study(options, stores, results)
-    return page("traffic", study.tables(), study.figures(), [stores["keep"]], **study.values())
+    return page("traffic", study, [stores["keep"]], gradient=GRADIENT)
 
 
 def wider(every: list[Task], costs: Any) -> dict[str, Task]:

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nnode.calibrate.bfgs import minimise, optimality_residual
+from nnode.calibrate.bfgs import optimality_residual
 from nnode.calibrate.cost import sequence_costs
 from nnode.calibrate.evaluate import baselines, best_common_speed
 from nnode.calibrate.optimizers.adadelta import NoisyAdadelta
 from nnode.calibrate.parameters import ParameterVector
 from nnode.calibrate.resampling import group_weights
 from nnode.simulation.fused import FusedSolver
-from studies.traffic.problem import COARSE, Problem, groups, named, recording, speeds
+from studies.traffic.problem import COARSE, Problem, groups, minimised, named, recording, speeds
 
 Result = dict[str, Any]
 
@@ -44,32 +44,33 @@ def fit(
         bootstrap: resamples of groups of sequences.
         steps: other steps (s) at which the solution is evaluated.
     """
-    sequences = recording(folder, recording_name)
-    problem = Problem(sequences, model, box)
+    problem = Problem(recording(folder, recording_name), model, box)
+    group = groups(folder, recording_name)
     minima, judged = problem.search(problem.starts(restarts, seed), dt, iterations)
     cost = problem.cost(dt, torch.float64)
-    best = minima.rows[minima.best]
-    residual = optimality_residual(
-        minima.rows, minima.costs, minima.gradients, cost.low, cost.high
-    )[minima.best]
+    best = minima.rows[[minima.best]]
+    residual = optimality_residual(minima.rows, minima.costs, minima.gradients, cost.low, cost.high)
     result: Result = {
-        "cost": float(minima.costs[minima.best]),
-        "costs": cost.costs(best[None])[0].tolist(),
-        "groups": groups(folder, recording_name).tolist(),
+        "cost": minima.costs[minima.best],
+        "costs": cost.costs(best)[0],
+        "groups": group,
         "parameters": named(cost, best),
-        "residual": float(residual),
-        "speeds": speeds(ParameterVector(problem.system()).fill_(best)),
+        "residual": residual[minima.best],
+        "speeds": speeds(ParameterVector(problem.system()).fill_(best[0])),
         "steps_costs": {
-            f"{step:g}": float(problem.cost(step, torch.float64).costs(best[None]).mean())
-            for step in steps
+            f"{step:g}": problem.cost(step, torch.float64).costs(best).mean() for step in steps
         },
-        "starts": np.quantile(judged.numpy(), [0.0, 0.1, 0.25, 0.5, 0.75]).tolist(),
+        "best_tenth": np.quantile(judged, 0.1),
     }
     if bootstrap:
-        rng = np.random.default_rng(seed)
-        weights = torch.from_numpy(group_weights(groups(folder, recording_name), bootstrap, rng))
+        weights = group_weights(group, bootstrap, np.random.default_rng(seed))
         result["bootstrap"] = _bootstrap(
-            problem, best, minima.inverses[minima.best], weights, dt, iterations // 3
+            problem,
+            best,
+            minima.inverses[minima.best],
+            torch.from_numpy(weights),
+            dt,
+            iterations // 3,
         )
     return result
 
@@ -79,30 +80,19 @@ def _bootstrap(
 ) -> Result:
     """Local refits to resampled sequences: what their spread says about the parameters."""
     # the coarse step is ten times cheaper, and does where it hardly changes the solution's cost
-    costs = [float(problem.cost(h, torch.float32).costs(row[None]).mean()) for h in (COARSE, dt)]
-    step = COARSE if abs(costs[0] / costs[1] - 1) < 0.02 else dt
-    cost = problem.cost(step, torch.float32)
-    refits = minimise(
-        lambda rows: cost(rows, weights),
-        row.expand(len(weights), -1),
-        cost.low,
-        cost.high,
-        iterations=iterations,
-        inverse=inverse,
-    )
+    coarse, fine = (problem.cost(step, torch.float32) for step in (COARSE, dt))
+    ratio = coarse.costs(row).mean() / fine.costs(row).mean()
+    cost = coarse if abs(ratio - 1) < 0.02 else fine
+    refits = minimised(cost, row.expand(len(weights), -1), iterations, weights, inverse)
     rows = refits.rows[torch.isfinite(refits.costs)]
     vector = ParameterVector(problem.system())
     curves = [speeds(vector.fill_(one)) for one in rows]
     values = {
-        name.removeprefix("terms.0."): value.double().tolist()
+        name.removeprefix("terms.0."): value.double()
         for name, value in cost.vector.runs(rows).items()
         if value.ndim == 1
     }
-    return {
-        "step": step,
-        "values": values,
-        "speeds": np.quantile(np.array(curves), [0.025, 0.975], axis=0).tolist(),
-    }
+    return {"values": values, "speeds": np.quantile(curves, [0.025, 0.975], axis=0)}
 
 
 def cross_validate(
@@ -120,19 +110,16 @@ def cross_validate(
 
     Fewer groups than ``folds`` make as many folds as groups; a single group has none.
     """
-    sequences = recording(folder, recording_name)
     group = groups(folder, recording_name)
     number = int(group.max()) + 1
     if number < 2:
         return {"costs": None}
-    place = np.random.default_rng(seed).permutation(number) % min(folds, number)
-    fold = place[group]
-    problem = Problem(sequences, model, box)
+    fold = (np.random.default_rng(seed).permutation(number) % min(folds, number))[group]
+    problem = Problem(recording(folder, recording_name), model, box)
     rows = problem.search_folds(fold, problem.starts(restarts, seed + 1), dt, iterations)
-    each = problem.cost(dt, torch.float64).costs(rows).numpy()
-    costs = each[fold, np.arange(len(sequences))]
-    simple = {name: np.empty(len(sequences)) for name in BASELINES}
-    for k in range(int(fold.max()) + 1):
+    each = problem.cost(dt, torch.float64).costs(rows)
+    simple = {name: np.empty(len(fold)) for name in BASELINES}
+    for k in range(len(rows)):
         train, test = (
             problem.batch.select(np.flatnonzero(part).tolist()) for part in (fold != k, fold == k)
         )
@@ -140,11 +127,7 @@ def cross_validate(
         with torch.no_grad():
             for name, simulate in baselines(problem.system(), FusedSolver(dt), speed).items():
                 simple[name][fold == k] = sequence_costs(simulate(test), test)
-    return {
-        "costs": costs.tolist(),
-        **{name: values.tolist() for name, values in simple.items()},
-        "groups": group.tolist(),
-    }
+    return {"costs": each[fold, np.arange(len(fold))], "groups": group, **simple}
 
 
 def descend(
@@ -167,13 +150,12 @@ def descend(
         lr: factor on the update, 1 in the paper.
         batch_size: sequences in a mini-batch, the same for all runs; 0 takes all.
     """
-    sequences = recording(folder, recording_name)
-    problem = Problem(sequences, model)
+    problem = Problem(recording(folder, recording_name), model)
     cost = problem.cost(updates_dt, torch.float32)
     rows = problem.starts(restarts, seed, wide=False).requires_grad_()
     optimizer = NoisyAdadelta([rows], lr=lr, seed=seed)
     rng = np.random.default_rng(seed)
-    number = len(sequences)
+    number = len(problem.batch)
     size = min(batch_size or number, number)
     order: list[int] = []
     history = []
@@ -185,7 +167,7 @@ def descend(
             better = now < best
             best = torch.where(better, now, best)
             best_rows = torch.where(better[:, None], rows.detach(), best_rows)
-            history.append([step, float(best.min()), float(best.median())])
+            history.append([step, best.min(), best.median()])
         if step == steps:
             break
         if len(order) < size:
@@ -200,11 +182,10 @@ def descend(
     end = best_rows[[int(best.argmin())]]
     cost = problem.cost(dt, torch.float64)
     value, gradient = cost(end)
-    residual = optimality_residual(end, value, gradient, cost.low, cost.high)
     return {
-        "cost": float(value[0]),
-        "parameters": named(cost, end[0]),
-        "residual": float(residual[0]),
+        "cost": value[0],
+        "parameters": named(cost, end),
+        "residual": optimality_residual(end, value, gradient, cost.low, cost.high)[0],
         "history": history,
     }
 
@@ -221,8 +202,5 @@ def scan(folder: str, recording_name: str, model: str, points: int, dt: float) -
     }
     grid = torch.cartesian_prod(*(axes[name] for name in names))
     costs = torch.cat([cost.costs(part).mean(1) for part in grid.split(256)])
-    return {
-        "cost": float(costs.min()),
-        "lengths": axes["L"].tolist(),
-        "by_length": costs.reshape(points, points).amin(names.index("v0")).tolist(),
-    }
+    by_length = costs.reshape(points, points).amin(names.index("v0"))
+    return {"cost": costs.min(), "lengths": axes["L"], "by_length": by_length}

@@ -29,21 +29,26 @@ def fit(law: str, desired: str, folders: list[str], held: list[str]) -> Result:
         desired: where people want to go.
         folders: of the prepared data.
         held: recordings that are left out.
+
+    Returns:
+        Parameters as ``row``, the training error (m²) as ``train``, and ``errors`` by law and run.
     """
     system = new_system(law, desired)
     train = chosen(folders, held, test=False)
     own = parameters_of(system)
     grid = [dict(zip(GRID[law], each, strict=True)) for each in product(*GRID[law].values())]
     row, error = pooled_fit(system, train, [own, *({**own, **more} for more in grid)])
-    return {"row": row, "train": error, "errors": _of_runs(simulated(system), folders, held)}
+    errors = {law: _of_runs(simulated(system), folders, held)}
+    return {"row": row, "train": error, "errors": errors}
 
 
 def baselines(folders: list[str], held: list[str]) -> Result:
-    """Errors of predictions that need no calibration, by name and run."""
-    return {
-        "constant_velocity": _of_runs(lambda b: straight(b, b.v[0]), folders, held),
-        "preferred": _of_runs(lambda b: straight(b, along_stream(b)), folders, held),
+    """Errors of predictions that need no calibration, as those of :func:`fit`."""
+    simple: dict[str, Predict] = {
+        "constant_velocity": lambda b: straight(b, b.v[0]),
+        "preferred": lambda b: straight(b, along_stream(b)),
     }
+    return {"errors": {name: _of_runs(x, folders, held) for name, x in simple.items()}}
 
 
 def _of_runs(x: Predict, folders: list[str], runs: list[str]) -> Result:

@@ -108,11 +108,9 @@ def baselines(folder: str) -> dict[str, Any]:
 def transfer(folder: str, rows: dict[str, list[float]]) -> dict[str, Any]:
     """In place of :func:`studies.crowd.tasks.transfer`."""
     assert rows["sf"] == FORCE[_horizon(folder)]
-    runs = {
-        run: {
-            "people": [6],
-            "costs": {model: {"a": cost} for model, cost in {**costs, **SIMPLE}.items()},
+    return {
+        "runs": {
+            run: {model: {"a": cost} for model, cost in {**costs, **SIMPLE}.items()}
+            for run, costs in ELSEWHERE.items()
         }
-        for run, costs in ELSEWHERE.items()
     }
-    return {"runs": runs}

@@ -56,7 +56,8 @@ def test_constant_velocity_has_nearly_the_published_errors(real_data: Path, tmp_
         pytest.skip("eth_ucy is not there")
     for name in SCENES[1:]:
         store = prepare(scene(name, str(real_data)), tmp_path / name)
-        found = walking.baselines([str(store.folder)], [name])["constant_velocity"][name]
+        errors = walking.baselines([str(store.folder)], [name])["errors"]
+        found = errors["constant_velocity"][name]
         ade, fde = printed.constant_velocity[name]
         assert found["ade"] == pytest.approx(ade, rel=0.08)
         assert found["fde"] == pytest.approx(fde, rel=0.08)
@@ -83,17 +84,17 @@ def test_tables_of_errors() -> None:
     found = pd.DataFrame(
         [
             {"task": "follow", "law": "idm", "row": {"T": 1.5}, "train": sums, "test": sums},
-            {"task": "baselines", **{name: {"eth_univ": run} for name in study.SIMPLE}},
-            {"task": "fit", "law": "alone", "errors": {"eth_univ": {**run, "ade": 0.25}}},
+            {"errors": {name: {"eth_univ": run} for name in study.SIMPLE}},
+            {"errors": {"alone": {"eth_univ": {**run, "ade": 0.25}}}},
         ]
     )
-    table = study._following(found, 0)
+    table = study.following(found, 0)
     assert table.loc["idm", "test"] == pytest.approx(np.sqrt(10 / 200))
     assert table.loc["idm", "low"] < table.loc["idm", "test"] < table.loc["idm", "high"]
     assert table.loc["idm", "parameters"] == "T = 1.5"
     assert list(table.index[1:]) == ["idm, published", "learned, published"]
-    distances = errors_by_run(found.query("task != 'follow'"), study.SIMPLE | study.PEOPLE)
-    ade = study._by_scene(distances, "ade")["eth_univ"]
+    distances = errors_by_run(found["errors"].dropna(), study.SIMPLE | study.PEOPLE)
+    ade = study.by_scene(distances, "ade")["eth_univ"]
     assert ade.to_dict() == {
         "constant velocity": 0.5,
         "mean speed with the stream": 0.5,

@@ -74,7 +74,7 @@ def fit(
         "residual": 1e-3,
         "speeds": [15.0] * len(GAPS),
         "steps_costs": {f"{step:g}": cost * (1 + step) for step in steps},
-        "starts": [cost + k for k in range(5)],
+        "best_tenth": cost + 1,
     }
     if bootstrap:
         found["bootstrap"] = {

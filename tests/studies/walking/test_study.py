@@ -15,7 +15,7 @@ from studies.frame import differences
 from studies.options import WalkingStudyOptions
 from studies.walking import tasks
 from studies.walking.data import RUNS, chosen
-from studies.walking.laws import GRID, LABELS, LAWS, new_system
+from studies.walking.laws import GRID, LABELS, LAWS, SIMPLE, new_system
 from studies.walking.study import Walking, groups
 
 
@@ -42,9 +42,10 @@ def test_a_calibration_finds_the_law_and_tests_it_elsewhere(tmp_path: Path) -> N
     found = tasks.fit("alone", "direction", [str(tmp_path)], ["b"])
     assert found["row"]["tau"] == pytest.approx(0.8, rel=0.05)  # Euler's steps are 0.05 s
     # who was not measured before is not asked for
-    assert found["errors"]["b"]["people"] == 1
-    assert found["errors"]["b"]["mean"] < 1e-4
-    simple = tasks.baselines([str(tmp_path)], ["b"])
+    errors = found["errors"]["alone"]["b"]
+    assert errors["people"] == 1
+    assert errors["mean"] < 1e-4
+    simple = tasks.baselines([str(tmp_path)], ["b"])["errors"]
     gone = 0.6 * 0.05 * np.arange(21) - walker("b", 0.8).x[:, 0, 0]
     wanted = float((gone[1:] ** 2).mean())
     assert simple["constant_velocity"]["b"]["mean"] == pytest.approx(wanted, rel=1e-9)
@@ -66,12 +67,11 @@ def test_errors_are_means_over_people() -> None:
             "task": "baselines",
             "desired": np.nan,
             "horizon": 1.0,
-            "constant_velocity": {f"r{i}": one},
-            "preferred": {f"r{i}": one},
+            "errors": {name: {f"r{i}": one} for name in SIMPLE},
         }
         for i, one in enumerate(runs)
     ]
-    study = Walking(WalkingStudyOptions(horizons=[1.0], folds=2), pd.DataFrame(rows))
+    study = Walking(WalkingStudyOptions(horizons=[1.0], folds=2), pd.DataFrame(rows), [])
     label = LABELS["preferred"]
     assert study.costs("direction", 1.0)[label].mean() == 1.0
     assert study.costs("direction", 1.0, "end")[label].mean() == 0.75
