@@ -23,9 +23,8 @@ from nnode.calibrate.interrupt import Interrupted, InterruptGuard
 from nnode.errors import StudyError
 from nnode.files import write_json, write_text
 from nnode.version import VERSION
-from studies.cluster import calls_on_cluster
 from studies.progress import TaskProgress
-from studies.workers import Call, Outcome, calls_here, calls_in_processes
+from studies.workers import Call, Outcome, calls_here, calls_in_processes, calls_on_cluster
 
 log = logging.getLogger(__name__)
 

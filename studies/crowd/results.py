@@ -1,7 +1,8 @@
-"""Tables and figures of the crowd study."""
+"""Tables and figures of the study."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
@@ -16,11 +18,20 @@ from nnode.model.system import System
 from nnode.pages.replay import Scene
 from nnode.plots.crowd import force_contours
 from nnode.plots.settings import SETTINGS, Setting, six_settings
-from nnode.plots.style import thinned
-from studies.crowd import figures, forces, printed
+from nnode.plots.style import (
+    GREY,
+    OKABE_ITO,
+    SHADE,
+    SMALL_FONT,
+    curve_style,
+    dress,
+    legend_above,
+    new_figure,
+    thinned,
+)
+from studies.crowd import forces, printed
 from studies.crowd.data import ALL, RECORDING, mean_speed, time_groups
-from studies.crowd.fit import NAMES, named, system_of
-from studies.crowd.tasks import KINDS
+from studies.crowd.tasks import KINDS, NAMES, named, system_of
 from studies.figures import horizon_costs
 from studies.frame import by_number, by_unit, differences, labelled, means
 from studies.options import CrowdStudyOptions
@@ -298,11 +309,11 @@ class Crowd:
             LABELS[kind]: [forces.away_by_distance(system, self.measured) for system in every]
             for kind, every in (("sf", systems["sf"][:1]), ("nn", systems["nn"]))
         }
-        return figures.forces_by_distance(curves)
+        return plot_forces_by_distance(curves)
 
     def draw_accelerations(self) -> Figure:
         speeds = {LABELS[k]: forces.along_by_speed(parts) for k, parts in self.best_parts.items()}
-        return figures.acceleration_by_speed(speeds)
+        return plot_acceleration_by_speed(speeds)
 
     def draw_contours(self, model: str, part: Any, component: int) -> Figure:
         system = self.system(model, self.options.horizons[0])
@@ -358,3 +369,65 @@ def _described(items: list[Sequence]) -> dict[str, Any]:
     """The number of sequences, and the mean number and speed (m/s) of their people."""
     people = np.mean([s.n_agents for s in items])
     return {"sequences": len(items), "people": people, "speed": mean_speed(items)}
+
+
+def plot_forces_by_distance(curves: Mapping[str, list[pd.DataFrame]]) -> Figure:
+    """Mean force between two people along the line that joins them, by their distance.
+
+    Args:
+        curves: model to one table per start, the best first, with the columns ``facing`` and
+            ``same way`` (N), indexed by distance (m).
+    """
+    figure = new_figure(7.2, 3.4)
+    axes = figure.subplots(1, 2, sharey=True)
+    titles = {"facing": "walking in opposite directions", "same way": "walking the same way"}
+    handles = []
+    for i, (model, tables) in enumerate(curves.items()):
+        style = {**curve_style(i), "marker": ""}
+        handles.append(Line2D([], [], **style, linewidth=1.8, label=f"{model}, best start"))
+        if len(tables) > 1:
+            label = f"{model}, other starts ({len(tables) - 1})"
+            handles.append(Line2D([], [], **style, linewidth=0.7, alpha=0.6, label=label))
+        for ax, way in zip(axes, titles, strict=True):
+            for n, table in enumerate(tables):
+                if way in table:
+                    width, alpha = (1.8, 1.0) if n == 0 else (0.7, 0.6)
+                    ax.plot(table.index, table[way], linewidth=width, alpha=alpha, **style)
+    for ax, way in zip(axes, titles, strict=True):
+        ax.axhline(0, color=GREY, linewidth=0.6)
+        dress(ax, x="distance (m)", title=titles[way])
+    axes[0].set_ylabel("mean force, + apart, - together (N)", fontsize=9.0)
+    legend_above(figure, handles, len(handles))
+    return figure
+
+
+def plot_acceleration_by_speed(tables: Mapping[str, pd.DataFrame]) -> Figure:
+    """Mean acceleration along a person's own way by his speed; one panel per model.
+
+    Args:
+        tables: model to a table with the columns ``pair``, ``wall``, ``sum`` (m/s²) and ``n``
+            (people), indexed by speed (m/s).
+    """
+    figure = new_figure(2.4 * len(tables) + 0.4, 3.2)
+    axes = np.atleast_1d(figure.subplots(1, len(tables), sharey=True, sharex=True))
+    lines: dict[str, tuple[str, str, Any]] = {
+        "pair": ("from people", "vermillion", (0, (6, 2))),
+        "wall": ("from walls", "blue", (0, (1.2, 1.4))),
+        "sum": ("sum", "black", "-"),
+    }
+    for ax, (model, table) in zip(axes, tables.items(), strict=True):
+        share = table["n"] / table["n"].max()
+        twin = ax.twinx()
+        twin.bar(table.index, share, width=0.09, color=SHADE, edgecolor="none")
+        twin.set(ylim=(0, 4), yticks=[])
+        twin.set_zorder(0)
+        ax.set_zorder(1)
+        ax.patch.set_visible(False)
+        for part, (label, color, line) in lines.items():
+            style = {"label": label, "color": OKABE_ITO[color], "linestyle": line}
+            ax.plot(table.index, table[part], **style, linewidth=1.4)
+        ax.axhline(0, color=GREY, linewidth=0.6)
+        dress(ax, x="own speed (m/s)", title=model)
+    axes[0].set_ylabel("mean acceleration along the own way (m/s²)", fontsize=SMALL_FONT)
+    legend_above(figure, axes[0].get_legend_handles_labels()[0])
+    return figure

@@ -9,11 +9,10 @@ import pandas as pd
 
 from nnode.data.store import Store
 from nnode.pages.page import Block
-from studies.following import fit, inference, leaders, platoons, printed
-from studies.following.candidates import DECAY, EVERY, REFERENCE, key
+from studies.following import printed, tasks
 from studies.following.data import LEADERS, PAIRS, PLATOONS, stores
-from studies.following.fit import OBJECTIVES
 from studies.following.results import EVEN, SWING, Study
+from studies.following.tasks import DECAY, EVERY, OBJECTIVES, ON_TRACK, REFERENCE, key
 from studies.frame import computed
 from studies.options import FollowingStudyOptions
 from studies.page import page
@@ -73,7 +72,7 @@ def training(options: FollowingStudyOptions, prepared: Mapping[str, Store]) -> l
     return [
         Task(
             f"cv-{key(name)}",
-            fit.cross_validate,
+            tasks.cross_validate,
             where | {"name": name},
             cost=len(one.effects) + (one.network or 0) + 2.0,
         )
@@ -92,23 +91,23 @@ def after(study: Study) -> list[Task]:
     idm = {"name": REFERENCE, **search}
     rows = study.calibrated["row"]
     folds = {"row": rows[REFERENCE], "folds": options.folds}
-    tasks = [
-        Task("reproduced-pairs", fit.reproduced, pairs),
-        Task("reproduced-platoon", platoons.reproduced, track),
-        Task("floor", fit.floor, pairs | idm, cost=6.0),
-        Task("halves", inference.halves, pairs | idm | folds, cost=8.0),
-        Task("leaders", leaders.by_leader, road | idm, cost=6.0),
-        Task("runs", platoons.every_run, track | idm, cost=8.0),
+    every = [
+        Task("reproduced-pairs", tasks.reproduced_pairs, pairs),
+        Task("reproduced-platoon", tasks.reproduced_platoon, track),
+        Task("floor", tasks.floor, pairs | idm, cost=6.0),
+        Task("halves", tasks.halves, pairs | idm | folds, cost=8.0),
+        Task("leaders", tasks.by_leader, road | idm, cost=6.0),
+        Task("runs", tasks.every_run, track | idm, cost=8.0),
     ]
     for name, row in rows.items():
         own = pairs | {"name": name, "row": row}
-        tasks.append(Task(f"test-{key(name)}", fit.tested, own))
+        every.append(Task(f"test-{key(name)}", tasks.tested, own))
         if name in study.chosen:
             where = pairs | {"name": name} | search
-            tasks.append(Task(f"objectives-{key(name)}", fit.objectives, where, cost=6.0))
-            tasks.append(Task(f"precision-{key(name)}", inference.precision, own, cost=4.0))
-    for name in platoons.CANDIDATES:
+            every.append(Task(f"objectives-{key(name)}", tasks.objectives, where, cost=6.0))
+            every.append(Task(f"precision-{key(name)}", tasks.precision, own, cost=4.0))
+    for name in ON_TRACK:
         if not options.quick or name in FEW:
             where = track | {"name": name} | search
-            tasks.append(Task(f"platoon-{key(name)}", platoons.compare, where, cost=5.0))
-    return tasks
+            every.append(Task(f"platoon-{key(name)}", tasks.compare, where, cost=5.0))
+    return every

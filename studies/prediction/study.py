@@ -15,7 +15,7 @@ from studies.frame import computed
 from studies.options import PredictionStudyOptions
 from studies.page import page
 from studies.prediction import printed, tasks
-from studies.prediction.data import AHEAD, SCENES, SEEN, STEP, stores
+from studies.prediction.tasks import AHEAD, SCENES, SEEN, STEP, stores
 from studies.runner import Task
 from studies.walking import tasks as walking
 from studies.walking.study import errors_by_run

@@ -1,7 +1,8 @@
-"""Tables and figures of the traffic study."""
+"""Tables and figures of the study."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -11,18 +12,28 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from nnode.calibrate.resampling import average_interval, holm
 from nnode.data.sequence import Sequence
 from nnode.data.store import Store
 from nnode.pages.replay import Scene
-from nnode.plots.style import thinned
+from nnode.plots.style import (
+    GREY,
+    SMALL_FONT,
+    curve_style,
+    dress,
+    legend_above,
+    new_figure,
+    thinned,
+)
 from nnode.plots.traffic import measured_gaps
+from studies.figures import error_bars
 from studies.frame import by_number, by_unit, differences
 from studies.options import TrafficStudyOptions
 from studies.replay import scenes
-from studies.traffic import figures, printed, tasks
-from studies.traffic.problem import GAPS, recording, system_of
+from studies.traffic import printed
+from studies.traffic.tasks import BASELINES, GAPS, recording, system_of
 
 LAWS, NETWORKS = ("lin", "log"), ("n2", "n4", "n10")
 MODELS = (*NETWORKS, *LAWS)
@@ -97,12 +108,12 @@ class Study:
     def heldout(self) -> dict[str, pd.DataFrame]:
         """By treatment of faults, a column of held-out costs (m² s) per model and baseline."""
         every = self.results.query("task == 'cross_validate'").dropna(subset="groups")
-        every = every.explode(["costs", "groups", *tasks.BASELINES])
+        every = every.explode(["costs", "groups", *BASELINES])
         by_faults = {}
         for faults, part in every.groupby("faults"):
             columns = {str(law): rows["costs"] for law, rows in part.groupby("law", sort=False)}
             lin = part[part["law"] == "lin"]
-            columns |= {name: lin[name] for name in tasks.BASELINES}
+            columns |= {name: lin[name] for name in BASELINES}
             by_faults[str(faults)] = by_unit(
                 columns, lin["recording"] + " " + lin["groups"].map(str)
             )
@@ -195,7 +206,7 @@ class Study:
             for faults, costs in self.heldout.items()
         }
         stacked = pd.concat(parts, names=["faults", "model"])
-        order = [*tasks.BASELINES, *LAWS, *(m + s for m in NETWORKS for s in ("-box", ""))]
+        order = [*BASELINES, *LAWS, *(m + s for m in NETWORKS for s in ("-box", ""))]
         return stacked.reindex([(f, m) for f in ("keep", "drop") for m in order])
 
     def significance(self) -> pd.DataFrame:
@@ -242,7 +253,7 @@ class Study:
             above = [run[:, 1] - least.loc[model, name] for name, run in runs.items()]
             simulations = np.maximum(runs.iloc[0][:, 0] * GRADIENT * 2, 1)
             curves[model] = np.stack([simulations, np.mean(above, axis=0).clip(min=1e-6)], 1)
-        return figures.descents(curves)
+        return plot_descents(curves)
 
     # -- laws --------------------------------------------------------------------------------
 
@@ -250,7 +261,7 @@ class Study:
         return averaged(self.parameter("v0")[0] * KMH)
 
     def draw_leader_speeds(self) -> Figure:
-        return figures.leader_speeds(*(KMH * values for values in self.parameter("v0")))
+        return plot_leader_speeds(*(KMH * values for values in self.parameter("v0")))
 
     def speeds_by_gap(self, box: bool) -> dict[str, pd.DataFrame]:
         """By recording, a column of speeds (m/s) per model."""
@@ -268,7 +279,7 @@ class Study:
         drawn = {} if box else self.take("bootstrap").map(lambda b: np.array(b["speeds"]))
         speeds = self.speeds_by_gap(box)
         gaps = {name: measured_gaps(self.recording(name)) for name in speeds}
-        return figures.law_panels(speeds, drawn, gaps)
+        return plot_law_panels(speeds, drawn, gaps)
 
     # -- sequences ---------------------------------------------------------------------------
 
@@ -336,7 +347,7 @@ class Study:
             if fault["sequence"] == sequence.name and fault["time"] is not None
             for agent in fault["agents"]
         ]
-        return figures.space_time(scene, marked)
+        return plot_space_time(scene, marked)
 
     def scenes(self) -> list[Scene]:
         """Sequences without a fault, of the player."""
@@ -346,3 +357,122 @@ class Study:
             sequences = thinned(self.recording(str(name), "drop"), FEW)
             shown += scenes(sequences, systems, self.options.dt)
         return shown
+
+
+#: Speeds outside are cut, m/s.
+LIMITS = (-8.0, 38.0)
+
+
+def plot_leader_speeds(speeds: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -> Figure:
+    """Identified speed of the leading vehicle by recording, and its mean by model.
+
+    Args:
+        speeds: km/h; a row per model, a column per recording.
+        low, high: ends of their intervals, the same layout, NaN where there is none.
+
+    Source: Göttlich & Totzeck, figure (veloLength).
+    """
+    figure = new_figure(7.2, 4.0)
+    ax = figure.subplots()
+    error_bars(ax, speeds, low, high, 0.14, linestyle="")
+    handles = []
+    for i, (model, mean) in enumerate(speeds.mean(axis=1).items()):
+        style = curve_style(i)
+        ax.axhline(mean, color=style["color"], linestyle=style["linestyle"], linewidth=1)
+        label = f"{model}: mean {mean:.0f} km/h"
+        handles.append(Line2D([], [], **style, markersize=4.5, label=label))
+    numbered = [f"{n}\n{name}" for n, name in enumerate(speeds.columns, 1)]
+    ax.set_xticks(range(len(numbered)), numbered)
+    dress(ax, x="recording", y="leader's speed v0 (km/h)")
+    legend_above(figure, handles)
+    return figure
+
+
+def plot_law_panels(
+    speeds: Mapping[str, pd.DataFrame],
+    bands: Mapping[str, Mapping[str, np.ndarray]],
+    measured: Mapping[str, np.ndarray],
+) -> Figure:
+    """Speed against gap, one panel per recording, all models.
+
+    Args:
+        speeds: recording to m/s, a column per model, indexed by the gap, m.
+        bands: recording to model to ``(2, G)`` ends of the interval, m/s; may be empty.
+        measured: recording to measured gaps, m; a bar below shows their middle 90 %.
+
+    Source: Göttlich & Totzeck, figure (interactionForce).
+    """
+    rows = -(-len(speeds) // 5)
+    figure = new_figure(11.0, 2.5 * rows + 0.4)
+    axes = figure.subplots(rows, 5, sharex=True, sharey=True, squeeze=False)
+    handles: list[Line2D] = []
+    for n, (name, table) in enumerate(speeds.items()):
+        ax, handles = axes.flat[n], []
+        for i, (model, speed) in enumerate(table.items()):
+            style = {**curve_style(i), "marker": ""}
+            ax.plot(table.index, speed.clip(-1e3, 1e3), linewidth=1.2, **style)
+            handles.append(Line2D([], [], **style, label=model))
+            if name in bands:
+                low, high = np.clip(bands[name][str(model)], -1e3, 1e3)
+                ax.fill_between(
+                    table.index, low, high, color=style["color"], alpha=0.10, linewidth=0
+                )
+        span = np.quantile(measured[name], [0.05, 0.95])
+        ax.plot(span, [LIMITS[0] + 1.5] * 2, color=GREY, linewidth=4, solid_capstyle="butt")
+        last = n // 5 == rows - 1
+        dress(
+            ax,
+            x="gap (m)" if last else "",
+            y="speed W (m/s)" if n % 5 == 0 else "",
+            title=f"{n + 1}: {name}",
+        )
+    for ax in axes.flat[len(speeds) :]:
+        ax.set_axis_off()
+    axes[0, 0].set(xlim=(table.index.min(), table.index.max()), ylim=LIMITS)
+    handles.append(Line2D([], [], color=GREY, linewidth=4, label="middle 90 % of measured gaps"))
+    legend_above(figure, handles, len(handles))
+    return figure
+
+
+def plot_descents(curves: Mapping[str, np.ndarray]) -> Figure:
+    """Average cost above the least one known, against simulations, one curve per model.
+
+    Args:
+        curves: model to ``(P, 2)`` simulations and excess of the average cost, m² s.
+    """
+    figure = new_figure(5.6, 3.2)
+    ax = figure.subplots()
+    for i, (model, values) in enumerate(curves.items()):
+        ax.plot(*values.T, **{**curve_style(i), "marker": ""}, linewidth=1.3, label=model)
+    ax.set(xscale="log", yscale="log")
+    ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-3))  # lower values are rounding errors
+    dress(ax, x="simulations", y="average J above the least (m² s)")
+    ax.legend(fontsize=SMALL_FONT, frameon=False)
+    return figure
+
+
+def plot_space_time(scene: Scene, marked: list[tuple[int, float]]) -> Figure:
+    """One traffic sequence: measured positions and simulated ones.
+
+    Args:
+        marked: vehicles and times (s) at which a fault of the measurement was found.
+    """
+    figure = new_figure(6.4, 3.8)
+    ax = figure.subplots()
+    sequence = scene.sequence
+    t = sequence.time - sequence.time[0]
+    handles = [Line2D([], [], color=GREY, marker="o", markersize=4, label="measured")]
+    ax.plot(t, sequence.x[:, :, 0], color=GREY, marker="o", markersize=4, linewidth=1)
+    for i, (name, x) in enumerate(scene.simulated.items()):
+        style = {**curve_style(i), "marker": ""}
+        ax.plot(t, x[:, :, 0], **style, linewidth=1.3)
+        handles.append(Line2D([], [], **style, label=name))
+    for agent, time in marked:
+        k = int(np.abs(sequence.time - time).argmin())
+        ax.plot(t[k], sequence.x[k, agent, 0], "s", color="black", fillstyle="none", markersize=10)
+    if marked:
+        box: dict[str, Any] = {"marker": "s", "fillstyle": "none", "markersize": 8, "linestyle": ""}
+        handles.append(Line2D([], [], color="black", **box, label="fault of the measurement"))
+    dress(ax, x="time in the sequence (s)", y="position along the lane (m)", title=sequence.name)
+    ax.legend(handles=handles, fontsize=SMALL_FONT)
+    return figure

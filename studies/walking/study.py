@@ -24,9 +24,16 @@ from studies.pooled import filled
 from studies.replay import scenes
 from studies.runner import Task
 from studies.walking import tasks
-from studies.walking.data import RUNS, measured_before, prepare_runs
-from studies.walking.laws import DESIRED, LABELS, LAWS, new_system
-from studies.walking.tasks import Result
+from studies.walking.tasks import (
+    DESIRED,
+    LABELS,
+    LAWS,
+    RUNS,
+    Result,
+    measured_before,
+    new_system,
+    prepare_runs,
+)
 
 TITLE = "Walking: pedestrian laws in two-way flows"
 SUBTITLE = (

@@ -71,7 +71,7 @@ def test_a_request_to_stop_waits_for_no_task(scheduler: str, tmp_path: Path) -> 
 
 @pytest.mark.thorough
 def test_nobody_at_the_address_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("studies.cluster.ANSWER", 0.5)
+    monkeypatch.setattr("studies.workers.ANSWER", 0.5)
     tasks = [Task("where", work.conditions, {})]
     with pytest.raises(ConfigError, match="no scheduler answers"):
         run_tasks(tasks, tmp_path, workers=1, fingerprint="f", cluster="tcp://127.0.0.1:9")

@@ -11,7 +11,7 @@ from nnode.data.sequence import Sequence
 from nnode.errors import SimulationError
 from nnode.pages.replay import ReplayBlock
 from studies import replay
-from studies.traffic.problem import system_of
+from studies.traffic.tasks import system_of
 from tests.studies.traffic.invented import platoons
 
 V0, L = 25.0, 5.0

@@ -11,7 +11,7 @@ import numpy as np
 from nnode.data.sequence import Sequence
 from nnode.data.store import Store, write_store
 from studies.crowd.data import parts
-from studies.crowd.fit import new_system, row_of, silence
+from studies.crowd.tasks import new_system, row_of, silence
 from studies.stores import sequences
 from tests.studies.crowd.corridor import DT, sequence
 

@@ -15,9 +15,8 @@ from nnode.plots.interaction import evaluate_force, interaction
 from studies.crowd import forces as crowd_forces
 from studies.crowd import printed
 from studies.crowd.data import ALL, fold_of, parts, time_groups, turned
-from studies.crowd.fit import calibrate, costs, new_system, row_of, system_of
 from studies.crowd.results import beside_printed
-from studies.crowd.tasks import even_pace
+from studies.crowd.tasks import calibrate, costs, even_pace, new_system, row_of, system_of
 from tests.studies.crowd.corridor import corridor, sequence, walkers
 
 TRUE = np.array([0.05, 40.0, 12.0])

@@ -10,7 +10,7 @@ import pytest
 from nnode.data.store import write_store
 from studies.crowd import tasks
 from studies.crowd.data import chosen
-from studies.crowd.fit import costs, system_of
+from studies.crowd.tasks import costs, system_of
 from tests.studies.crowd.corridor import DT, walkers
 
 TRUE = np.array([0.05, 40.0, 12.0])

@@ -12,8 +12,8 @@ from nnode.data.clusters import folds
 from nnode.data.sequence import Sequence, collate
 from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
 from nnode.simulation.fused import FusedSolver
-from studies.following import data, fit, inference, leaders, printed
-from studies.following.candidates import EVERY, decay, key, published_law, starts
+from studies.following import data, printed, tasks
+from studies.following.tasks import EVERY, decay, key, published_law, starts
 
 HELLY = {"c_s": 0.15, "c_v": 0.7, "T": 1.4, "s0": 3.0}
 
@@ -88,7 +88,7 @@ def test_followers_of_a_platoon_keep_their_leaders() -> None:
 
 
 def test_cross_validation_finds_the_hidden_law(known: list[Sequence]) -> None:
-    found = fit.cross_validate("", "helly", restarts=2, folds=2, seed=0)
+    found = tasks.cross_validate("", "helly", restarts=2, folds=2, seed=0)
     assert found["parameters"] == pytest.approx(HELLY, rel=1e-3)
     assert max(found["heldout"]["spacing"]) < 1e-3
     assert found["limits"] == []
@@ -101,7 +101,7 @@ def test_numbers_of_a_pair_that_last_are_found(monkeypatch: pytest.MonkeyPatch) 
     pairs = driven(time_gaps=own)
     monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
     row = [HELLY[n] for n in ("c_s", "c_v", "T", "s0")]
-    found = inference.halves("", "helly", row, folds=2, restarts=1, seed=0)
+    found = tasks.halves("", "helly", row, folds=2, restarts=1, seed=0)
     assert found["names"] == ["c_s", "c_v", "T", "s0"]
     # the spread of the middle of the six time gaps, whose 5 % quantiles the ends are moved to
     tame = np.clip(own, *np.quantile(own, [0.05, 0.95]))
@@ -115,9 +115,9 @@ def test_a_profile_is_least_at_the_best_value(known: list[Sequence]) -> None:
     cost = ResidualProblem(
         EVERY["helly"].system(), collate(known), FusedSolver(), Convention.spacing
     )
-    best = np.array([HELLY[n] for n in fit.named(cost, cost.start)])
+    best = np.array([HELLY[n] for n in tasks.named(cost, cost.start)])
     before = cost.low.copy()
-    found = inference.profile(cost, best, 2, np.arange(6))
+    found = tasks.profile(cost, best, 2, np.arange(6))
     rise = np.array(found["rise"])
     assert found["values"] == sorted(found["values"])
     assert found["values"][int(rise.argmin())] == pytest.approx(HELLY["T"], rel=1e-9)
@@ -147,4 +147,4 @@ def test_the_jackknife_of_a_mean_is_its_usual_interval() -> None:
     values = np.random.default_rng(0).normal(size=(10, 2))
     without = (values.sum(0) - values) / 9
     usual = values.std(0, ddof=1) / np.sqrt(10)
-    assert leaders.jackknifed(without) == pytest.approx(usual * stats.t.ppf(0.975, 9))
+    assert tasks.jackknifed(without) == pytest.approx(usual * stats.t.ppf(0.975, 9))

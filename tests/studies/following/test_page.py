@@ -12,11 +12,10 @@ import pytest
 
 from nnode.pages.page import TableBlock, write_page
 from studies.following import printed, stability
-from studies.following.candidates import EVERY, key
 from studies.following.data import LEADERS, PAIRS, PLATOONS
-from studies.following.fit import OBJECTIVES, named
 from studies.following.results import Study
 from studies.following.study import after, blocks, training
+from studies.following.tasks import EVERY, OBJECTIVES, key, named
 from studies.frame import tidy
 from studies.options import FollowingStudyOptions
 from studies.runner import Task

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.following import fit, platoons, printed
+from studies.following import printed, tasks
 from studies.following.data import PAIRS, PLATOONS, stores
 from studies.options import FollowingStudyOptions
 
@@ -25,7 +25,7 @@ def folders(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 
 def test_nine_errors_of_test_pairs(folders: dict[str, str]) -> None:
-    found = fit.reproduced(folders[PAIRS])
+    found = tasks.reproduced_pairs(folders[PAIRS])
     for law, theirs in printed.errors.items():
         for objective, value in zip(printed.objectives, theirs, strict=True):
             errors = found[f"{law} {objective}"]
@@ -34,5 +34,5 @@ def test_nine_errors_of_test_pairs(folders: dict[str, str]) -> None:
 
 
 def test_four_errors_on_the_track(folders: dict[str, str]) -> None:
-    found = platoons.reproduced(folders[PLATOONS])
+    found = tasks.reproduced_platoon(folders[PLATOONS])
     assert found["stopped"] == pytest.approx(printed.platoon_errors, abs=0.03)

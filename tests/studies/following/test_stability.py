@@ -9,8 +9,8 @@ from nnode.model.build import build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.system import System
 from studies.following import stability
-from studies.following.candidates import EVERY
 from studies.following.stability import FREQUENCIES, Slopes, passed
+from studies.following.tasks import EVERY
 
 LENGTH = 4.5
 

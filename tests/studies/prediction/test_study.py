@@ -14,10 +14,10 @@ from nnode.data.sequence import Sequence
 from nnode.data.store import write_store
 from nnode.model.build import build_model
 from studies.prediction import printed, study, tasks
-from studies.prediction.data import AHEAD, SCENES, SEEN, events, scene
+from studies.prediction.tasks import AHEAD, SCENES, SEEN, events, scene
 from studies.walking import tasks as walking
-from studies.walking.data import chosen
 from studies.walking.study import errors_by_run
+from studies.walking.tasks import chosen
 from tests.builders import lane
 
 FREE = {"parameters": {"v0": "12 m/s"}, "rate": {"x": "v0"}}

@@ -9,7 +9,7 @@ import numpy as np
 from nnode.data.sequence import Sequence
 from nnode.model import build_model
 from studies.traffic import printed
-from studies.traffic.problem import GAPS, model_options
+from studies.traffic.tasks import GAPS, model_options
 from tests.builders import lane
 
 #: Cost above the printed one, m² s; all others lie 1 below it. The second is of a wider search.

@@ -16,10 +16,10 @@ from nnode.model.build import build_model
 from nnode.model.system import System
 from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver
 from studies.crowd.data import prepared
-from studies.crowd.fit import system_of
+from studies.crowd.tasks import system_of
 from studies.options import CrowdStudyOptions
 from studies.traffic import printed
-from studies.traffic.problem import Problem, model_options, recording
+from studies.traffic.tasks import Problem, model_options, recording
 
 PUBLISHED = Path(__file__).parents[3] / "docs" / "studies" / "traffic"
 DT = 0.002

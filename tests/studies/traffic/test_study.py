@@ -15,7 +15,7 @@ from nnode.errors import ConfigError
 from studies.options import TrafficStudyOptions
 from studies.traffic import printed, tasks
 from studies.traffic import study as traffic
-from studies.traffic.problem import Problem
+from studies.traffic.tasks import Problem
 from tests.builders import linear
 
 V0, L = 24.0, 5.0

@@ -14,9 +14,8 @@ from nnode.data.store import write_store
 from studies.frame import differences
 from studies.options import WalkingStudyOptions
 from studies.walking import tasks
-from studies.walking.data import RUNS, chosen
-from studies.walking.laws import GRID, LABELS, LAWS, SIMPLE, new_system
 from studies.walking.study import Walking, groups
+from studies.walking.tasks import GRID, LABELS, LAWS, RUNS, SIMPLE, chosen, new_system
 
 
 def walker(run: str, tau: float, known: bool = True) -> Sequence:
