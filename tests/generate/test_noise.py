@@ -15,6 +15,7 @@ from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError, DataError
 from nnode.generate.fit import fit_noise
 from nnode.generate.noise import (
+    SLOWEST,
     DifferentDrivers,
     Noise,
     allows_driver_differences,
@@ -22,7 +23,6 @@ from nnode.generate.noise import (
     free_running,
     sample,
 )
-from nnode.generate.people import SLOWEST
 from nnode.generate.scores import band
 from nnode.model import System, Traffic, build_model
 from nnode.model.laws import make_law
