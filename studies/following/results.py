@@ -121,7 +121,7 @@ class Study:
         table.insert(0, "train", self.calibrated["train"].map(np.mean))
         table.insert(0, "numbers", self.calibrated["row"].map(len))
         table["at a limit"] = self.calibrated["limits"].map(", ".join)
-        return table.rename_axis("candidate")
+        return table
 
     def objectives_heldout(self) -> pd.DataFrame:
         costs = {label: self.heldout(one).mean() for one, label in OBJECTIVES.items()}
