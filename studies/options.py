@@ -11,15 +11,14 @@ from omegaconf import MISSING
 from nnode.errors import ConfigError
 
 
-def option(default: Any, *, quick: Any = None, least: float = 0.0, above: bool = False) -> Any:
+def option(default: Any, *, quick: Any = None, least: float | None = None) -> Any:
     """A field with its value in a quick study and its limit.
 
     Args:
         quick: None keeps the value.
-        least: of the value, or of every value of a list.
-        above: the value must exceed ``least``.
+        least: of the value, or of every value of a list; None: they must be positive.
     """
-    metadata = {"quick": quick, "least": least, "above": above}
+    metadata = {"quick": quick, "least": least}
     return field(default_factory=lambda: copy.copy(default), metadata=metadata)
 
 
@@ -45,14 +44,14 @@ class TrafficStudyOptions(StudyOptions):
     # starts of n4 on the largest recording; smaller ones get more
     restarts: int = option(32, quick=4, least=1)
     iterations: int = option(150, quick=30, least=3)  # evaluations of the first search
-    dt: float = option(0.002, above=True)  # Euler step, s
-    box: float = option(1.0, above=True)  # bound on the weights where its effect is studied
+    dt: float = option(0.002)  # Euler step, s
+    box: float = option(1.0)  # bound on the weights where its effect is studied
     bootstrap: int = option(100, quick=10, least=2)  # resamples of the sequences
     folds: int = option(5, quick=2, least=2)  # of cross-validation
     descent_steps: int = option(1500, quick=30, least=1)  # updates of the paper's optimiser
-    descent_dt: float = option(0.01, above=True)  # Euler step during its updates, s
-    descent_lr: float = option(1.0, above=True)  # factor on them
-    batch_size: int = option(32)  # sequences in its mini-batches; 0: all
+    descent_dt: float = option(0.01)  # Euler step during its updates, s
+    descent_lr: float = option(1.0)  # factor on them
+    batch_size: int = option(32, least=0)  # sequences in its mini-batches; 0: all
 
 
 @dataclass
@@ -62,7 +61,7 @@ class CrowdStudyOptions(StudyOptions):
     name: str = "crowd"
     # start parameters per model; the better half goes on to longer horizons
     restarts: int = option(8, quick=1, least=1)
-    horizons: list[float] = option([1.0, 2.0, 3.0, 5.0], quick=slice(0, 3, 2), above=True)  # s
+    horizons: list[float] = option([1.0, 2.0, 3.0, 5.0], quick=slice(0, 3, 2))  # s
     folds: int = option(4, quick=2, least=2)  # blocks of time, each held out once
     # of the networks by Levenberg and Marquardt's method, at each length
     steps: int = option(4, quick=1, least=1)
@@ -74,7 +73,7 @@ class WalkingStudyOptions(StudyOptions):
     """Laws of people that the field uses, on two-way flows of other runs."""
 
     name: str = "walking"
-    horizons: list[float] = option([1.0, 2.0, 3.0, 4.0, 5.0], quick=slice(1), above=True)  # s
+    horizons: list[float] = option([1.0, 2.0, 3.0, 4.0, 5.0], quick=slice(1))  # s
     folds: int = option(2, quick=2, least=2)  # groups of runs, each held out once
 
 
@@ -108,9 +107,9 @@ def checked(options: StudyOptions) -> StudyOptions:
         if not limit or value is None:
             continue
         values = sorted(set(value)) if isinstance(value, list) else [value]
-        least, above = limit["least"], limit["above"]
-        if not values or values[0] < least or (above and values[0] == least):
-            what = "positive" if above else f"at least {least:g}"
+        least = limit["least"]
+        if not values or (values[0] <= 0 if least is None else values[0] < least):
+            what = "positive" if least is None else f"at least {least:g}"
             raise ConfigError(f"study.{one.name}={value} must be {what}")
         quick = limit["quick"] if options.quick else None
         if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Tasks in real processes: kept, gone on with, interrupted, killed, failing."""
+"""Tasks here, in other processes and on a Dask cluster: kept, interrupted, killed, failing."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +21,8 @@ import torch
 
 from benchmarks.speed.problems import Shape, pose
 from nnode import progress
-from nnode.errors import StudyError
+from nnode.calibrate.interrupt import Interrupted
+from nnode.errors import ConfigError, StudyError
 from nnode.simulation import TorchdiffeqSolver
 from studies import runner
 from studies.runner import Task, kept_results, run_tasks
@@ -71,14 +74,31 @@ def threads() -> Iterator[int]:
     torch.set_num_threads(before)
 
 
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """The address of a Dask cluster on this machine."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        yield str(cluster.scheduler_address)
+
+
+@pytest.fixture(params=["here", "processes", "cluster"])
+def where(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """Options of the runner: this process, others, or the workers of a cluster."""
+    if request.param == "cluster":
+        return {"workers": 1, "cluster": request.getfixturevalue("scheduler")}
+    return {"workers": 1 if request.param == "here" else 2}
+
+
 @pytest.mark.thorough
-@pytest.mark.parametrize("workers", [1, 2])
-def test_results_are_the_same_in_any_number_of_processes(
-    workers: int, tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch
+def test_results_are_the_same_wherever_tasks_run(
+    where: dict[str, Any], tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
     todo = [*squares(tmp_path, 3.0, 1.0, 2.0), Task("conditions", work.conditions, {})]
-    found = run_tasks(todo, tmp_path, workers=workers, fingerprint="f")
+    found = run_tasks(todo, tmp_path, fingerprint="f", **where)
     assert list(found) == ["square-3", "square-1", "square-2", "conditions"]
     assert [found[task.key].get("y") for task in todo] == [9.0, 1.0, 4.0, None]
     nan, *rest = found["conditions"]["values"]
@@ -86,11 +106,12 @@ def test_results_are_the_same_in_any_number_of_processes(
     assert rest == [math.inf, -0.1, 1e-300]
     assert found["conditions"]["text"] == "κ"
     assert found["conditions"]["threads"] == 1
-    assert (found["conditions"]["process"] == os.getpid()) == (workers == 1)
-    if workers > 1:
+    assert (found["conditions"]["process"] == os.getpid()) == (where == {"workers": 1})
+    if where["workers"] > 1:
         assert found["conditions"]["blas"] == "1"
     assert torch.get_num_threads() == threads
-    again = run_tasks(todo, tmp_path, workers=workers, fingerprint="f")
+    # nothing is computed twice, here or elsewhere
+    again = run_tasks(todo, tmp_path, workers=1, fingerprint="f")
     assert json.dumps(again) == json.dumps(found)
     assert len(calls(tmp_path)) == 3
 
@@ -129,13 +150,13 @@ def test_a_damaged_result_is_computed_again(text: str, tmp_path: Path, caplog) -
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("workers", [1, 2])
-def test_failing_tasks_let_the_others_finish(workers: int, tmp_path: Path) -> None:
+def test_failing_tasks_let_the_others_finish(where: dict[str, Any], tmp_path: Path) -> None:
+    workers = where["workers"]
     kinds = ["data", "python", "list", "object"] + ["exit", "killed"] * (workers > 1)
     bad = [Task(kind, work.fail, {"kind": kind}, cost=2.0) for kind in kinds]
     good = squares(tmp_path, 1.0, 2.0)
     with pytest.raises(StudyError) as caught:
-        run_tasks(bad + good, tmp_path, workers=workers, fingerprint="f")
+        run_tasks(bad + good, tmp_path, fingerprint="f", **where)
     text = str(caught.value)
     assert f"{len(kinds)} of {len(kinds) + 2} tasks failed" in text
     assert "data: recording 7: no rows" in text
@@ -188,6 +209,28 @@ def test_an_interrupted_study_goes_on_where_it_stopped(
     found = run_tasks(work.tasks(tmp_path), tmp_path, workers=1, fingerprint="f")
     assert len(found) == 4
     assert sorted(calls(tmp_path)) == ["1", "2"]
+
+
+def test_a_request_to_stop_waits_for_no_task_of_a_cluster(scheduler: str, tmp_path: Path) -> None:
+    tasks = [Task("sleep", work.sleep, {"folder": str(tmp_path), "name": "a"})]
+
+    def stop() -> None:
+        eventually((tmp_path / "sign-a").exists)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=stop, daemon=True).start()
+    start = time.monotonic()
+    with pytest.raises(Interrupted, match="0 of 1 tasks"):
+        run_tasks(tasks, tmp_path, workers=1, fingerprint="f", cluster=scheduler)
+    assert time.monotonic() - start < 30
+
+
+@pytest.mark.thorough
+def test_nobody_at_the_address_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("studies.workers.ANSWER", 0.5)
+    tasks = [Task("where", work.conditions, {})]
+    with pytest.raises(ConfigError, match="no scheduler answers"):
+        run_tasks(tasks, tmp_path, workers=1, fingerprint="f", cluster="tcp://127.0.0.1:9")
 
 
 @pytest.mark.slow

@@ -10,12 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from nnode.data.sequence import collate
 from nnode.pages.page import TableBlock, write_page
 from studies.following import printed, stability
 from studies.following.data import LEADERS, PAIRS, PLATOONS
 from studies.following.results import Study
 from studies.following.study import after, blocks, training
-from studies.following.tasks import EVERY, OBJECTIVES, key, named
+from studies.following.tasks import EVERY, OBJECTIVES, costs_of, key, named
 from studies.frame import tidy
 from studies.options import FollowingStudyOptions
 from studies.runner import Task
@@ -37,13 +38,8 @@ def invented() -> dict[str, dict[str, Any]]:
         },
     }
     for name, (held, test) in ERRORS.items():
-        system = EVERY[name].system()
-        row = [float(p.detach()) for p in system.parameters()]
-        cost = cast(
-            Any,
-            SimpleNamespace(names=[f"x.{n.split('.')[-1]}" for n, _ in system.named_parameters()]),
-        )
-        values = named(cost, np.array(row))
+        cost = costs_of(EVERY[name], collate(driven(1)))
+        row, values = cost.start.tolist(), named(cost, cost.start)
         noise = 0.1 * np.arange(6)
         found[f"cv-{key(name)}"] = {
             "row": row,
