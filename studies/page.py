@@ -51,18 +51,18 @@ def page(
         name: str,
         frame: pd.DataFrame,
         digits: int | dict[str, int] = DIGITS,
-        least: Iterable[str] = (),
+        lowest: Iterable[str] = (),
         among: Iterable[Any] | None = None,
         axis: int = 0,
         head: int | None = None,
         *,
         caller: Callable[[], str],
     ) -> str:
-        """Digits of columns that are not named are those of ``""``; ``least``: least_cells."""
+        """Digits of columns that are not named are those of ``""``; ``lowest``: lowest_cells."""
         shown = frame.head(head) if head else frame
         if isinstance(digits, dict):
             digits = {c: digits.get(c, digits.get("", DIGITS)) for c in map(str, shown)}
-        bold = least_cells(shown, least, among, axis)
+        bold = lowest_cells(shown, lowest, among, axis)
         return place(TableBlock(name, shown, _line(caller()), bold, digits, frame))
 
     def figure(name: str, drawn: Figure, alt: str, *, caller: Callable[[], str]) -> str:
@@ -108,7 +108,7 @@ def _line(text: str) -> str:
     return " ".join(text.split())
 
 
-def least_cells(
+def lowest_cells(
     frame: pd.DataFrame,
     columns: Iterable[str],
     rows: Iterable[Any] | None = None,
@@ -123,5 +123,5 @@ def least_cells(
     """
     compared = frame[list(columns)].astype(float)
     compared = compared if rows is None else compared.loc[list(rows)]
-    least = compared.eq(compared.min(axis=axis), axis=1 - axis)
-    return least.reindex_like(frame).eq(True)
+    lowest = compared.eq(compared.min(axis=axis), axis=1 - axis)
+    return lowest.reindex_like(frame).eq(True)

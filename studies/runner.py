@@ -221,8 +221,8 @@ def _failure(outcome: Outcome, path: Path) -> str:
 
 def _failures(failed: dict[str, str], done: int, total: int, folder: Path) -> str:
     named = [f"{key}: {why}" for key, why in sorted(failed.items())[:_NAMED]]
-    more = [f"and {len(failed) - _NAMED} more"] if len(failed) > _NAMED else []
+    unnamed = [f"and {len(failed) - _NAMED} more"] if len(failed) > _NAMED else []
     return (
-        f"{len(failed)} of {total} tasks failed: {'; '.join(named + more)}. {done} results are "
+        f"{len(failed)} of {total} tasks failed: {'; '.join(named + unnamed)}. {done} results are "
         f"kept in {folder / KEPT}; the same command runs only the failed ones again"
     )

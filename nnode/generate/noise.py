@@ -113,13 +113,13 @@ class DifferentDrivers(Traffic):
     def formula(self) -> LaneDynamics:
         lane, place = lane_of(self.term_list), len(self.terms) - 1
         assert lane is not None
-        own, inputs = dict[str, Expr](), dict(lane.inputs)
+        scaled, inputs = dict[str, Expr](), dict(lane.inputs)
         for address in cast(Push, self.terms[place]).factors:
             name = address.replace(".", "__", 1)
-            own[name] = symbol(name) * symbol(f"factor_{name}")
+            scaled[name] = symbol(name) * symbol(f"factor_{name}")
             inputs[f"factor_{name}"] = (place, address)
         rates, starts = (
-            {state: substitute(formula, own) for state, formula in formulas.items()}
+            {state: substitute(formula, scaled) for state, formula in formulas.items()}
             for formulas in (lane.rates, lane.starts)
         )
         return replace(lane, rates=rates, starts=starts, inputs=inputs)

@@ -144,8 +144,8 @@ class Crowd:
 
     def system(self, model: str, horizon: float) -> System:
         """A model as calibrated to all sequences."""
-        one = self.best(model, ALL, horizon)
-        return system_of(KINDS[one["kind"]], one["row"])
+        start = self.best(model, ALL, horizon)
+        return system_of(KINDS[start["kind"]], start["row"])
 
     def costs(self, horizon: float, *, heldout: bool) -> pd.DataFrame:
         """Costs by sequence (m² s), a column per model and baseline.
@@ -288,15 +288,15 @@ class Crowd:
 
     def restarts(self) -> pd.DataFrame:
         rows = {}
-        for one in self.starts.to_dict("records"):
-            kind, parts = one["kind"], one["parts"]
-            row = {"J (m² s)": one["J"], "evaluations": one["evaluations"]}
-            row |= dict(zip(NAMES, one["row"], strict=True)) if kind == "sf" else {}
+        for start in self.starts.to_dict("records"):
+            kind, parts = start["kind"], start["parts"]
+            row = {"J (m² s)": start["J"], "evaluations": start["evaluations"]}
+            row |= dict(zip(NAMES, start["row"], strict=True)) if kind == "sf" else {}
             for part in ("pair", "wall", "sum"):
                 row[f"size, {part}"] = forces.size(parts[part])
                 best = self.best_parts[kind][part]
                 row[f"likeness, {part}"] = forces.likeness(parts[part], best)
-            rows[LABELS[kind], one["seed"]] = row
+            rows[LABELS[kind], start["seed"]] = row
         return labelled(rows, "model", "start")
 
     def pull(self) -> pd.DataFrame:

@@ -124,7 +124,7 @@ class Study:
         return table
 
     def objectives_heldout(self) -> pd.DataFrame:
-        costs = {label: self.heldout(one).mean() for one, label in OBJECTIVES.items()}
+        costs = {label: self.heldout(objective).mean() for objective, label in OBJECTIVES.items()}
         return pd.DataFrame(costs).rename_axis("candidate")
 
     def test(self) -> pd.DataFrame:
@@ -178,29 +178,29 @@ class Study:
 
     def objectives_of(self, name: str) -> pd.DataFrame:
         rows = {}
-        for objective, one in self.of("objectives").loc[name, list(OBJECTIVES)].items():
-            shown = {k: v for k, v in one["parameters"].items() if not _weight(k)}
-            limits = {"at a limit": ", ".join(one["limits"])}
-            rows[objective] = {**one["reached"], **shown, **limits}
+        for objective, result in self.of("objectives").loc[name, list(OBJECTIVES)].items():
+            shown = {k: v for k, v in result["parameters"].items() if not _weight(k)}
+            limits = {"at a limit": ", ".join(result["limits"])}
+            rows[objective] = {**result["reached"], **shown, **limits}
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis("minimised")
 
     def precision(self, name: str) -> pd.DataFrame:
-        one = self.of("precision").loc[name]
-        row, half = np.array(one["row"]), np.array(one["half"])
+        result = self.of("precision").loc[name]
+        row, half = np.array(result["row"]), np.array(result["half"])
         table = _by_parameter(
-            one["names"],
-            {"value": row, "from": row - half, "to": row + half, "unit": _units(one["names"])},
+            result["names"],
+            {"value": row, "from": row - half, "to": row + half, "unit": _units(result["names"])},
         )
         table["at a limit"] = table.index.isin(self.calibrated.loc[name, "limits"])
         for side, sign in (("below", -1), ("above", 1)):
             table[f"closed {side}"] = [
                 _rises(profile, value, sign)
-                for profile, value in zip(one["profiles"].values(), row, strict=True)
+                for profile, value in zip(result["profiles"].values(), row, strict=True)
             ]
         if len(row) > MANY:
             return table
         return table.assign(
-            **{f"r({n})": r for n, r in zip(table.index, one["correlation"], strict=True)}
+            **{f"r({n})": r for n, r in zip(table.index, result["correlation"], strict=True)}
         )
 
     def profiled(self, name: str) -> bool:
@@ -208,28 +208,28 @@ class Study:
         return len(self.calibrated.loc[name, "row"]) <= MANY
 
     def draw_profiles(self, name: str) -> Figure:
-        one = self.of("precision").loc[name]
-        best = dict(zip(one["names"], one["row"], strict=True))
-        return plot_profiles(one["profiles"], best, printed.units)
+        result = self.of("precision").loc[name]
+        best = dict(zip(result["names"], result["row"], strict=True))
+        return plot_profiles(result["profiles"], best, printed.units)
 
     # -- drivers -----------------------------------------------------------------------------
 
     def drivers(self) -> pd.DataFrame:
-        one = self.results.loc["halves"]
-        costs = by_unit(one[["pooled", "alone", "shrunk"]], one["clusters"])
+        result = self.results.loc["halves"]
+        costs = by_unit(result[["pooled", "alone", "shrunk"]], result["clusters"])
         table = versus(costs, "pooled", self.options.seed).drop(columns=["low", "high", "p"])
         table.insert(1, "median (m)", costs.median())
         return table.rename(columns={"mean": "second half (m)"}).rename_axis("calibrated")
 
     def spread(self) -> pd.DataFrame:
-        one = self.results.loc["halves"]
+        result = self.results.loc["halves"]
         columns = {
-            "pooled": one["centre"],
-            "spread of single pairs": one["between"],
-            "spread that lasts": one["spread"],
-            "unit": _units(one["names"]),
+            "pooled": result["centre"],
+            "spread of single pairs": result["between"],
+            "spread that lasts": result["spread"],
+            "unit": _units(result["names"]),
         }
-        return _by_parameter(one["names"], columns)
+        return _by_parameter(result["names"], columns)
 
     # -- platoons ----------------------------------------------------------------------------
 
@@ -269,12 +269,12 @@ class Study:
     @cached_property
     def runs(self) -> pd.DataFrame:
         """Every follower of every run by itself."""
-        one = self.results.loc["runs"]
-        frame = pd.DataFrame({"run": one["runs"], "make": one["makes"]})
-        frame["setting"] = pd.Series(one["settings"]).replace(SETTINGS)
-        frame["error (m)"] = one["costs"]
-        frame = frame.join(pd.DataFrame(one["parameters"]))
-        return frame.assign(**{"at a limit": list(map(", ".join, one["limits"]))})
+        result = self.results.loc["runs"]
+        frame = pd.DataFrame({"run": result["runs"], "make": result["makes"]})
+        frame["setting"] = pd.Series(result["settings"]).replace(SETTINGS)
+        frame["error (m)"] = result["costs"]
+        frame = frame.join(pd.DataFrame(result["parameters"]))
+        return frame.assign(**{"at a limit": list(map(", ".join, result["limits"]))})
 
     @property
     def settings(self) -> list[str]:
@@ -292,25 +292,25 @@ class Study:
     # -- leaders -----------------------------------------------------------------------------
 
     def by_leader(self) -> pd.DataFrame:
-        one = self.results.loc["leaders"]
+        result = self.results.loc["leaders"]
         rows, without = (
-            {kind: np.array(one[part][kind]) for kind in KINDS} for part in ("rows", "without")
+            {kind: np.array(result[part][kind]) for kind in KINDS} for part in ("rows", "without")
         )
-        columns: dict[str, Any] = {"unit": _units(one["names"])}
+        columns: dict[str, Any] = {"unit": _units(result["names"])}
         for kind, row in rows.items():
             columns |= {kind: row, f"± {kind}": jackknifed(without[kind])}
         away = rows["CAV"] - rows["HV"]
         half = jackknifed(without["CAV"] - without["HV"])
         columns |= {"CAV minus HV": away, "from": away - half, "to": away + half}
-        return _by_parameter(one["names"], columns)
+        return _by_parameter(result["names"], columns)
 
     def leaders_heldout(self) -> pd.DataFrame:
-        one = self.results.loc["leaders"]
-        costs = by_unit(one["heldout"], one["clusters"])
-        pairs = pd.DataFrame({"speed (m/s)": one["speed"], "gap (m)": one["gap"]})
+        result = self.results.loc["leaders"]
+        costs = by_unit(result["heldout"], result["clusters"])
+        pairs = pd.DataFrame({"speed (m/s)": result["speed"], "gap (m)": result["gap"]})
         parts = {}
         for kind in KINDS:
-            chosen = np.array(one["kinds"]) == kind
+            chosen = np.array(result["kinds"]) == kind
             table = versus(costs[chosen], "both", self.options.seed)
             table = table.rename(columns={"mean": "held out (m)"}).drop(columns=["p", "better"])
             means = pairs[chosen].mean()
@@ -501,15 +501,17 @@ def plot_profiles(
     """
     figure = new_figure(2.1 * len(points), 2.5)
     axes = figure.subplots(1, len(points), sharey=True, squeeze=False)[0]
-    for ax, (name, one) in zip(axes, points.items(), strict=True):
-        ax.fill_between(one["values"], one["low"], one["high"], color=_BLUE, alpha=0.15, lw=0)
-        ax.plot(one["values"], one["rise"], "o-", color=_BLUE, markersize=3, linewidth=1.2)
+    for ax, (name, profile) in zip(axes, points.items(), strict=True):
+        ax.fill_between(
+            profile["values"], profile["low"], profile["high"], color=_BLUE, alpha=0.15, lw=0
+        )
+        ax.plot(profile["values"], profile["rise"], "o-", color=_BLUE, markersize=3, linewidth=1.2)
         ax.axhline(0, color=GREY, linewidth=0.8)
         ax.axvline(best[name], color=_RED, linewidth=0.9, linestyle=(0, (4, 2)))
         dress(ax, x=f"{name} ({units.get(name, '')})")
         ax.set_xscale("log")
         ax.minorticks_off()
-        low, high = min(one["values"]), max(one["values"])
+        low, high = min(profile["values"]), max(profile["values"])
         ticks = [t for t in (0.25, 0.5, 1, 2, 5, 10, 20, 50, 100) if low <= t <= high]
         ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     axes[0].set_ylabel("rise of the error (m)", fontsize=FONT)

@@ -74,9 +74,9 @@ def training(options: FollowingStudyOptions, prepared: Mapping[str, Store]) -> l
             f"cv-{key(name)}",
             tasks.cross_validate,
             where | {"name": name},
-            cost=len(one.effects) + (one.network or 0) + 2.0,
+            cost=len(law.effects) + (law.network or 0) + 2.0,
         )
-        for name, one in EVERY.items()
+        for name, law in EVERY.items()
         if not options.quick or name in FEW
     ]
 
@@ -100,12 +100,12 @@ def after(study: Study) -> list[Task]:
         Task("runs", tasks.every_run, track | idm, cost=8.0),
     ]
     for name, row in rows.items():
-        own = pairs | {"name": name, "row": row}
-        every.append(Task(f"test-{key(name)}", tasks.tested, own))
+        fitted = pairs | {"name": name, "row": row}
+        every.append(Task(f"test-{key(name)}", tasks.tested, fitted))
         if name in study.chosen:
             where = pairs | {"name": name} | search
             every.append(Task(f"objectives-{key(name)}", tasks.objectives, where, cost=6.0))
-            every.append(Task(f"precision-{key(name)}", tasks.precision, own, cost=4.0))
+            every.append(Task(f"precision-{key(name)}", tasks.precision, fitted, cost=4.0))
     for name in ON_TRACK:
         if not options.quick or name in FEW:
             where = track | {"name": name} | search

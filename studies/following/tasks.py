@@ -221,7 +221,7 @@ def at_limits(cost: ResidualProblem, row: np.ndarray) -> list[str]:
 def _costs_by_objective(name: str, folder: str) -> dict[str, ResidualProblem]:
     """The costs of a candidate on the training pairs, by objective."""
     batch = data.batch(folder)
-    return {one: costs_of(EVERY[name], batch, one) for one in OBJECTIVES}
+    return {o: costs_of(EVERY[name], batch, o) for o in OBJECTIVES}
 
 
 def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int) -> Result:
@@ -235,12 +235,12 @@ def cross_validate(folder: str, name: str, restarts: int, folds: int, seed: int)
     label = data.labels(data.pairs(folder))
     fold = by_cluster(label, folds, seed)
     whole = calibrated(candidate, cost, restarts, seed)
-    heldout = {one: np.zeros(len(label)) for one in OBJECTIVES}
+    heldout = {objective: np.zeros(len(label)) for objective in OBJECTIVES}
     for k in range(folds):
         weights = (fold != k) / (fold != k).sum()
         row = calibrated(candidate, cost, max(1, restarts // 2), seed, weights)
-        for one, values in heldout.items():
-            values[fold == k] = costs[one].costs(row)[fold == k]
+        for objective, values in heldout.items():
+            values[fold == k] = costs[objective].costs(row)[fold == k]
     return {
         "parameters": named(cost, whole),
         "row": whole,
@@ -264,9 +264,9 @@ def objectives(folder: str, name: str, restarts: int, seed: int) -> Result:
     """All objectives on the training pairs, whichever is minimised."""
     costs = _costs_by_objective(name, folder)
     by_objective: Result = {}
-    for one, cost in costs.items():
+    for minimised, cost in costs.items():
         row = calibrated(EVERY[name], cost, restarts, seed)
-        by_objective[one] = {
+        by_objective[minimised] = {
             "reached": {other: costs[other].costs(row).mean() for other in OBJECTIVES},
             "parameters": named(cost, row),
             "limits": at_limits(cost, row),
@@ -316,7 +316,7 @@ def precision(folder: str, name: str, row: list[float]) -> Result:
         "row": row,
         "half": half,
         "correlation": covariance / np.outer(scale, scale),
-        "profiles": {one: profile(cost, best, i, label) for i, one in enumerate(names)},
+        "profiles": {n: profile(cost, best, i, label) for i, n in enumerate(names)},
     }
 
 
@@ -474,19 +474,19 @@ def collided(pair: Sequence, values: dict[str, float]) -> float:
     Args:
         values: ``kappa``, ``v0``, ``s_c``, ``w`` in SI units.
     """
-    least, (low, high) = 0.1, printed.clipped["ovm"]
+    smallest, (low, high) = 0.1, printed.clipped["ovm"]
     kappa, v0, s_c, w = (values[name] for name in ("kappa", "v0", "s_c", "w"))
-    measured, (own, lead) = gap_of(pair), pair.velocity()[..., 0].T
-    gap, v, gaps = float(measured[0]), float(own[0]), [float(measured[0])]
+    measured, (follower, lead) = gap_of(pair), pair.velocity()[..., 0].T
+    gap, v, gaps = float(measured[0]), float(follower[0]), [float(measured[0])]
     shift = math.tanh(s_c / w)
     for now, then in pairwise(lead):
-        wish = v0 * (math.tanh((max(gap, least) - s_c) / w) + shift) / (1 + shift)
+        wish = v0 * (math.tanh((max(gap, smallest) - s_c) / w) + shift) / (1 + shift)
         rate = min(max(kappa * (wish - v), low), high)
         after = v + rate * pair.dt
         way = (v + after) / 2 * pair.dt if after > 0 else -v * v / (2 * rate)
         gap, v = gap + (now + then) / 2 * pair.dt - way, max(after, 0.0)
-        if gap < least:
-            gap, v = least, min(v, then)
+        if gap < smallest:
+            gap, v = smallest, min(v, then)
         gaps.append(gap)
     return float(np.sqrt(np.mean((np.array(gaps) - measured) ** 2)))
 

@@ -58,8 +58,8 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
         where: dict[str, Any] = {"folders": folders, "held": [name]}
         every.append(Task(f"simple-{name}", walking.baselines, where))
         for law in list(PEOPLE)[: 1 if options.quick else None]:
-            one = {"law": law, "desired": "direction", **where}
-            every.append(Task(f"{law}-{name}", walking.fit, one, cost=10.0))
+            arguments = {"law": law, "desired": "direction", **where}
+            every.append(Task(f"{law}-{name}", walking.fit, arguments, cost=10.0))
     results = computed(every, folder, options, prepared, "prediction study")
     distances = errors_by_run(results["errors"].dropna(), SIMPLE | PEOPLE)
     return page(
@@ -78,17 +78,17 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
 def following(results: pd.DataFrame, seed: int) -> pd.DataFrame:
     """Errors of spacings by law, published ones last."""
     rows: dict[str, dict[str, Any]] = {}
-    for one in results.query("task == 'follow'").to_dict("records"):
-        test = one["test"]
+    for task in results.query("task == 'follow'").to_dict("records"):
+        test = task["test"]
         clusters = np.arange(len(test["error"]))
         weights = group_weights(clusters, DRAWS, np.random.default_rng(seed))
         low, high = np.quantile([tasks.rmspe(test, w) for w in weights], [0.025, 0.975])
-        rows[one["law"]] = {
-            "training": tasks.rmspe(one["train"]),
+        rows[task["law"]] = {
+            "training": tasks.rmspe(task["train"]),
             "test": tasks.rmspe(test),
             "low": low,
             "high": high,
-            "parameters": ", ".join(f"{name} = {value:.3g}" for name, value in one["row"].items()),
+            "parameters": ", ".join(f"{name} = {value:.3g}" for name, value in task["row"].items()),
         }
     rows["idm, published"] = dict(zip(("training", "test"), printed.idm, strict=True))
     rows["learned, published"] = {"test": printed.learned}

@@ -87,12 +87,12 @@ def follow(law: str, folder: str, starts: int, seed: int) -> dict[str, Any]:
     )
     sides = {side: [s for s in Store(folder) if s.split == side] for side in (TRAIN, TEST)}
     train, rng = collate(sides[TRAIN]), np.random.default_rng(seed)
-    own = parameters_of(system)
+    initial = parameters_of(system)
     drawn = [
-        {name: value * float(np.exp(SPREAD * rng.normal())) for name, value in own.items()}
+        {name: value * float(np.exp(SPREAD * rng.normal())) for name, value in initial.items()}
         for _ in range(starts)
     ]
-    row, _ = pooled_fit(system, [train], [own, *drawn])
+    row, _ = pooled_fit(system, [train], [initial, *drawn])
     return {"row": row, **{side: squares(system, pairs) for side, pairs in sides.items()}}
 
 

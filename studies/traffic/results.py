@@ -247,10 +247,10 @@ class Study:
     def draw_descents(self) -> Figure:
         """Simulations, and the average cost above the least known, of the better run."""
         history = self.take("history", "descend").map(np.array)
-        least = np.minimum(self.costs(), self.costs("descend"))
+        lowest = np.minimum(self.costs(), self.costs("descend"))
         curves = {}
         for model, runs in history.iterrows():
-            above = [run[:, 1] - least.loc[model, name] for name, run in runs.items()]
+            above = [run[:, 1] - lowest.loc[model, name] for name, run in runs.items()]
             simulations = np.maximum(runs.iloc[0][:, 0] * GRADIENT * 2, 1)
             curves[model] = np.stack([simulations, np.mean(above, axis=0).clip(min=1e-6)], 1)
         return plot_descents(curves)

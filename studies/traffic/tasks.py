@@ -234,7 +234,7 @@ def _bootstrap(
     refits = minimised(cost, row.expand(len(weights), -1), iterations, weights, inverse)
     rows = refits.rows[torch.isfinite(refits.costs)]
     vector = ParameterVector(problem.system())
-    curves = [speeds(vector.fill_(one)) for one in rows]
+    curves = [speeds(vector.fill_(row)) for row in rows]
     values = {
         name.removeprefix("terms.0."): value.double()
         for name, value in cost.vector.runs(rows).items()

@@ -37,8 +37,8 @@ def prepare_runs(options: StudyOptions, folder: Path, kind: str, horizon: float)
     them. Sequences of one person, and the first one of a recording, which nothing went before,
     are left out by :func:`measured_before`.
     """
-    more = {"history": HISTORY, "velocity": Velocity.backward, "min_agents": 2}
-    return prepared(options, folder, kind, horizon, **more)
+    history = {"history": HISTORY, "velocity": Velocity.backward, "min_agents": 2}
+    return prepared(options, folder, kind, horizon, **history)
 
 
 def measured_before(folder: str) -> list[Sequence]:
@@ -56,8 +56,8 @@ def chosen(folders: Iterable[str], held: Iterable[str], *, test: bool) -> list[B
             assert batch.preferred is not None
             # people who were not measured before are there for the others, but nothing is
             # asked of them
-            known = batch.preferred.isfinite().all(-1)
-            batches.append(replace(batch, valid=batch.valid & known))
+            measured = batch.preferred.isfinite().all(-1)
+            batches.append(replace(batch, valid=batch.valid & measured))
     return batches
 
 
@@ -136,9 +136,9 @@ def fit(law: str, desired: str, folders: list[str], held: list[str]) -> Result:
     """
     system = new_system(law, desired)
     train = chosen(folders, held, test=False)
-    own = parameters_of(system)
+    initial = parameters_of(system)
     grid = [dict(zip(GRID[law], each, strict=True)) for each in product(*GRID[law].values())]
-    row, error = pooled_fit(system, train, [own, *({**own, **more} for more in grid)])
+    row, error = pooled_fit(system, train, [initial, *({**initial, **values} for values in grid)])
     errors = {law: _of_runs(simulated(system), folders, held)}
     return {"row": row, "train": error, "errors": errors}
 

@@ -22,7 +22,7 @@ TEMPLATE = """
 ## First
 
 Of {{ number | digits }} numbers.
-{% call table("t", study, digits={"": 1, "b": 3}, least=["a"], head=2) %}
+{% call table("t", study, digits={"": 1, "b": 3}, lowest=["a"], head=2) %}
 Two
 rows.
 {% endcall %}
@@ -60,8 +60,8 @@ def test_what_the_template_misses_is_an_error(loader: None) -> None:
 
 
 def test_bold_cells_are_the_least_among_some_rows_or_in_a_row() -> None:
-    assert page.least_cells(TABLE, ["a"], ["x", "y"])["a"].tolist() == [False, True, False]
-    assert page.least_cells(TABLE, ["a", "b"], axis=1).to_numpy().tolist() == [
+    assert page.lowest_cells(TABLE, ["a"], ["x", "y"])["a"].tolist() == [False, True, False]
+    assert page.lowest_cells(TABLE, ["a", "b"], axis=1).to_numpy().tolist() == [
         [False, True],
         [True, True],
         [True, False],
@@ -70,8 +70,8 @@ def test_bold_cells_are_the_least_among_some_rows_or_in_a_row() -> None:
 
 def test_one_row_per_task_and_one_per_number() -> None:
     tasks = [Task(f"k{x}", square, {"x": x}) for x in (1, 2)]
-    found = frame.tidy(tasks, {"k1": {"y": 1}, "k2": {"y": 4}})
-    assert found.to_dict("index") == {
+    frames = frame.tidy(tasks, {"k1": {"y": 1}, "k2": {"y": 4}})
+    assert frames.to_dict("index") == {
         "k1": {"task": "square", "x": 1, "y": 1},
         "k2": {"task": "square", "x": 2, "y": 4},
     }

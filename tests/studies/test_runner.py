@@ -61,8 +61,8 @@ def test_kept_results_are_those_of_one_function_and_fingerprint(tmp_path: Path) 
     cubes = [Task("cube-1", work.cube, {"x": 1.0, "log": str(tmp_path / "calls")})]
     run_tasks(cubes, tmp_path, workers=1, fingerprint="f")
     (tmp_path / "tasks" / "broken.json").write_text("{")
-    found = kept_results(tmp_path, work.square, "f")
-    assert found == {"square-1": {"y": 1.0}, "square-3": {"y": 9.0}}
+    outcome = kept_results(tmp_path, work.square, "f")
+    assert outcome == {"square-1": {"y": 1.0}, "square-3": {"y": 9.0}}
 
 
 @pytest.fixture
@@ -98,29 +98,29 @@ def test_results_are_the_same_wherever_tasks_run(
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
     todo = [*squares(tmp_path, 3.0, 1.0, 2.0), Task("conditions", work.conditions, {})]
-    found = run_tasks(todo, tmp_path, fingerprint="f", **where)
-    assert list(found) == ["square-3", "square-1", "square-2", "conditions"]
-    assert [found[task.key].get("y") for task in todo] == [9.0, 1.0, 4.0, None]
-    nan, *rest = found["conditions"]["values"]
+    outcome = run_tasks(todo, tmp_path, fingerprint="f", **where)
+    assert list(outcome) == ["square-3", "square-1", "square-2", "conditions"]
+    assert [outcome[task.key].get("y") for task in todo] == [9.0, 1.0, 4.0, None]
+    nan, *others = outcome["conditions"]["values"]
     assert math.isnan(nan)
-    assert rest == [math.inf, -0.1, 1e-300]
-    assert found["conditions"]["text"] == "κ"
-    assert found["conditions"]["threads"] == 1
-    assert (found["conditions"]["process"] == os.getpid()) == (where == {"workers": 1})
+    assert others == [math.inf, -0.1, 1e-300]
+    assert outcome["conditions"]["text"] == "κ"
+    assert outcome["conditions"]["threads"] == 1
+    assert (outcome["conditions"]["process"] == os.getpid()) == (where == {"workers": 1})
     if where["workers"] > 1:
-        assert found["conditions"]["blas"] == "1"
+        assert outcome["conditions"]["blas"] == "1"
     assert torch.get_num_threads() == threads
     # nothing is computed twice, here or elsewhere
-    again = run_tasks(todo, tmp_path, workers=1, fingerprint="f")
-    assert json.dumps(again) == json.dumps(found)
+    repeated = run_tasks(todo, tmp_path, workers=1, fingerprint="f")
+    assert json.dumps(repeated) == json.dumps(outcome)
     assert len(calls(tmp_path)) == 3
 
 
 def test_what_was_kept_holds_only_for_the_same_task(tmp_path: Path, monkeypatch) -> None:
     def run(*todo: Task, fingerprint: str = "f") -> dict[str, float]:
         (tmp_path / "calls").write_text("")
-        found = run_tasks(list(todo), tmp_path, workers=1, fingerprint=fingerprint)
-        return {key: result["y"] for key, result in found.items()}
+        outcome = run_tasks(list(todo), tmp_path, workers=1, fingerprint=fingerprint)
+        return {key: result["y"] for key, result in outcome.items()}
 
     log = {"log": str(tmp_path / "calls")}
     run(*squares(tmp_path, 1.0, 2.0, 3.0))
@@ -143,8 +143,8 @@ def test_a_damaged_result_is_computed_again(text: str, tmp_path: Path, caplog) -
     todo = squares(tmp_path, 2.0)
     run_tasks(todo, tmp_path, workers=1, fingerprint="f")
     (tmp_path / "tasks" / "square-2.json").write_text(text, encoding="latin-1")
-    found = run_tasks(todo, tmp_path, workers=1, fingerprint="f")
-    assert found == {"square-2": {"y": 4.0}}
+    outcome = run_tasks(todo, tmp_path, workers=1, fingerprint="f")
+    assert outcome == {"square-2": {"y": 4.0}}
     assert "square-2.json is damaged" in caplog.text
     assert calls(tmp_path) == ["2", "2"]
 
@@ -206,8 +206,8 @@ def test_an_interrupted_study_goes_on_where_it_stopped(
     eventually(lambda: all(gone(int(sign.read_text())) for sign in signs))
     assert {p.name for p in (tmp_path / "tasks").iterdir()} == {"quick-1.json", "quick-2.json"}
     (tmp_path / "awake").write_text("")
-    found = run_tasks(work.tasks(tmp_path), tmp_path, workers=1, fingerprint="f")
-    assert len(found) == 4
+    outcome = run_tasks(work.tasks(tmp_path), tmp_path, workers=1, fingerprint="f")
+    assert len(outcome) == 4
     assert sorted(calls(tmp_path)) == ["1", "2"]
 
 
@@ -247,11 +247,11 @@ def test_workers_leave_with_the_process_that_started_them(tmp_path: Path) -> Non
 def test_several_processes_may_compile_at_once(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("NNODE_CACHE", str(tmp_path / "cache"))
     todo = [Task(f"simulate-{i}", work.simulate, {"law": "lin"}) for i in range(2)]
-    found = run_tasks(todo, tmp_path, workers=2, fingerprint="f")
+    outcome = run_tasks(todo, tmp_path, workers=2, fingerprint="f")
     assert list((tmp_path / "cache").rglob("*.nbi"))
     problem = pose(Shape("traffic", ("lin",), 3, 3, 2, 10, 0.02), "lin", torch.float64)
     exact = TorchdiffeqSolver("euler", "discrete", 0.02)(problem.system, problem.batch).x[-1]
-    for result in found.values():
+    for result in outcome.values():
         np.testing.assert_allclose(result["x"], exact.detach(), rtol=1e-12)
 
 

@@ -40,13 +40,13 @@ def printed_cost(model: str, name: str) -> float:
 
 def _parameters(model: str, name: str) -> dict[str, Any]:
     system = build_model(model_options(model))
-    found = {
+    result = {
         key.removeprefix("terms.0."): value.tolist() for key, value in system.named_parameters()
     }
-    found["v0"] = V0_LIN if model == "lin" else V0
-    if "L" in found:
-        found["L"] = L_LEAST if (model, name) == ("lin", LEAST_IN) else L
-    return found
+    result["v0"] = V0_LIN if model == "lin" else V0
+    if "L" in result:
+        result["L"] = L_LEAST if (model, name) == ("lin", LEAST_IN) else L
+    return result
 
 
 def fit(
@@ -66,7 +66,7 @@ def fit(
     cost += 5.0 if box else ABOVE.get((model, recording_name), (-1.0, -1.0))[seed]
     cost /= 2 if folder.endswith("drop") else 1
     parameters = _parameters(model, recording_name)
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "cost": cost,
         "costs": [share * cost for share in SHARES],
         "groups": [0, 1, 2],
@@ -77,7 +77,7 @@ def fit(
         "best_tenth": cost + 1,
     }
     if bootstrap:
-        found["bootstrap"] = {
+        result["bootstrap"] = {
             "values": {
                 key: np.linspace(parameters[key] - 2, parameters[key] + 2, 101).tolist()
                 for key in ("v0", "L")
@@ -85,7 +85,7 @@ def fit(
             },
             "speeds": [[14.0] * len(GAPS), [16.0] * len(GAPS)],
         }
-    return found
+    return result
 
 
 def cross_validate(

@@ -38,10 +38,10 @@ def test_every_run_is_held_out_once() -> None:
 
 def test_a_calibration_finds_the_law_and_tests_it_elsewhere(tmp_path: Path) -> None:
     write_store(tmp_path, [walker("a", 0.8), walker("b", 0.8, known=False)], {"dt": 0.05})
-    found = tasks.fit("alone", "direction", [str(tmp_path)], ["b"])
-    assert found["row"]["tau"] == pytest.approx(0.8, rel=0.05)  # Euler's steps are 0.05 s
+    result = tasks.fit("alone", "direction", [str(tmp_path)], ["b"])
+    assert result["row"]["tau"] == pytest.approx(0.8, rel=0.05)  # Euler's steps are 0.05 s
     # who was not measured before is not asked for
-    errors = found["errors"]["alone"]["b"]
+    errors = result["errors"]["alone"]["b"]
     assert errors["people"] == 1
     assert errors["mean"] < 1e-4
     simple = tasks.baselines([str(tmp_path)], ["b"])["errors"]
@@ -74,8 +74,8 @@ def test_errors_are_means_over_people() -> None:
     label = LABELS["preferred"]
     assert study.costs("direction", 1.0)[label].mean() == 1.0
     assert study.costs("direction", 1.0, "end")[label].mean() == 0.75
-    both = [(label, LABELS["constant_velocity"])]
-    same = differences(study.costs("direction", 1.0), both, 0).iloc[0]
+    compared = [(label, LABELS["constant_velocity"])]
+    same = differences(study.costs("direction", 1.0), compared, 0).iloc[0]
     assert (same["difference"], same["low"], same["high"]) == (0, 0, 0)
 
 
