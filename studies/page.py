@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -22,6 +22,8 @@ from nnode.data.store import Store
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
 from nnode.pages.replay import ReplayBlock, Scene
 from nnode.pages.tables import DIGITS, number
+
+Axis = Literal[0, 1]
 
 #: Lines that are a heading, or that stand for a placed block.
 _SEPARATE = re.compile(r"^(#{2,4} .+|\0\d+)$", re.M)
@@ -53,7 +55,7 @@ def page(
         digits: int | dict[str, int] = DIGITS,
         lowest: Iterable[str] = (),
         among: Iterable[Any] | None = None,
-        axis: int = 0,
+        axis: Axis = 0,
         head: int | None = None,
         *,
         caller: Callable[[], str],
@@ -112,7 +114,7 @@ def lowest_cells(
     frame: pd.DataFrame,
     columns: Iterable[str],
     rows: Iterable[Any] | None = None,
-    axis: int = 0,
+    axis: Axis = 0,
 ) -> pd.DataFrame:
     """The cells that are set in bold: the least cell of each column, or of each row.
 
@@ -123,5 +125,5 @@ def lowest_cells(
     """
     compared = frame[list(columns)].astype(float)
     compared = compared if rows is None else compared.loc[list(rows)]
-    lowest = compared.eq(compared.min(axis=axis), axis=1 - axis)
+    lowest = compared.eq(compared.min(axis=axis), axis=0 if axis else 1)
     return lowest.reindex_like(frame).eq(True)

@@ -80,7 +80,7 @@ def beside_printed(model: str, table: pd.DataFrame) -> pd.DataFrame:
     """
     people = by_person(table)
     told = np.reshape(printed.forces[model], (-1, 2))
-    columns = {
+    columns: dict[str, Any] = {
         "place (m)": [f"({x:g}; {y:g})" for x, y in people["x"]],
         "velocity (m/s)": [f"({x:g}; {y:g})" for x, y in people["v"]],
     }
@@ -355,7 +355,7 @@ class Crowd:
             h: means(self.costs(h, heldout=True), self.options.seed).loc[shown]
             for h in self.options.horizons
         }
-        columns = pd.concat(tables, axis=1).swaplevel(axis=1)
+        columns: Any = pd.concat(tables, axis=1).swaplevel(axis=1)
         return horizon_costs(columns["mean"], columns["low"], columns["high"])
 
     def scenes(self) -> list[Scene]:

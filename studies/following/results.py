@@ -371,7 +371,7 @@ class Study:
     @cached_property
     def slopes(self) -> dict[tuple[str, float], tuple[float, stability.Slopes]]:
         """Equilibrium gap, and slopes there, by candidate and speed; only where it exists."""
-        gaps = self.equilibria(SPEEDS, self.continuous)
+        gaps: Any = self.equilibria(SPEEDS, self.continuous)
         return {
             (name, v): (gap, stability.slopes(self.systems[name], gap, v, self.length))
             for name in gaps

@@ -93,9 +93,9 @@ class Candidate:
 def candidate(name: str) -> Candidate:
     """The law and the effects of a name such as ``idm + reaction delay + network 4``."""
     law, *added = name.replace(" ", "_").split("_+_")
-    neurons = [int(part.removeprefix("network_")) for part in added if "network" in part]
-    effects = tuple(part for part in added if "network" not in part)
-    return Candidate(law, effects, *neurons)
+    neurons = {part: int(part.removeprefix("network_")) for part in added if "network" in part}
+    effects = tuple(part for part in added if part not in neurons)
+    return Candidate(law, effects, next(iter(neurons.values()), None))
 
 
 def published_law(name: str, values: dict[str, float]) -> dict[str, Any]:
@@ -294,8 +294,6 @@ def reproduced_pairs(folder: str) -> Result:
     return errors
 
 
-Result = dict[str, Any]
-
 #: Factors on a parameter, at which all others are calibrated again.
 PROFILE = np.geomspace(0.25, 4, 17)
 
@@ -367,8 +365,6 @@ def halves(
     return {"names": list(named(first, results.centre)), **vars(results), "clusters": label}
 
 
-Result = dict[str, Any]
-
 #: Kinds of leaders: people, automated cars.
 KINDS = ("HV", "CAV")
 
@@ -416,8 +412,6 @@ def jackknifed(left_out: np.ndarray) -> np.ndarray:
     error = np.sqrt((number - 1) / number * (away**2).sum(0))
     return error * float(t.ppf(0.975, number - 1))
 
-
-Result = dict[str, Any]
 
 #: Laws that are tried on commercial cars, those of accelerations also with what delays them.
 ACCELERATIONS = ("idm", "gipps", "ovm", "fvdm", "helly")

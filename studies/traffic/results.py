@@ -209,9 +209,9 @@ class Study:
         order = [*BASELINES, *LAWS, *(m + s for m in NETWORKS for s in ("-box", ""))]
         return stacked.reindex([(f, m) for f in ("keep", "drop") for m in order])
 
-    def significance(self) -> pd.DataFrame:
+    def significance(self) -> Any:
         models = [*LAWS, *(m + "-box" for m in NETWORKS), "no_interaction"]
-        pairs = differences(self.heldout["keep"], combinations(models, 2), self.options.seed)
+        pairs: Any = differences(self.heldout["keep"], combinations(models, 2), self.options.seed)
         pairs["first is better (%)"] = 100 * pairs.pop("better")
         pairs.index = pd.Index([" − ".join(pair) for pair in pairs.index], name="pair")
         return pairs.assign(**{"p, Holm": pd.Series(holm(pairs["p"].to_dict()))})
