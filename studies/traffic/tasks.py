@@ -200,7 +200,7 @@ def fit(
     residual = optimality_residual(minima.rows, minima.costs, minima.gradients, cost.low, cost.high)
     result: Result = {
         "cost": minima.costs[minima.best],
-        "costs": cost.costs(best)[0],
+        "costs": cost.costs(best)[0].numpy(),
         "groups": group,
         "parameters": named(cost, best),
         "residual": residual[minima.best],
@@ -265,7 +265,7 @@ def cross_validate(
     fold = (np.random.default_rng(seed).permutation(number) % min(folds, number))[group]
     problem = Problem(recording(folder, recording_name), model, box)
     rows = problem.search_folds(fold, problem.starts(restarts, seed + 1), dt, iterations)
-    each = problem.cost(dt, torch.float64).costs(rows)
+    each = problem.cost(dt, torch.float64).costs(rows).numpy()
     simple = {name: np.empty(len(fold)) for name in BASELINES}
     for k in range(len(rows)):
         train, test = (
@@ -350,5 +350,5 @@ def scan(folder: str, recording_name: str, model: str, points: int, dt: float) -
     }
     grid = torch.cartesian_prod(*(axes[name] for name in names))
     costs = torch.cat([cost.costs(part).mean(1) for part in grid.split(256)])
-    by_length = costs.reshape(points, points).amin(names.index("v0"))
-    return {"cost": costs.min(), "lengths": axes["L"], "by_length": by_length}
+    by_length = costs.reshape(points, points).amin(names.index("v0")).numpy()
+    return {"cost": costs.min(), "lengths": axes["L"].numpy(), "by_length": by_length}

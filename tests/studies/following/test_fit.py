@@ -92,7 +92,6 @@ def test_cross_validation_finds_the_hidden_law(pairs_by_helly: list[Sequence]) -
     assert result["parameters"] == pytest.approx(HELLY, rel=1e-3)
     assert max(result["heldout"]["spacing"]) < 1e-3
     assert result["limits"] == []
-    assert len(result["starts"]) == 2
 
 
 @pytest.mark.thorough  # calibrations of every pair, some thirty times
@@ -119,7 +118,7 @@ def test_a_profile_is_least_at_the_best_value(pairs_by_helly: list[Sequence]) ->
     before = cost.low.copy()
     result = tasks.profile(cost, best, 2, np.arange(6))
     rise = np.array(result["rise"])
-    assert result["values"] == sorted(result["values"])
+    assert list(result["values"]) == sorted(result["values"])
     assert result["values"][int(rise.argmin())] == pytest.approx(HELLY["T"], rel=1e-9)
     assert (rise >= -1e-9).all()
     assert cost.low.tolist() == before.tolist()
