@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -41,14 +40,11 @@ def error_bars(
         )
 
 
-def horizon_costs(
-    horizons: Sequence[float], costs: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame
-) -> Figure:
+def horizon_costs(costs: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -> Figure:
     """Cost relative to the first row's, against the horizon.
 
     Args:
-        horizons: s.
-        costs: m² s; a row per model, a column per horizon.
+        costs: m² s; a row per model, a column per horizon (s).
         low, high: ends of the intervals, the same layout, NaN where there is none.
     """
     figure = new_figure(6.6, 3.8)
@@ -60,7 +56,7 @@ def horizon_costs(
     ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
     ax.set_ylim(np.nanmin(costs / unit) / 1.25, np.nanmax(costs / unit) * 1.25)
-    ax.set_xticks(range(len(horizons)), [f"{h:g}" for h in horizons])
+    ax.set_xticks(range(len(costs.columns)), [f"{h:g}" for h in costs])
     dress(ax, x="length of a sequence (s)", y=f"held-out J / J of {costs.index[0]}")
     legend_above(figure, ax.get_legend_handles_labels()[0])
     return figure

@@ -27,7 +27,7 @@ def tidy(tasks: Iterable[Task], results: Mapping[str, Mapping[str, Any]]) -> pd.
 
 
 def computed(
-    tasks: list[Task], folder: Path, options: StudyOptions, stores: Mapping[str, Store], title: str
+    tasks: list[Task], folder: Path, options: StudyOptions, stores: Mapping[Any, Store], title: str
 ) -> pd.DataFrame:
     """The :func:`tidy` results of all tasks, which read some prepared data.
 

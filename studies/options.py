@@ -11,15 +11,14 @@ from omegaconf import MISSING
 from nnode.errors import ConfigError
 
 
-def option(default: Any, *, quick: Any = None, least: float = 0.0, above: bool = False) -> Any:
+def option(default: Any, *, quick: Any = None, minimum: float | None = None) -> Any:
     """A field with its value in a quick study and its limit.
 
     Args:
         quick: None keeps the value.
-        least: of the value, or of every value of a list.
-        above: the value must exceed ``least``.
+        minimum: of the value, or of every value of a list; None: they must be positive.
     """
-    metadata = {"quick": quick, "least": least, "above": above}
+    metadata = {"quick": quick, "minimum": minimum}
     return field(default_factory=lambda: copy.copy(default), metadata=metadata)
 
 
@@ -31,7 +30,7 @@ class StudyOptions:
     source: str | None = None  # folder with the raw files; null downloads
     download: str | None = None  # folder for downloaded files; null: raw/ in the study's folder
     quick: bool = False  # few restarts, few resamples: shows that all works, no figures to cite
-    workers: int | None = option(None, least=1)  # processes; null: one per core
+    workers: int | None = option(None, minimum=1)  # processes; null: one per core
     # address of a Dask scheduler, such as tcp://host:8786, whose workers do the work instead
     cluster: str | None = None
     seed: int = 0  # of start parameters and of resampling
@@ -43,16 +42,16 @@ class TrafficStudyOptions(StudyOptions):
 
     name: str = "traffic"
     # starts of n4 on the largest recording; smaller ones get more
-    restarts: int = option(32, quick=4, least=1)
-    iterations: int = option(150, quick=30, least=3)  # evaluations of the first search
-    dt: float = option(0.002, above=True)  # Euler step, s
-    box: float = option(1.0, above=True)  # bound on the weights where its effect is studied
-    bootstrap: int = option(100, quick=10, least=2)  # resamples of the sequences
-    folds: int = option(5, quick=2, least=2)  # of cross-validation
-    descent_steps: int = option(1500, quick=30, least=1)  # updates of the paper's optimiser
-    descent_dt: float = option(0.01, above=True)  # Euler step during its updates, s
-    descent_lr: float = option(1.0, above=True)  # factor on them
-    batch_size: int = option(32)  # sequences in its mini-batches; 0: all
+    restarts: int = option(32, quick=4, minimum=1)
+    iterations: int = option(150, quick=30, minimum=3)  # evaluations of the first search
+    dt: float = option(0.002)  # Euler step, s
+    box: float = option(1.0)  # bound on the weights where its effect is studied
+    bootstrap: int = option(100, quick=10, minimum=2)  # resamples of the sequences
+    folds: int = option(5, quick=2, minimum=2)  # of cross-validation
+    descent_steps: int = option(1500, quick=30, minimum=1)  # updates of the paper's optimiser
+    descent_dt: float = option(0.01)  # Euler step during its updates, s
+    descent_lr: float = option(1.0)  # factor on them
+    batch_size: int = option(32, minimum=0)  # sequences in its mini-batches; 0: all
 
 
 @dataclass
@@ -61,12 +60,12 @@ class CrowdStudyOptions(StudyOptions):
 
     name: str = "crowd"
     # start parameters per model; the better half goes on to longer horizons
-    restarts: int = option(8, quick=1, least=1)
-    horizons: list[float] = option([1.0, 2.0, 3.0, 5.0], quick=slice(0, 3, 2), above=True)  # s
-    folds: int = option(4, quick=2, least=2)  # blocks of time, each held out once
+    restarts: int = option(8, quick=1, minimum=1)
+    horizons: list[float] = option([1.0, 2.0, 3.0, 5.0], quick=slice(0, 3, 2))  # s
+    folds: int = option(4, quick=2, minimum=2)  # blocks of time, each held out once
     # of the networks by Levenberg and Marquardt's method, at each length
-    steps: int = option(4, quick=1, least=1)
-    bootstrap: int = option(100, quick=4, least=2)  # resamples of stretches of time
+    steps: int = option(4, quick=1, minimum=1)
+    bootstrap: int = option(100, quick=4, minimum=2)  # resamples of stretches of time
 
 
 @dataclass
@@ -74,8 +73,8 @@ class WalkingStudyOptions(StudyOptions):
     """Laws of people that the field uses, on two-way flows of other runs."""
 
     name: str = "walking"
-    horizons: list[float] = option([1.0, 2.0, 3.0, 4.0, 5.0], quick=slice(1), above=True)  # s
-    folds: int = option(2, quick=2, least=2)  # groups of runs, each held out once
+    horizons: list[float] = option([1.0, 2.0, 3.0, 4.0, 5.0], quick=slice(1))  # s
+    folds: int = option(2, quick=2, minimum=2)  # groups of runs, each held out once
 
 
 @dataclass
@@ -84,8 +83,8 @@ class FollowingStudyOptions(StudyOptions):
 
     name: str = "following"
     # starts of every calibration; networks get as many
-    restarts: int = option(4, quick=1, least=1)
-    folds: int = option(5, quick=2, least=2)  # of cross-validation, by cluster
+    restarts: int = option(4, quick=1, minimum=1)
+    folds: int = option(5, quick=2, minimum=2)  # of cross-validation, by cluster
 
 
 @dataclass
@@ -103,18 +102,18 @@ def checked(options: StudyOptions) -> StudyOptions:
         ConfigError: an option out of its range.
     """
     changed: dict[str, Any] = {}
-    for one in fields(options):
-        value, limit = getattr(options, one.name), one.metadata
+    for item in fields(options):
+        value, limit = getattr(options, item.name), item.metadata
         if not limit or value is None:
             continue
         values = sorted(set(value)) if isinstance(value, list) else [value]
-        least, above = limit["least"], limit["above"]
-        if not values or values[0] < least or (above and values[0] == least):
-            what = "positive" if above else f"at least {least:g}"
-            raise ConfigError(f"study.{one.name}={value} must be {what}")
+        minimum = limit["minimum"]
+        if not values or (values[0] <= 0 if minimum is None else values[0] < minimum):
+            what = "positive" if minimum is None else f"at least {minimum:g}"
+            raise ConfigError(f"study.{item.name}={value} must be {what}")
         quick = limit["quick"] if options.quick else None
         if isinstance(value, list):
-            changed[one.name] = values if quick is None else values[quick]
+            changed[item.name] = values if quick is None else values[quick]
         elif quick is not None:
-            changed[one.name] = quick
+            changed[item.name] = quick
     return replace(options, **changed)

@@ -1,18 +1,18 @@
-"""A study's page: a template in Markdown says where its tables, figures and players stand.
+"""A study's page: a template in Markdown that places tables, figures and a player of sequences.
 
-A template ``studies/<name>/page.md.j2`` is text with headings of level 2 to 4 and with these calls,
-whose body is the caption (digits of columns that are not named: those of ``""``)::
+A template ``studies/<name>/page.md.j2`` is text with headings of level 2 to 4. The results of the
+study are its variable ``study``. A call makes a table or a figure, and its body is the caption::
 
-    {% call table("costs", digits={"p": 3}, least=["held out"]) %}Mean cost (m² s).{% endcall %}
-    {% call figure("laws", "Ten panels of speed against gap.") %}Speed by gap.{% endcall %}
-    {{ player("replay") }}
+    {% call table("costs", study.costs(), digits={"p": 3}) %}Mean cost (m² s).{% endcall %}
+    {% call figure("laws", study.draw_laws(), "Ten panels of curves.") %}Speed by gap.{% endcall %}
+    {% call player(study.scenes(), 100) %}Pairs as simulated by idm.{% endcall %}
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, Literal
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -20,66 +20,66 @@ from matplotlib.figure import Figure
 
 from nnode.data.store import Store
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text
-from nnode.pages.replay import ReplayBlock
+from nnode.pages.replay import ReplayBlock, Scene
 from nnode.pages.tables import DIGITS, number
 
-_BLOCK = re.compile(r"^(?:(?P<level>#{2,4}) (?P<heading>.+)|\0(?P<place>\d+)\0)$", re.M)
+Axis = Literal[0, 1]
+
+#: Lines that are a heading, or that stand for a placed block.
+_SEPARATE = re.compile(r"^(#{2,4} .+|\0\d+)$", re.M)
 
 
 def page(
-    study: str,
-    tables: Mapping[str, pd.DataFrame],
-    figures: Mapping[str, Figure | ReplayBlock],
-    stores: Iterable[Store] = (),
-    **values: Any,
+    name: str, study: Any = None, stores: Iterable[Store] = (), **constants: Any
 ) -> list[Block]:
     """The blocks of a study's page in the order of its template.
 
     Args:
-        study: name of the folder with the template.
-        tables, figures: by the names that the template gives them.
+        name: folder with the template.
+        study: results, whose attributes and methods the template uses.
         stores: prepared data, whose files are named with their hashes.
-        values: all else that the template refers to.
+        constants: further variables of the template.
 
     Raises:
-        KeyError: the template names a table or a figure that is not there.
-        jinja2.UndefinedError: the template refers to a value that is not there.
+        jinja2.UndefinedError: the template refers to something that does not exist.
     """
     placed: list[Block] = []
 
     def place(block: Block) -> str:
         placed.append(block)
-        return f"\n\n\0{len(placed) - 1}\0\n\n"
+        return f"\n\n\0{len(placed) - 1}\n\n"
 
     def table(
         name: str,
+        frame: pd.DataFrame,
         digits: int | dict[str, int] = DIGITS,
-        least: Iterable[str] = (),
+        lowest: Iterable[str] = (),
         among: Iterable[Any] | None = None,
-        row: Iterable[str] = (),
+        axis: Axis = 0,
         head: int | None = None,
         *,
         caller: Callable[[], str],
     ) -> str:
-        frame = tables[name]
+        """Digits of columns that are not named are those of ``""``; ``lowest``: lowest_cells."""
         shown = frame.head(head) if head else frame
         if isinstance(digits, dict):
             digits = {c: digits.get(c, digits.get("", DIGITS)) for c in map(str, shown)}
-        bold = least_cells(shown, least, among, row)
+        bold = lowest_cells(shown, lowest, among, axis)
         return place(TableBlock(name, shown, _line(caller()), bold, digits, frame))
 
-    def figure(name: str, alt: str, *, caller: Callable[[], str]) -> str:
-        drawn = figures[name]
-        assert isinstance(drawn, Figure)
+    def figure(name: str, drawn: Figure, alt: str, *, caller: Callable[[], str]) -> str:
         return place(FigureBlock(name, drawn, _line(caller()), alt))
 
-    def player(name: str) -> str:
-        replay = figures[name]
-        assert isinstance(replay, ReplayBlock)
-        return place(replay)
+    def player(scenes: list[Scene], total: int, *, caller: Callable[[], str]) -> str:
+        caption = (
+            f"{_line(caller())} Outlines are measured agents. Arrows lead from the simulated to "
+            "the measured position. The player opens on the sequence with the median error."
+        )
+        alt = f"Player of {len(scenes)} sequences: agents as measured and as simulated."
+        return place(ReplayBlock("replay", scenes, caption, alt, total=total))
 
     environment = Environment(
-        loader=PackageLoader("studies", study),
+        loader=PackageLoader("studies", name),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -87,54 +87,43 @@ def page(
     )
     environment.filters["digits"] = number
     text = environment.get_template("page.md.j2").render(
-        table=table, figure=figure, player=player, tables=tables, **values
+        table=table, figure=figure, player=player, study=study, **constants
     )
+    blocks: list[Block] = []
+    for part in map(str.strip, _SEPARATE.split(text)):
+        if part.startswith("\0"):
+            blocks.append(placed[int(part[1:])])
+        elif part.startswith("##"):
+            level, heading = part.split(" ", 1)
+            blocks.append(Heading(heading, len(level)))
+        elif part:
+            blocks.append(Text(part))
     hashes = {
         f"SHA-256 of {file['name']}": file["sha256"]
         for store in stores
         for file in store.manifest["files"].values()
     }
-    return [*_blocks(text, placed), Provenance(hashes)]
+    return [*blocks, Provenance(hashes)]
 
 
 def _line(text: str) -> str:
     return " ".join(text.split())
 
 
-def _blocks(text: str, placed: list[Block]) -> list[Block]:
-    blocks: list[Block] = []
-    end = 0
-    for match in [*_BLOCK.finditer(text), None]:
-        between = text[end : match.start() if match else None].strip()
-        if between:
-            blocks.append(Text(between))
-        if match and match["heading"]:
-            blocks.append(Heading(match["heading"], len(match["level"])))
-        elif match:
-            blocks.append(placed[int(match["place"])])
-        end = match.end() if match else end
-    return blocks
-
-
-def least_cells(
+def lowest_cells(
     frame: pd.DataFrame,
-    columns: Iterable[str] = (),
-    among: Iterable[Any] | None = None,
-    row: Iterable[str] = (),
+    columns: Iterable[str],
+    rows: Iterable[Any] | None = None,
+    axis: Axis = 0,
 ) -> pd.DataFrame:
-    """Which cells are set in bold: the least ones.
+    """The cells that are set in bold: the least cell of each column, or of each row.
 
     Args:
-        columns: in each of these the least cell.
-        among: labels of the rows that are compared; None: all.
-        row: columns that are compared in each row.
+        columns: labels of the compared columns.
+        rows: labels of the compared rows; None: all.
+        axis: 0 compares the rows of each column, 1 the columns of each row.
     """
-    bold = pd.DataFrame(False, frame.index, frame.columns)
-    for name in columns:
-        bold.loc[
-            frame[name].loc[list(frame.index if among is None else among)].astype(float).idxmin(),
-            name,
-        ] = True
-    if compared := list(row):
-        bold[compared] = frame[compared].eq(frame[compared].min(axis=1), axis=0)
-    return bold
+    compared = frame[list(columns)].astype(float)
+    compared = compared if rows is None else compared.loc[list(rows)]
+    lowest = compared.eq(compared.min(axis=axis), axis=0 if axis else 1)
+    return lowest.reindex_like(frame).eq(True)

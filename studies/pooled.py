@@ -50,7 +50,7 @@ def pooled_fit(
 
     def quadratic(rows: np.ndarray) -> Quadratic:
         each = [problem(rows[0]) for problem in problems]
-        parts = zip(*((one.cost, one.gradient, one.hessian) for one in each), strict=True)
+        parts = zip(*((part.cost, part.gradient, part.hessian) for part in each), strict=True)
         return Quadratic(*(share * np.concatenate(part).sum(0)[None] for part in parts))
 
     rows = [np.array(list(start.values())) for start in starts]
@@ -61,7 +61,7 @@ def pooled_fit(
         )
         for row in rows[:BEST]
     ]
-    best = min(minima, key=lambda one: float(one.cost[0]))
+    best = min(minima, key=lambda part: float(part.cost[0]))
     values = dict(zip(starts[0], best.row[0].tolist(), strict=True))
     filled(system, values)
     return values, float(best.cost[0])

@@ -10,7 +10,7 @@ import torch
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import SimulationError
 from nnode.model.system import System
-from nnode.pages.replay import ReplayBlock, Scene
+from nnode.pages.replay import Scene
 from nnode.simulation.fused import FusedSolver
 
 
@@ -36,20 +36,3 @@ def _simulated(system: System, s: Sequence, solver: FusedSolver) -> np.ndarray:
         return solver(system.double(), collate([s])).x[:, 0].numpy()
     except SimulationError:
         return np.concatenate([s.x[:1], np.full_like(s.x[1:], np.nan)])
-
-
-def player(every: list[Scene], what: str, total: int) -> ReplayBlock:
-    """The player of some scenes, as :mod:`studies.page` places it under the name ``replay``.
-
-    Args:
-        what: which sequences and models they are, as a sentence.
-        total: sequences that they were chosen from.
-    """
-    return ReplayBlock(
-        "replay",
-        every,
-        f"{what} Outlines are measured agents. Arrows lead from the simulated to the measured "
-        "position. The player opens on the sequence with the median error.",
-        f"Player of {len(every)} sequences: agents as measured and as simulated.",
-        total=total,
-    )

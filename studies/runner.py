@@ -23,9 +23,8 @@ from nnode.calibrate.interrupt import Interrupted, InterruptGuard
 from nnode.errors import StudyError
 from nnode.files import write_json, write_text
 from nnode.version import VERSION
-from studies.cluster import calls_on_cluster
 from studies.progress import TaskProgress
-from studies.workers import Call, Outcome, calls_here, calls_in_processes
+from studies.workers import Call, Outcome, calls_here, calls_in_processes, calls_on_cluster
 
 log = logging.getLogger(__name__)
 
@@ -222,8 +221,8 @@ def _failure(outcome: Outcome, path: Path) -> str:
 
 def _failures(failed: dict[str, str], done: int, total: int, folder: Path) -> str:
     named = [f"{key}: {why}" for key, why in sorted(failed.items())[:_NAMED]]
-    more = [f"and {len(failed) - _NAMED} more"] if len(failed) > _NAMED else []
+    unnamed = [f"and {len(failed) - _NAMED} more"] if len(failed) > _NAMED else []
     return (
-        f"{len(failed)} of {total} tasks failed: {'; '.join(named + more)}. {done} results are "
+        f"{len(failed)} of {total} tasks failed: {'; '.join(named + unnamed)}. {done} results are "
         f"kept in {folder / KEPT}; the same command runs only the failed ones again"
     )

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from functools import lru_cache
+from typing import Any
 
 from nnode.data.sequence import Sequence
 from nnode.data.store import Store
@@ -17,7 +18,7 @@ def sequences(folder: str) -> tuple[Sequence, ...]:
     return tuple(Store(folder))
 
 
-def hash_of(stores: Mapping[str, Store]) -> str:
+def hash_of(stores: Mapping[Any, Store]) -> str:
     """Of the content of all files of prepared data: a fingerprint of tasks that read them."""
-    content = {name: store.manifest["files"] for name, store in stores.items()}
+    content = {str(name): store.manifest["files"] for name, store in stores.items()}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Worker processes for independent tasks, each with one thread, that may die or be stopped."""
+"""Workers for independent tasks: this process, processes of this machine, and those of Dask."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
+import numpy as np
 import torch
 
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
-from nnode.errors import NNodeError, StudyError
+from nnode.errors import ConfigError, NNodeError, StudyError
 
 #: A function and its keyword arguments.
 Call = tuple[Callable[..., dict[str, Any]], dict[str, Any]]
@@ -60,7 +61,7 @@ def attempt(call: Callable[[], Call]) -> Outcome:
         result = function(**arguments)
         if not isinstance(result, dict):
             raise TypeError(f"{function.__qualname__} returned {type(result).__name__}, not a dict")
-        text = json.dumps(result, ensure_ascii=False, allow_nan=True)
+        text = json.dumps(result, ensure_ascii=False, allow_nan=True, default=_plain)
         return Outcome(text, seconds=time.perf_counter() - start)
     except Interrupted:
         raise
@@ -69,6 +70,13 @@ def attempt(call: Callable[[], Call]) -> Outcome:
     except Exception as error:
         text = f"{type(error).__name__}: {error}"
         return Outcome(error=text, trace=traceback.format_exc())
+
+
+def _plain(value: object) -> Any:
+    """Arrays and NumPy's numbers as JSON has them."""
+    if isinstance(value, np.ndarray | np.generic | torch.Tensor):
+        return value.tolist()
+    raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
 
 
 def calls_here(
@@ -229,3 +237,56 @@ def _leave_together() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
+
+
+#: Seconds that a scheduler has to answer.
+ANSWER = 20.0
+
+
+def calls_on_cluster(
+    calls: Iterable[tuple[str, Call]],
+    address: str,
+    guard: InterruptGuard,
+    tick: Callable[[], None],
+) -> Generator[tuple[str, Outcome], None, None]:
+    """Make named calls by the workers of a scheduler; their functions must be importable there.
+
+    Ends early when the guard was asked to stop; unfinished calls are lost. Dask gives the calls of
+    a worker that dies to others.
+
+    Args:
+        address: of the scheduler.
+        tick: called a few times per second.
+
+    Raises:
+        ConfigError: Dask is not installed, or nobody answers at the address.
+    """
+    try:
+        from distributed import Client, wait
+    except ImportError:
+        raise ConfigError(
+            f"cluster={address} needs Dask; install it with: pip install 'nnode[dask]'"
+        ) from None
+    try:
+        client = Client(address, timeout=ANSWER)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"cluster={address}: no scheduler answers there ({error}); expected an address such "
+            "as tcp://host:8786, where `dask scheduler` runs"
+        ) from None
+    with client:
+        keys = {client.submit(_attempt, call, pure=False): key for key, call in calls}
+        waiting = set(keys)
+        while waiting and guard.requested is None:
+            tick()
+            try:
+                done, waiting = wait(waiting, timeout=POLL, return_when="FIRST_COMPLETED")
+            except TimeoutError:
+                continue
+            for future in done:
+                yield keys[future], future.result()
+
+
+def _attempt(call: Call) -> Outcome:
+    torch.set_num_threads(1)
+    return attempt(lambda: call)

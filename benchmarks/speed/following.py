@@ -26,8 +26,7 @@ from scipy.optimize import differential_evolution
 from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.files import write_json
 from studies.following import data, printed
-from studies.following.candidates import EVERY
-from studies.following.fit import costs_of
+from studies.following.tasks import EVERY, costs_of
 from studies.options import FollowingStudyOptions
 
 

@@ -9,6 +9,7 @@ intervals come from a bootstrap of clusters.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -72,19 +73,6 @@ class FittedNoise:
     modelled: list[float] = field(default_factory=list)
 
 
-@dataclass
-class _Sums:
-    """Sums of squares and numbers of samples of M moments per cluster, ``(G, M)`` each."""
-
-    squares: np.ndarray
-    number: np.ndarray
-
-    def mean(self, weight: np.ndarray) -> np.ndarray:
-        """``(M,)`` moments, m², with weights of clusters."""
-        mean: np.ndarray = weight @ self.squares / (weight @ self.number)
-        return mean
-
-
 def fit_noise(
     system: System,
     batches: list[Batch],
@@ -111,43 +99,32 @@ def fit_noise(
     lags = lags_of(sampling, longest, _SHORTEST[system.domain])
     _, label = np.unique(label, return_inverse=True)
     groups = np.split(label, np.cumsum([len(batch) for batch in batches])[:-1])
+    number = int(label.max()) + 1
     without_noise = [
         sample(system, batch, Noise(0.0, 1.0), 1, seed=seed, **options).x for batch in batches
     ]
-    error = _measurement(batches)
-    number = int(label.max()) + 1
-    measured = _sums(
-        [batch.x - x for batch, x in zip(batches, without_noise, strict=True)],
-        batches,
-        groups,
-        lags,
-        number,
-    )
-    if not (measured.number.sum(0) > 0).all():
+
+    def sums(paths: Iterable[Tensor]) -> np.ndarray:
+        return _sums(paths, without_noise, batches, groups, lags, number)
+
+    measured = sums(batch.x for batch in batches)
+    if not (measured[1].sum(0) > 0).all():
         shortest = 3 * _SHORTEST[system.domain]
         raise DataError(
             f"the noise needs {_WHO[system.domain]} that are measured for more than {shortest:g} s"
         )
 
-    def sampled(*noises: Noise) -> list[_Sums]:
+    def sampled(*noises: Noise) -> list[np.ndarray]:
         parts = [
-            [
-                trajectory.x - x.repeat(1, SAMPLES, 1, 1)
-                for trajectory in sample_each(
-                    system, batch, list(noises), SAMPLES, seed=(seed, i), **options
-                )
-            ]
-            for i, (batch, x) in enumerate(zip(batches, without_noise, strict=True))
+            sample_each(system, batch, list(noises), SAMPLES, seed=(seed, i), **options)
+            for i, batch in enumerate(batches)
         ]
-        return [
-            _sums(list(each), batches, groups, lags, number) for each in zip(*parts, strict=True)
-        ]
+        return [sums(trajectory.x for trajectory in each) for each in zip(*parts, strict=True)]
 
+    error = _measurement(batches)
     equal_weights = np.ones(number)
-    sigma, spread = (
-        _FIRST[system.order],
-        _SPREAD if allows_driver_differences(system, batches[0]) else 0.0,
-    )
+    sigma = _FIRST[system.order]
+    spread = _SPREAD if allows_driver_differences(system, batches[0]) else 0.0
     starts = TIMES[1:-1:2]
     for _ in range(2):
         search = _Search(
@@ -167,7 +144,7 @@ def fit_noise(
         None,
         number,
         [lag * sampling for lag in lags],
-        measured.mean(equal_weights).tolist(),
+        _mean(measured, equal_weights).tolist(),
         modelled.tolist(),
     )
     if number < 2:
@@ -175,10 +152,8 @@ def fit_noise(
     weights = number * group_weights(np.arange(number), DRAWS, np.random.default_rng(seed))
     draws = np.array([search(weight, np.array([tau]), ROUGH)[:3] for weight in weights])
     ends = np.quantile(draws, [0.025, 0.975], axis=0).T.tolist()
-    sigma_interval, tau_interval, drivers_interval = ((low, high) for low, high in ends)
-    return replace(
-        fitted, sigma=sigma_interval, tau=tau_interval, drivers=drivers_interval if spread else None
-    )
+    sigma_ends, tau_ends, drivers_ends = map(tuple, ends)
+    return replace(fitted, sigma=sigma_ends, tau=tau_ends, drivers=drivers_ends if spread else None)
 
 
 def lags_of(sampling: float, samples: int, shortest: float) -> list[int]:
@@ -213,17 +188,23 @@ def _measurement(batches: list[Batch]) -> float:
 
 
 def _sums(
-    residuals: list[Tensor],
+    paths: Iterable[Tensor],
+    without_noise: list[Tensor],
     batches: list[Batch],
     groups: list[np.ndarray],
     lags: list[int],
     number: int,
-) -> _Sums:
-    """Squares of residuals ``(K, S * B, N, D)`` and of their changes, by cluster."""
+) -> np.ndarray:
+    """``(2, G, M)`` sums of squares (m²), and numbers of samples, of M moments per cluster.
+
+    Args:
+        paths: ``(K, S * B, N, D)`` measured or sampled positions of each batch.
+    """
     short = lags[:_SHORT]
-    squares, count = np.zeros((2, number, len(lags) + len(short) + 1))
-    for e, batch, group in zip(residuals, batches, groups, strict=True):
-        copies = e.shape[1] // len(batch)
+    sums = np.zeros((2, number, len(lags) + len(short) + 1))
+    for x, mean_path, batch, group in zip(paths, without_noise, batches, groups, strict=True):
+        copies = x.shape[1] // len(batch)
+        e = x - mean_path.repeat(1, copies, 1, 1)
         follower = batch.valid.clone()
         if e.shape[-1] == 1:  # leaders follow their measured paths
             follower[:, torch.arange(len(batch)), batch.agent.sum(1) - 1] = False
@@ -236,10 +217,16 @@ def _sums(
             parts.append((bend + e[: len(bend)], valid[2 * lag :]))
         parts.append((e[1:], valid[1:]))
         for j, (change, real) in enumerate(parts):
-            total = torch.where(real, change.square(), 0.0).sum((0, 2, 3)).numpy()
-            squares[:, j] += np.bincount(cluster, total, number)
-            count[:, j] += np.bincount(cluster, real.sum((0, 2, 3)).numpy(), number)
-    return _Sums(squares, count)
+            squares = torch.where(real, change.square(), 0.0)
+            for total, values in zip(sums, (squares, real), strict=True):
+                total[:, j] += np.bincount(cluster, values.sum((0, 2, 3)).numpy(), number)
+    return sums
+
+
+def _mean(sums: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """``(M,)`` moments, m², with weights of clusters."""
+    squares, number = (weight @ each for each in sums)
+    return np.asarray(squares / number)
 
 
 def _white(lags: int, error: float) -> np.ndarray:
@@ -256,15 +243,15 @@ class _Search:
     variances.
 
     Attributes:
-        measured: measured moments.
+        measured: measured moments, as :func:`_sums` returns them.
         pushes: moments of noise of size ``unit``, by correlation time.
         drivers: moments of drivers with the spread ``spread``; None if all drivers are equal.
         white: ``(M,)`` moments of the measurement error, m².
     """
 
-    measured: _Sums
-    pushes: list[_Sums]
-    drivers: _Sums | None
+    measured: np.ndarray
+    pushes: list[np.ndarray]
+    drivers: np.ndarray | None
     unit: float
     spread: float
     white: np.ndarray
@@ -279,13 +266,13 @@ class _Search:
             starts: start values of the correlation time, s, since there may be several minima.
             tolerance: the search ends when the cost decreases by less than this share.
         """
-        goal = np.log(np.maximum(self.measured.mean(weight), 1e-12))
-        pushes = np.array([sums.mean(weight) for sums in self.pushes]) / self.unit**2
+        goal = np.log(np.maximum(_mean(self.measured, weight), 1e-12))
+        pushes = np.array([_mean(sums, weight) for sums in self.pushes]) / self.unit**2
         log_push = PchipInterpolator(np.log(TIMES), np.log(pushes))
         slope = log_push.derivative()
         driver_moments = 0.0 * goal
         if self.drivers is not None:
-            driver_moments = self.drivers.mean(weight) / self.spread**2
+            driver_moments = _mean(self.drivers, weight) / self.spread**2
 
         def parts(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return np.exp(2 * p[0] + log_push(p[1])), np.exp(2 * p[2]) * driver_moments

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, cast
@@ -17,7 +17,6 @@ from torchdiffeq import odeint
 from nnode.data.sequence import Batch
 from nnode.errors import ConfigError
 from nnode.exchange.drivers import drawn
-from nnode.generate.people import depends_on_preferred_speed, sample_people
 from nnode.model import Crowd, Traffic
 from nnode.model.effects.base import IndividualEffect
 from nnode.model.effects.crowd import GaitSway
@@ -32,6 +31,9 @@ from nnode.model.term import State, Term
 from nnode.model.terms import LaneDynamics, Rule
 from nnode.simulation.base import Trajectory, check_finite, substeps
 from nnode.simulation.ode import Rates, whole_steps
+
+#: Smallest random factor on a measured preferred speed.
+SLOWEST = 0.1
 
 
 @dataclass(frozen=True)
@@ -111,13 +113,13 @@ class DifferentDrivers(Traffic):
     def formula(self) -> LaneDynamics:
         lane, place = lane_of(self.term_list), len(self.terms) - 1
         assert lane is not None
-        own, inputs = dict[str, Expr](), dict(lane.inputs)
+        scaled, inputs = dict[str, Expr](), dict(lane.inputs)
         for address in cast(Push, self.terms[place]).factors:
             name = address.replace(".", "__", 1)
-            own[name] = symbol(name) * symbol(f"factor_{name}")
+            scaled[name] = symbol(name) * symbol(f"factor_{name}")
             inputs[f"factor_{name}"] = (place, address)
         rates, starts = (
-            {state: substitute(formula, own) for state, formula in formulas.items()}
+            {state: substitute(formula, scaled) for state, formula in formulas.items()}
             for formulas in (lane.rates, lane.starts)
         )
         return replace(lane, rates=rates, starts=starts, inputs=inputs)
@@ -136,7 +138,10 @@ def allows_driver_differences(system: System, batch: Batch) -> bool:
     if any(isinstance(term, IndividualEffect) for term in system.terms):
         return False
     if isinstance(system, Crowd):
-        return depends_on_preferred_speed(system, batch)
+        scene, y = system.scene(batch), system.initial(batch)
+        faster = _with_speed_factor(scene, torch.tensor(1.1))
+        rates = [system(torch.zeros(()), y, each) for each in (scene, faster)]
+        return not torch.equal(*rates)
     assert isinstance(system, Traffic)
     trial = copy.deepcopy(system)
     trial.terms.append(DriverHeterogeneity())
@@ -222,9 +227,7 @@ def sample_each(
     if isinstance(system, Crowd):
         moving = copy.deepcopy(system)
         _assign_drivers(moving, repeated, batch.names, rng)
-        (noise,) = noises
-        parameters = (noise.sigma, noise.tau, noise.drivers)
-        return [sample_people(moving, repeated, parameters, rng, dt)]
+        return [_sample_people(moving, repeated, noises[0], rng, dt)]
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     n = substeps(batch.dt, dt, system)
     step = batch.dt / n
@@ -233,19 +236,19 @@ def sample_each(
         method = noisy.step
     rates = Rates(noisy, repeated, n, method)
     y = noisy.initial(repeated, step)
+    each = samples * len(batch)
     # values for each sampled sequence
     sigma, kept = (
-        torch.tensor(values, dtype=y.dtype).repeat_interleave(samples * len(batch))[:, None]
+        torch.tensor(values, dtype=y.dtype).repeat_interleave(each)[:, None]
         for values in ([o.sigma for o in noises], [math.exp(-step / o.tau) for o in noises])
     )
     kick = sigma * torch.sqrt(1 - kept**2)
 
     def normal() -> Tensor:
-        shape = samples * len(batch), y.shape[1]
-        return torch.randn(shape, generator=generator, dtype=y.dtype).repeat(len(noises), 1)
+        drawn_once = torch.randn(each, y.shape[1], generator=generator, dtype=y.dtype)
+        return drawn_once.repeat(len(noises), 1)
 
     y[..., -1] = sigma * normal()
-
     state_mask = torch.ones_like(y[0, 0])
     state_mask[-1] = 0.0
 
@@ -260,16 +263,61 @@ def sample_each(
         rate[..., -1] = (kept - 1) * y[..., -1] + kick * normal()
         return rate
 
-    times = n * torch.arange(batch.n_samples, dtype=y.dtype)
-    grid = {"grid_constructor": whole_steps}
-    states = odeint(change, y, times, method="euler", options=grid)
-    x, v = noisy.observe(states, repeated)
+    x, v = noisy.observe(_integrate(change, y, n, batch.n_samples), repeated)
     check_finite(Trajectory(x, v), repeated)
-    each = samples * len(batch)
-    parts = zip(
-        x.split(each, 1), [None] * len(noises) if v is None else v.split(each, 1), strict=True
-    )
-    return [Trajectory(*part) for part in parts]
+    speeds = [None] * len(noises) if v is None else v.split(each, 1)
+    return [Trajectory(*part) for part in zip(x.split(each, 1), speeds, strict=True)]
+
+
+def _integrate(
+    change: Callable[[Tensor, Tensor], Tensor], start: Tensor, n: int, samples: int
+) -> Tensor:
+    """States at the sampling times, by n steps of ``change`` in a sampling interval."""
+    times = n * torch.arange(samples, dtype=start.dtype)
+    options = {"grid_constructor": whole_steps}
+    return cast(Tensor, odeint(change, start, times, method="euler", options=options))
+
+
+def _sample_people(
+    system: Crowd, batch: Batch, noise: Noise, rng: np.random.Generator, dt: float | None
+) -> Trajectory:
+    """Sampled motion of people in Euler's steps.
+
+    Args:
+        batch: the sequences, repeated for every sample.
+    """
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    n = substeps(batch.dt, dt, system)
+    step = batch.dt / n
+    kept = math.exp(-step / noise.tau)
+    kick = noise.sigma * math.sqrt(1 - kept**2)
+    rates = Rates(system, batch, n, system.step)
+    if noise.drivers:
+        factors = 1 + noise.drivers * rng.normal(size=(*batch.agent.shape, 1))
+        # the directions of streams are already computed from the measured preferred speeds
+        rates.scene = _with_speed_factor(
+            rates.scene, torch.from_numpy(np.maximum(factors, SLOWEST))
+        )
+    y = system.initial(batch, step)
+    width, driven = y.shape[-1], slice(2 * (system.order - 1), 2 * system.order)
+    real = batch.agent[..., None].to(y.dtype)
+
+    def normal() -> Tensor:
+        return real * torch.randn(*y.shape[:2], 2, generator=generator, dtype=y.dtype)
+
+    def change(k: Tensor, state: Tensor) -> Tensor:
+        rate, push = rates(k, state[..., :width]), state[..., width:]
+        rate[..., driven] += rates.until_the_end(k, step * push)
+        return torch.cat([rate, (kept - 1) * push + kick * normal()], -1)
+
+    start = torch.cat([y, noise.sigma * normal()], -1)
+    states = _integrate(change, start, n, batch.n_samples)[..., :width]
+    return check_finite(Trajectory(*system.observe(states, batch)), batch)
+
+
+def _with_speed_factor(scene: Scene, factor: Tensor) -> Scene:
+    """The scene with preferred speeds multiplied by a factor."""
+    return replace(scene, preferred=factor * scene.preferred)
 
 
 def numbered(names: tuple[str, ...], samples: int) -> tuple[str, ...]:

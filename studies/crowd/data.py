@@ -38,7 +38,7 @@ GROUP = 10.0
 ALL = "all"
 
 
-def prepared(options: StudyOptions, folder: Path, kind: str, horizon: float, **more: Any) -> Store:
+def prepared(options: StudyOptions, folder: Path, kind: str, horizon: float, **extra: Any) -> Store:
     """Cut the paper's recording, or the other runs, into sequences of ``horizon`` seconds.
 
     Only people who are tracked through a whole sequence are part of it: the longer it is, the
@@ -63,7 +63,7 @@ def prepared(options: StudyOptions, folder: Path, kind: str, horizon: float, **m
     data = folder / "data"
     download = options.download or str(data / "raw")
     source = JuelichOptions(
-        source=options.source, download=download, t_seq=horizon, **chosen, **more
+        source=options.source, download=download, t_seq=horizon, **chosen, **extra
     )
     return prepare(source, data / f"{kind}-{horizon:g}s")
 

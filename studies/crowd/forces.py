@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -42,17 +42,18 @@ class Measured:
     def of(cls, batch: Batch, seed: int = 0) -> Measured:
         """What a batch of sequences holds; pairs are drawn where there are very many."""
         k = batch.n_samples // 2
-        middle = Batch(**{**vars(batch), "x": batch.x[k:], "v": batch.v[k:]})
+        middle = replace(batch, x=batch.x[k:], v=batch.v[k:])
         x, v, real = middle.x[0], middle.v[0], batch.agent
         dx, dv = x[:, :, None] - x[:, None], v[:, :, None] - v[:, None]
         near = torch.linalg.vector_norm(dx, dim=-1) < FAR
         near &= real[:, :, None] & real[:, None] & ~torch.eye(x.shape[1], dtype=torch.bool)
-        facing = (v[:, :, None, 0] * v[:, None, :, 0])[near].numpy() < 0
-        near_pairs = dx[near].numpy(), dv[near].numpy(), facing
-        if len(facing) > MOST_PAIRS:
-            take = np.random.default_rng(seed).choice(len(facing), MOST_PAIRS, replace=False)
-            return cls(middle, *(part[take] for part in near_pairs))
-        return cls(middle, *near_pairs)
+        facing = v[:, :, None, 0] * v[:, None, :, 0] < 0
+        pairs = [each[near].numpy() for each in (dx, dv, facing)]
+        if near.sum() > MOST_PAIRS:
+            rng = np.random.default_rng(seed)
+            drawn = rng.choice(len(pairs[0]), MOST_PAIRS, replace=False)
+            pairs = [each[drawn] for each in pairs]
+        return cls(middle, *pairs)
 
 
 @torch.no_grad()
@@ -79,10 +80,9 @@ def along_by_speed(parts: dict[str, np.ndarray]) -> pd.DataFrame:
     heading = np.where(parts["v"][:, 0] < 0, -1.0, 1.0)
     table = pd.DataFrame({name: heading * parts[name][:, 0] for name in ("pair", "wall", "sum")})
     speed = np.abs(parts["v"][:, 0])
-    table["speed"] = (np.floor(speed / SPEED_BIN) + 0.5) * SPEED_BIN
-    table = table[speed < FASTEST]
-    by_speed = table.groupby("speed").mean()
-    by_speed["n"] = table.groupby("speed").size()
+    table["speed"] = _middle(speed, SPEED_BIN)
+    grouped = table[speed < FASTEST].groupby("speed")
+    by_speed = grouped.mean().assign(n=grouped.size())
     return by_speed[by_speed["n"] >= LEAST]
 
 
@@ -91,7 +91,7 @@ def slope(parts: dict[str, np.ndarray]) -> tuple[float, float]:
     (m/s) it pulls to: the least-squares line through acceleration against speed."""
     heading = np.where(parts["v"][:, 0] < 0, -1.0, 1.0)
     rise, level = np.polyfit(np.abs(parts["v"][:, 0]), heading * parts["sum"][:, 0], 1)
-    return float(-rise), float(-level / rise)
+    return -rise, -level / rise
 
 
 def away_by_distance(system: System, measured: Measured) -> pd.DataFrame:
@@ -104,16 +104,15 @@ def away_by_distance(system: System, measured: Measured) -> pd.DataFrame:
     """
     force = evaluate_force(system, measured.dx, measured.dv, "pair")
     distance = np.linalg.norm(measured.dx, axis=1)
-    away = (force * measured.dx).sum(1) / np.maximum(distance, 1e-9)
-    table = pd.DataFrame(
-        {
-            "away": away,
-            "distance": (np.floor(distance / BIN) + 0.5) * BIN,
-            "way": np.where(measured.facing, "facing", "same way"),
-        }
-    )
-    grouped = table.groupby(["distance", "way"])["away"]
-    return grouped.mean()[grouped.size() >= LEAST].unstack("way")
+    away = pd.Series((force * measured.dx).sum(1) / np.maximum(distance, 1e-9))
+    way = np.where(measured.facing, "facing", "same way")
+    grouped = away.groupby([pd.Index(_middle(distance, BIN), name="distance"), way])
+    return grouped.mean()[grouped.size() >= LEAST].unstack()
+
+
+def _middle(values: np.ndarray, width: float) -> np.ndarray:
+    """The middles of the bins of values."""
+    return np.asarray((np.floor(values / width) + 0.5) * width)
 
 
 def likeness(first: np.ndarray, second: np.ndarray) -> float:

@@ -5,14 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nnode.pages.page import Block
 from studies.crowd import tasks
-from studies.crowd.data import ALL, prepared
-from studies.crowd.results import Crowd
+from studies.crowd.data import ALL, GROUP, mean_speed, prepared
+from studies.crowd.forces import FAR
+from studies.crowd.results import LABELS, PARTS, Crowd
 from studies.frame import computed
 from studies.options import CrowdStudyOptions
 from studies.page import page
 from studies.runner import Task
+from studies.stores import sequences
 
 TITLE = "Crowd: social force and networks in a two-way corridor"
 SUBTITLE = (
@@ -40,7 +44,6 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
         for h in options.horizons
         for kind in ("main", "others")
     }
-    named = {f"{kind}-{horizon:g}": store for (kind, horizon), store in stores.items()}
     study = Crowd(options, stores)
     for number, horizon in enumerate(options.horizons):
         for what, make in (
@@ -49,8 +52,21 @@ def run(options: CrowdStudyOptions, folder: Path) -> list[Block]:
             ("intervals, other runs", evaluations),
         ):
             title = f"crowd study, {horizon:g} s: {what}"
-            study.add(horizon, computed(make(study, number), folder, options, named, title))
-    return page("crowd", study.tables(), study.figures(), stores.values(), **study.values())
+            study.add(horizon, computed(make(study, number), folder, options, stores, title))
+    dv, dx = np.abs(study.measured.dv[:, 1]), np.abs(study.measured.dx[:, 1])
+    return page(
+        "crowd",
+        study,
+        stores.values(),
+        labels=LABELS,
+        models=[LABELS[kind] for kind in tasks.KINDS],
+        parts=PARTS,
+        group=GROUP,
+        speed=mean_speed(sequences(study.folder("main", options.horizons[0]))),
+        far=FAR,
+        fast=100 * (dv >= 1.0).mean(),
+        wide=dx.max(),
+    )
 
 
 def starts(restarts: int, kind: str, scope: str, first: bool) -> int:

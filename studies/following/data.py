@@ -61,9 +61,9 @@ def stores(options: FollowingStudyOptions, folder: Path) -> dict[str, Store]:
     }
     return {
         name: prepare(
-            replace(one, source=options.source, faults=Faults.drop), folder / "data" / name
+            replace(source, source=options.source, faults=Faults.drop), folder / "data" / name
         )
-        for name, one in chosen.items()
+        for name, source in chosen.items()
     }
 
 

@@ -1,8 +1,8 @@
-"""Tables and figures of the study of car following."""
+"""Tables and figures of the study."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
@@ -11,33 +11,35 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from nnode.data.sequence import Sequence, collate
 from nnode.data.store import Store
 from nnode.model.system import System
-from nnode.pages.replay import ReplayBlock
-from nnode.plots.style import thinned
-from studies.following import data, figures, leaders, printed, stability
-from studies.following.candidates import DECAY, EVERY, REFERENCE, key
+from nnode.pages.replay import Scene
+from nnode.plots.style import (
+    FONT,
+    GREY,
+    OKABE_ITO,
+    SMALL_FONT,
+    curve_style,
+    dress,
+    legend_above,
+    new_figure,
+    thinned,
+)
+from studies.following import data, printed, stability
 from studies.following.data import gap_of
-from studies.following.fit import OBJECTIVES, costs_of
-from studies.frame import by_number, by_unit, differences, labelled, versus
+from studies.following.tasks import EVERY, KINDS, OBJECTIVES, REFERENCE, costs_of, jackknifed
+from studies.frame import by_number, by_unit, differences, versus
 from studies.options import FollowingStudyOptions
-from studies.replay import player, scenes
+from studies.replay import scenes
 
-#: Objectives on a page.
-WITH_UNITS = {
-    "spacing": "gap, RMSE (m)",
-    "gap": "gap, MSE (m²)",
-    "relative_gap": "relative gap, MSE",
-    "log_gap": "log of the gap, MSE",
-    "speed": "speed, MSE (m²/s²)",
-}
-#: Speeds at which platoons are looked at, m/s; the speed, and the period (s) of a swing, drawn.
+#: Speeds at which platoons are examined, m/s; the drawn speed, and the drawn period, s.
 SPEEDS, SWING = (3.0, 6.0, 9.0, 12.0), (6.0, 60.0)
 #: Nearly even driving: differences of speed, m/s, and accelerations, m/s², below these.
 EVEN = (0.5, 0.2)
-#: Laws in the figures of stability, where they are there, beside the chosen one.
+#: Laws in the figures of stability, beside the chosen one.
 FIGURED = ("idm", "ovm", "fvdm", "gipps", "helly")
 #: Settings of the distance in their order; people drive without.
 SETTINGS = {"min": "ACC, min", "max": "ACC, max", "none": "people"}
@@ -59,15 +61,17 @@ class Study:
         """The results of a function that many candidates are given to, a row per candidate."""
         return self.results.query("task == @task").set_index("name")
 
-    @property
-    def names(self) -> list[str]:
-        """Candidates that were cross-validated."""
-        return list(self.of("cross_validate").index)
-
     @cached_property
+    def calibrated(self) -> Any:
+        """Cross-validated candidates by their held-out error: no test pair has a say in it."""
+        results = self.of("cross_validate")
+        error = results["heldout"].map(lambda costs: np.mean(costs["spacing"]))
+        return results.loc[error.sort_values().index]
+
+    @property
     def order(self) -> list[str]:
-        """Candidates by cross-validated error: no test pair has a say in it."""
-        return list(self.heldout().mean().sort_values().index)
+        """Names of these candidates."""
+        return list(self.calibrated.index)
 
     @property
     def chosen(self) -> list[str]:
@@ -76,183 +80,174 @@ class Study:
 
     def heldout(self, objective: str = "spacing") -> pd.DataFrame:
         """Cross-validated costs of the training pairs, a column per candidate."""
-        one = self.of("cross_validate")
-        return by_unit(one["heldout"].map(itemgetter(objective)), one.loc[REFERENCE, "clusters"])
+        costs = self.calibrated["heldout"].map(itemgetter(objective))
+        return by_unit(costs, self.calibrated.loc[REFERENCE, "clusters"])
 
+    @property
     def tested(self) -> pd.DataFrame:
         """Costs of the test pairs, each a cluster of its own."""
-        costs = self.of("tested")["spacing"]
+        costs = self.of("tested")["costs"]
         return by_unit(costs, range(len(costs[REFERENCE])))
-
-    def away(self, costs: pd.DataFrame) -> pd.DataFrame:
-        """All candidates minus the reference."""
-        pairs = [(name, REFERENCE) for name in self.order]
-        return differences(costs, pairs, self.options.seed).droplevel("second")
 
     def pairs(self, test: bool = False) -> tuple[Sequence, ...]:
         """Of one side of the published division."""
         return data.pairs(str(self.stores[data.PAIRS].folder), test)
 
-    def system(self, name: str) -> System:
-        """A candidate with its parameters from all training pairs."""
-        row = self.of("cross_validate").loc[name, "row"]
-        return costs_of(EVERY[name], collate(self.pairs()[:1])).vector.fill_(np.array(row))
-
-    # -- tables ------------------------------------------------------------------------------
-
-    def tables(self) -> dict[str, pd.DataFrame]:
-        """By their names in the template."""
-        objectives = {label: self.heldout(o).mean() for o, label in WITH_UNITS.items()}
-        by_name = {
-            "published": self._published(),
-            "candidates": self._candidates(),
-            "objectives_heldout": pd.DataFrame(objectives).loc[self.order].rename_axis("candidate"),
-            "test": self._test(),
-            "sides": self._sides().groupby("side", sort=False).mean(),
-            "equilibrium_gaps": self._equilibrium_gaps(),
-            "stability": self._stability(),
-            "drivers": self._drivers(),
-            "spread": self._spread(),
-            "platoon_published": self._platoon_published(),
-            "platoon": self._platoon(),
-            "time_gaps": self._time_gaps(),
-            "runs": self._runs(),
-            "leaders": self._leaders(),
-            "leaders_heldout": self._leaders_heldout(),
-            "parameters": self._parameters(),
+    @cached_property
+    def systems(self) -> dict[str, System]:
+        """Candidates with their parameters from all training pairs."""
+        batch, rows = collate(self.pairs()[:1]), self.of("cross_validate")["row"]
+        return {
+            name: costs_of(EVERY[name], batch).vector.fill_(np.array(row))
+            for name, row in rows.items()
         }
-        for name in self.chosen:
-            by_name[f"objectives_{key(name)}"] = self._objectives(name)
-            by_name[f"precision_{key(name)}"] = self._precision(name)
-        return by_name
 
-    def _published(self) -> pd.DataFrame:
-        here = self.results.loc["reproduced-pairs"]
-        rows = {
-            (law, objective): {"printed": told, "here": float(np.mean(here[f"{law} {objective}"]))}
-            for law, errors in printed.errors.items()
-            for objective, told in zip(printed.objectives, errors, strict=True)
-        }
-        table = labelled(rows, "law", "minimised")
+    # -- laws --------------------------------------------------------------------------------
+
+    @property
+    def printed_errors(self) -> pd.Series[float]:
+        """Published errors of the test pairs (m) by law and minimised objective."""
+        return pd.DataFrame(printed.errors, index=printed.objectives).unstack()  # type: ignore[return-value]
+
+    def published(self) -> pd.DataFrame:
+        results, told = self.results.loc["reproduced-pairs"], self.printed_errors
+        errors = [np.mean(results[f"{law} {objective}"]) for law, objective in told.index]
+        table = pd.DataFrame({"printed": told, "here": errors}).rename_axis(["law", "minimised"])
         return table.assign(difference=table["here"] - table["printed"])
 
-    def _candidates(self) -> pd.DataFrame:
-        one = self.of("cross_validate").loc[self.order]
-        table = versus(self.heldout(), REFERENCE, self.options.seed).loc[self.order]
+    def candidates(self) -> pd.DataFrame:
+        table = versus(self.heldout(), REFERENCE, self.options.seed)
         table = table.rename(columns={"mean": "held out"}).drop(columns="p")
-        table.insert(0, "train", one["train"].map(lambda costs: np.mean(costs["spacing"])))
-        table.insert(0, "numbers", one["row"].map(len))
-        return table.assign(**{"at a limit": one["limits"].map(", ".join)})
+        table.insert(0, "train", self.calibrated["train"].map(np.mean))
+        table.insert(0, "numbers", self.calibrated["row"].map(len))
+        table["at a limit"] = self.calibrated["limits"].map(", ".join)
+        return table
 
-    def _test(self) -> pd.DataFrame:
-        table = versus(self.tested(), REFERENCE, self.options.seed).loc[self.order]
+    def objectives_heldout(self) -> pd.DataFrame:
+        costs = {label: self.heldout(objective).mean() for objective, label in OBJECTIVES.items()}
+        return pd.DataFrame(costs).rename_axis("candidate")
+
+    def test(self) -> pd.DataFrame:
+        table = versus(self.tested[self.order], REFERENCE, self.options.seed)
         table = table.rename(columns={"mean": "test"}).drop(columns="better")
         table.insert(0, "held out", self.heldout().mean())
-        told = {
-            f"{law}, printed ({objective})": {"test": value}
-            for law, errors in printed.errors.items()
-            for objective, value in zip(printed.objectives, errors, strict=True)
-        }
-        table = pd.concat([table, pd.DataFrame.from_dict(told, orient="index")])
-        return table.rename_axis("candidate")
+        told = self.printed_errors
+        told.index = [f"{law}, printed ({objective})" for law, objective in told.index]
+        return pd.concat([table, told.to_frame("test")]).rename_axis("candidate")
 
-    def _sides(self) -> pd.DataFrame:
+    def draw_candidates(self) -> Figure:
+        costs = {
+            "held out, clusters resampled": self.heldout(),
+            "test, pairs resampled": self.tested,
+        }
+        pairs = [(name, REFERENCE) for name in self.order]
+        away = {
+            label: differences(table, pairs, self.options.seed) for label, table in costs.items()
+        }
+        return plot_errors(self.order, away, REFERENCE)
+
+    def sides(self) -> pd.DataFrame:
         """Mean speed of the follower (m/s) and mean gap (m) of every pair, by side."""
         rows = [
-            (side, float(np.mean(pair.velocity()[:, 0])), float(gap_of(pair).mean()))
+            (side, np.mean(pair.velocity()[:, 0]), gap_of(pair).mean())
             for side in ("train", "test")
             for pair in self.pairs(side == "test")
         ]
         return pd.DataFrame(rows, columns=["side", "speed (m/s)", "gap (m)"])
 
-    def _objectives(self, name: str) -> pd.DataFrame:
+    def draw_sides(self) -> Figure:
+        return plot_sides(self.sides())
+
+    def pairs_across(self) -> int:
+        """Test pairs that share a vehicle with a training pair."""
+        train = self.pairs()
+        label = data.labels((*train, *self.pairs(test=True)))
+        return int(np.isin(label[len(train) :], label[: len(train)]).sum())
+
+    def standard_error(self, name: str, reference: str | None = None) -> float:
+        """Of the mean error of the test pairs, or of its difference from another law, m."""
+        error = self.tested[name] - (self.tested[reference] if reference else 0.0)
+        return float(error.std() / np.sqrt(len(error)))
+
+    def parameters(self) -> pd.DataFrame:
+        order = list(dict.fromkeys((*self.chosen, *self.of("cross_validate").index)))
+        fits = self.calibrated.loc[order, ["parameters"]].rename_axis("candidate").reset_index()
+        return by_number(fits, "parameters").drop(columns="index")
+
+    # -- one law -----------------------------------------------------------------------------
+
+    def objectives_of(self, name: str) -> pd.DataFrame:
         rows = {}
-        for objective, one in self.of("objectives").loc[name, list(OBJECTIVES)].items():
-            shown = {k: v for k, v in one["parameters"].items() if not _weight(k)}
-            limits = {"at a limit": ", ".join(one["limits"])}
-            rows[objective] = {**one["reached"], **shown, **limits}
+        for objective, result in self.of("objectives").loc[name, list(OBJECTIVES)].items():
+            shown = {k: v for k, v in result["parameters"].items() if not _weight(k)}
+            limits = {"at a limit": ", ".join(result["limits"])}
+            rows[objective] = {**result["reached"], **shown, **limits}
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis("minimised")
 
-    def _precision(self, name: str) -> pd.DataFrame:
-        one = self.of("precision").loc[name]
-        names, row, half = one["names"], np.array(one["row"]), np.array(one["half"])
-        limits = self.of("cross_validate").loc[name, "limits"]
+    def precision(self, name: str) -> pd.DataFrame:
+        result = self.of("precision").loc[name]
+        row, half = np.array(result["row"]), np.array(result["half"])
         table = _by_parameter(
-            names,
-            {
-                "value": row,
-                "from": row - half,
-                "to": row + half,
-                "unit": _units(names),
-                "at a limit": [n in limits for n in names],
-            },
+            result["names"],
+            {"value": row, "from": row - half, "to": row + half, "unit": _units(result["names"])},
         )
+        table["at a limit"] = table.index.isin(self.calibrated.loc[name, "limits"])
         for side, sign in (("below", -1), ("above", 1)):
-            closed = [_rises(one["profiles"][n], v, sign) for n, v in zip(names, row, strict=True)]
-            table[f"closed {side}"] = closed
-        if len(names) > MANY:
+            table[f"closed {side}"] = [
+                _rises(profile, value, sign)
+                for profile, value in zip(result["profiles"].values(), row, strict=True)
+            ]
+        if len(row) > MANY:
             return table
-        correlation = dict(zip((f"r({n})" for n in names), one["correlation"], strict=True))
-        return table.assign(**correlation)
+        return table.assign(
+            **{f"r({n})": r for n, r in zip(table.index, result["correlation"], strict=True)}
+        )
 
-    def _equilibrium_gaps(self) -> pd.DataFrame:
-        v, s = self._even_driving
-        gaps = {
-            n: stability.equilibrium(self.systems[n], np.array(SPEEDS), self.length)
-            for n in self.figured
-        }
-        measured = [pd.Series(s[np.abs(v - x) < 0.5]) for x in SPEEDS]
-        quarters = {"measured, median": 0.5, "quarter below": 0.25, "quarter above": 0.75}
-        gaps |= {
-            name: np.array([each.quantile(q) for each in measured]) for name, q in quarters.items()
-        }
-        return pd.DataFrame(gaps, index=pd.Index(SPEEDS, name="speed (m/s)"))
+    def profiled(self, name: str) -> bool:
+        """Whether the profiles of a candidate are drawn."""
+        return len(self.calibrated.loc[name, "row"]) <= MANY
 
-    def _stability(self) -> pd.DataFrame:
-        rows: dict[str, dict[str, float]] = {name: {} for name in self.systems}
-        for name, v, _, slope in self._slopes():
-            gain = stability.passed(
-                slope, stability.FREQUENCIES, **stability.lateness(self.systems[name])
-            )
-            rows[name][f"margin at {v:g} m/s"] = slope.margin
-            rows[name][f"most at {v:g} m/s"] = float(gain.max())
-        columns = [f"{what} at {v:g} m/s" for v in SPEEDS for what in ("margin", "most")]
-        return pd.DataFrame(rows, index=columns, dtype=float).T.rename_axis("candidate")
+    def draw_profiles(self, name: str) -> Figure:
+        result = self.of("precision").loc[name]
+        best = dict(zip(result["names"], result["row"], strict=True))
+        return plot_profiles(result["profiles"], best, printed.units)
 
-    def _drivers(self) -> pd.DataFrame:
-        one = self.results.loc["halves"]
-        costs = by_unit(one[["pooled", "alone", "shrunk"]], one["clusters"])
+    # -- drivers -----------------------------------------------------------------------------
+
+    def drivers(self) -> pd.DataFrame:
+        result = self.results.loc["halves"]
+        costs = by_unit(result[["pooled", "alone", "shrunk"]], result["clusters"])
         table = versus(costs, "pooled", self.options.seed).drop(columns=["low", "high", "p"])
         table.insert(1, "median (m)", costs.median())
         return table.rename(columns={"mean": "second half (m)"}).rename_axis("calibrated")
 
-    def _spread(self) -> pd.DataFrame:
-        one = self.results.loc["halves"]
-        return _by_parameter(
-            one["names"],
-            {
-                "pooled": one["centre"],
-                "spread of single pairs": one["between"],
-                "spread that lasts": one["spread"],
-                "unit": _units(one["names"]),
-            },
-        )
+    def spread(self) -> pd.DataFrame:
+        result = self.results.loc["halves"]
+        columns = {
+            "pooled": result["centre"],
+            "spread of single pairs": result["between"],
+            "spread that lasts": result["spread"],
+            "unit": _units(result["names"]),
+        }
+        return _by_parameter(result["names"], columns)
 
-    def _platoon_published(self) -> pd.DataFrame:
-        again = self.results.loc["reproduced-platoon"]
-        table = pd.DataFrame({"printed": printed.platoon_errors, "here": again["stopped"]})
+    # -- platoons ----------------------------------------------------------------------------
+
+    def platoon_published(self) -> pd.DataFrame:
+        results = self.results.loc["reproduced-platoon"]
+        table = pd.DataFrame({"printed": printed.platoon_errors, "here": results["stopped"]})
         table["difference"] = table["here"] - table["printed"]
-        table["the law alone"] = pd.Series(again["law"])
+        table["the law alone"] = pd.Series(results["law"])
         table.loc["mean"] = table.mean()
         return table.rename_axis("follower")
 
-    def _platoon(self) -> pd.DataFrame:
+    def platoon(self) -> pd.DataFrame:
         """Laws by the error inside the first 70 %, and the best law of each follower."""
         compared = self.of("compare")
         makes = compared["makes"].iloc[0]
         fold: Any
-        held: Any
-        fold, held = (
+        heldout: Any
+        fold, heldout = (
             pd.DataFrame(compared[part].to_list(), compared.index, makes)
             for part in ("chosen", "heldout")
         )
@@ -260,197 +255,163 @@ class Study:
             {
                 "fold": fold.mean(axis=1),
                 "first 70 %": compared["train"].map(np.mean),
-                "last 30 %": held.mean(axis=1),
-                **held,
+                "last 30 %": heldout.mean(axis=1),
+                **heldout,
                 "at a limit": compared["limits"].map(lambda each: sum(map(len, each))),
             }
-        )
-        best = pd.Series({make: held.loc[law, make] for make, law in fold.idxmin().items()})
-        told = pd.Series(printed.platoon_errors)
-        more = {
-            "chosen by follower": {"fold": fold.min().mean(), "last 30 %": best.mean(), **best},
-            "ovm, printed": {"last 30 %": told.mean(), **told},
-        }
-        table = pd.concat([table.sort_values("fold"), pd.DataFrame.from_dict(more, orient="index")])
+        ).sort_values("fold")
+        best = {make: heldout.loc[law, make] for make, law in fold.idxmin().items()}
+        for name, row in (("chosen by follower", best), ("ovm, printed", printed.platoon_errors)):
+            table.loc[name] = pd.Series({"last 30 %": np.mean(list(row.values())), **row})
+        table.loc["chosen by follower", "fold"] = fold.min().mean()
         return table.rename_axis("law")
 
-    def _runs(self) -> pd.DataFrame:
+    @cached_property
+    def runs(self) -> pd.DataFrame:
         """Every follower of every run by itself."""
-        one = self.results.loc["runs"]
-        frame = pd.DataFrame({"run": one["runs"], "make": one["makes"]})
-        frame["setting"] = [SETTINGS.get(s, s) for s in one["settings"]]
-        frame["error (m)"] = one["costs"]
-        limits = [", ".join(names) for names in one["limits"]]
-        return frame.join(pd.DataFrame(one["parameters"])).assign(**{"at a limit": limits})
-
-    def _time_gaps(self) -> pd.DataFrame:
-        by = self._runs().groupby("setting")
-        table = by["T"].agg(["count", "min", "median", "max"]).join(by["error (m)"].mean())
-        return table.rename(columns={"count": "followers"}).loc[self._settings]
+        result = self.results.loc["runs"]
+        frame = pd.DataFrame({"run": result["runs"], "make": result["makes"]})
+        frame["setting"] = pd.Series(result["settings"]).replace(SETTINGS)
+        frame["error (m)"] = result["costs"]
+        frame = frame.join(pd.DataFrame(result["parameters"]))
+        return frame.assign(**{"at a limit": list(map(", ".join, result["limits"]))})
 
     @property
-    def _settings(self) -> list[str]:
-        measured = set(self._runs()["setting"])
-        return [setting for setting in SETTINGS.values() if setting in measured]
+    def settings(self) -> list[str]:
+        """Settings of the distance with which somebody drove."""
+        return [setting for setting in SETTINGS.values() if setting in set(self.runs["setting"])]
 
-    def _leaders(self) -> pd.DataFrame:
-        one = self.results.loc["leaders"]
+    def time_gaps(self) -> pd.DataFrame:
+        by = self.runs.groupby("setting")
+        table = by["T"].agg(["count", "min", "median", "max"]).join(by["error (m)"].mean())
+        return table.rename(columns={"count": "followers"}).loc[self.settings]
+
+    def draw_time_gaps(self) -> Figure:
+        return plot_time_gaps(self.runs, self.settings)
+
+    # -- leaders -----------------------------------------------------------------------------
+
+    def by_leader(self) -> pd.DataFrame:
+        result = self.results.loc["leaders"]
         rows, without = (
-            {kind: np.array(one[part][kind]) for kind in leaders.KINDS}
-            for part in ("rows", "without")
+            {kind: np.array(result[part][kind]) for kind in KINDS} for part in ("rows", "without")
         )
-        columns: dict[str, Any] = {"unit": _units(one["names"])}
+        columns: dict[str, Any] = {"unit": _units(result["names"])}
         for kind, row in rows.items():
-            columns |= {kind: row, f"± {kind}": leaders.jackknifed(without[kind])}
+            columns |= {kind: row, f"± {kind}": jackknifed(without[kind])}
         away = rows["CAV"] - rows["HV"]
-        half = leaders.jackknifed(without["CAV"] - without["HV"])
+        half = jackknifed(without["CAV"] - without["HV"])
         columns |= {"CAV minus HV": away, "from": away - half, "to": away + half}
-        return _by_parameter(one["names"], columns)
+        return _by_parameter(result["names"], columns)
 
-    def _leaders_heldout(self) -> pd.DataFrame:
-        one = self.results.loc["leaders"]
-        costs = by_unit(one["heldout"], one["clusters"])
+    def leaders_heldout(self) -> pd.DataFrame:
+        result = self.results.loc["leaders"]
+        costs = by_unit(result["heldout"], result["clusters"])
+        pairs = pd.DataFrame({"speed (m/s)": result["speed"], "gap (m)": result["gap"]})
         parts = {}
-        for kind in leaders.KINDS:
-            chosen = np.array(one["kinds"]) == kind
+        for kind in KINDS:
+            chosen = np.array(result["kinds"]) == kind
             table = versus(costs[chosen], "both", self.options.seed)
             table = table.rename(columns={"mean": "held out (m)"}).drop(columns=["p", "better"])
-            for name, what in (("gap (m)", "gap"), ("speed (m/s)", "speed")):
-                table.insert(0, name, float(np.array(one[what])[chosen].mean()))
-            table.insert(0, "pairs", int(chosen.sum()))
-            parts[f"behind {kind}"] = table
+            means = pairs[chosen].mean()
+            parts[f"behind {kind}"] = pd.concat(
+                [pd.DataFrame({"pairs": chosen.sum(), **means}, index=table.index), table], axis=1
+            )
         return pd.concat(parts, names=["pairs", "calibrated on"])
-
-    def _parameters(self) -> pd.DataFrame:
-        order = list(dict.fromkeys((*self.chosen, *self.names)))
-        fits = self.of("cross_validate").loc[order, ["parameters"]].rename_axis("candidate")
-        return by_number(fits.reset_index(), "parameters").drop(columns="index")
 
     # -- equilibria ----------------------------------------------------------------------------
 
     @cached_property
-    def systems(self) -> dict[str, System]:
-        """Calibrated laws that have slopes; maps have none."""
-        names = [n for n in self.names if not n.startswith(stability.MAPS)]
-        return {name: self.system(name) for name in names}
+    def continuous(self) -> list[str]:
+        """Candidates that have slopes; maps have none."""
+        return [name for name in self.systems if not name.startswith(stability.MAPS)]
 
     @property
     def figured(self) -> list[str]:
         """Of these, those in the figures."""
-        return [n for n in dict.fromkeys((*FIGURED, *self.chosen)) if n in self.systems]
+        return [n for n in dict.fromkeys((*FIGURED, *self.chosen)) if n in self.continuous]
 
-    @property
+    @cached_property
     def length(self) -> float:
         """Mean length of the leaders, m."""
         return float(np.mean([p.length[1] for p in self.pairs() if p.length is not None]))
 
+    def equilibria(self, speeds: Any, names: list[str]) -> pd.DataFrame:
+        """Equilibrium gaps (m) by speed (m/s), a column per candidate."""
+        gaps = {n: stability.equilibrium(self.systems[n], speeds, self.length) for n in names}
+        return pd.DataFrame(gaps, index=pd.Index(speeds, name="speed (m/s)"))
+
     @cached_property
-    def _even_driving(self) -> tuple[np.ndarray, np.ndarray]:
-        """Speeds and gaps of training pairs at nearly even driving."""
-        speeds, gaps = [], []
+    def even_driving(self) -> pd.DataFrame:
+        """Speed (m/s) and gap (m) of the samples of training pairs at nearly even driving."""
+        parts = []
         for pair in self.pairs():
-            v = pair.velocity()[..., 0]
-            even = np.abs(v[:, 0] - v[:, 1]) < EVEN[0]
-            even &= np.abs(np.gradient(v[:, 0], pair.dt)) < EVEN[1]
-            speeds.append(v[even, 0])
-            gaps.append(gap_of(pair)[even])
-        return np.concatenate(speeds), np.concatenate(gaps)
+            v, lead = pair.velocity()[..., 0].T
+            part = pd.DataFrame({"v": v, "gap": gap_of(pair)})
+            even = (np.abs(v - lead) < EVEN[0]) & (np.abs(np.gradient(v, pair.dt)) < EVEN[1])
+            parts.append(part[even])
+        return pd.concat(parts, ignore_index=True)
 
-    def _slopes(self) -> Iterable[tuple[str, float, float, stability.Slopes]]:
-        """Candidate, speed, equilibrium gap and slopes there, where there is an equilibrium."""
-        for name, system in self.systems.items():
-            gaps = stability.equilibrium(system, np.array(SPEEDS), self.length)
-            for v, gap in zip(SPEEDS, map(float, gaps), strict=True):
-                if np.isfinite(gap):
-                    yield name, v, gap, stability.slopes(system, gap, v, self.length)
+    def equilibrium_gaps(self) -> pd.DataFrame:
+        table = self.equilibria(SPEEDS, self.figured)
+        v, gap = self.even_driving["v"], self.even_driving["gap"]
+        for name, q in (
+            ("measured, median", 0.5),
+            ("quarter below", 0.25),
+            ("quarter above", 0.75),
+        ):
+            table[name] = [gap[(v - speed).abs() < 0.5].quantile(q) for speed in SPEEDS]
+        return table
 
-    # -- figures -----------------------------------------------------------------------------
+    def draw_equilibria(self) -> Figure:
+        samples = self.even_driving
+        speeds = np.linspace(0.25, samples["v"].quantile(0.995), 60)
+        return plot_equilibria(self.equilibria(speeds, self.figured), samples, self.length)
 
-    def figures(self) -> dict[str, Figure | ReplayBlock]:
-        """By their names in the template."""
-        away = {
-            "held out, clusters resampled": self.away(self.heldout()),
-            "test, pairs resampled": self.away(self.tested()),
-        }
-        v = self._even_driving[0]
-        speeds = np.linspace(0.25, float(np.quantile(v, 0.995)), 60)
-        curves = {
-            n: stability.equilibrium(self.systems[n], speeds, self.length) for n in self.figured
-        }
-        drawings: dict[str, Figure | ReplayBlock] = {
-            "candidates": figures.errors(self.order, away, REFERENCE),
-            "sides": figures.sides(self._sides()),
-            "equilibria": figures.equilibria(speeds, curves, self._even_driving, self.length),
-            "amplification": self._amplification(),
-            "time_gaps": figures.time_gaps(self._runs(), self._settings),
-            "replay": self._replay(),
-        }
-        for name in self.profiled:
-            one = self.of("precision").loc[name]
-            best = dict(zip(one["names"], one["row"], strict=True))
-            drawings[f"profiles_{key(name)}"] = figures.profiles(
-                one["profiles"], best, printed.units
-            )
-        return drawings
-
-    @property
-    def profiled(self) -> list[str]:
-        """Candidates whose profiles are drawn."""
-        return [n for n in self.chosen if len(self.of("precision").loc[n, "names"]) <= MANY]
-
-    def _amplification(self) -> Figure:
-        speed, period = SWING
-        gains, along = {}, {}
-        for name, v, gap, slope in self._slopes():
-            if v != speed or name not in self.figured:
-                continue
-            system, w = self.systems[name], 2 * np.pi / period
-            late = stability.lateness(system)
-            gains[name] = stability.passed(slope, stability.FREQUENCIES, **late)
-            swing = stability.platoon(system, v, gap, self.length, w)
-            theory = float(stability.passed(slope, np.array([w]), **late)[0])
-            along[name] = (swing / swing[0], theory ** np.arange(len(swing)))
-        return figures.amplification(gains, stability.FREQUENCIES, along)
-
-    def _replay(self) -> ReplayBlock:
-        pairs = self.pairs(test=True)
-        systems = {name: self.system(name) for name in self.chosen}
-        what = (
-            f"Test pairs with the measured leader, as measured and as simulated by "
-            f"{' and '.join(systems)}, which are calibrated to all training pairs."
-        )
-        return player(scenes(thinned(pairs, FEW), systems), what, len(pairs))
-
-    def values(self) -> dict[str, Any]:
-        """What else the template refers to."""
-        train, test = self.pairs(), self.pairs(test=True)
-        label = data.labels((*train, *test))
-        floor = self.results.loc["floor"]
-        tested = self.tested()
-        paired = (tested[self.order[0]] - tested[REFERENCE]).std() / np.sqrt(len(tested))
+    @cached_property
+    def slopes(self) -> dict[tuple[str, float], tuple[float, stability.Slopes]]:
+        """Equilibrium gap, and slopes there, by candidate and speed; only where it exists."""
+        gaps: Any = self.equilibria(SPEEDS, self.continuous)
         return {
-            "options": self.options,
-            "reference": REFERENCE,
-            "best": self.order[0],
-            "keys": {name: key(name) for name in self.chosen},
-            "profiled": self.profiled,
-            "left": [name for name in EVERY if name not in self.names],
-            "pairs": len(train),
-            "tests": len(test),
-            "clusters": len(set(self.of("cross_validate").loc[REFERENCE, "clusters"])),
-            "shared": int(np.isin(label[len(train) :], label[: len(train)]).sum()),
-            "half": 1.96 * float(tested[REFERENCE].std() / np.sqrt(len(tested))),
-            "seen": 2.8 * float(paired),
-            "decay": DECAY,
-            "floor": float(np.mean(floor["costs"])),
-            "touched": sum(map(bool, floor["limits"])),
-            "strengths": sorted(set(self.results.loc["halves", "strengths"])),
-            "even": EVEN,
-            "length": self.length,
-            "swing": SWING,
-            "objectives": list(OBJECTIVES),
-            "run": printed.platoon,
+            (name, v): (gap, stability.slopes(self.systems[name], gap, v, self.length))
+            for name in gaps
+            for v, gap in gaps[name].dropna().items()
         }
+
+    def gain(self, name: str, speed: float, frequency: np.ndarray) -> np.ndarray:
+        """The amplification of a disturbance by a follower at frequencies, 1/s."""
+        lateness = stability.lateness(self.systems[name])
+        return stability.passed(self.slopes[name, speed][1], frequency, **lateness)
+
+    def string_stability(self) -> pd.DataFrame:
+        table = pd.DataFrame(
+            index=pd.Index(self.continuous, name="candidate"),
+            columns=[f"{what} at {v:g} m/s" for v in SPEEDS for what in ("margin", "most")],
+            dtype=float,
+        )
+        for (name, v), (_, slope) in self.slopes.items():
+            table.loc[name, f"margin at {v:g} m/s"] = slope.margin
+            most = self.gain(name, v, stability.FREQUENCIES).max()
+            table.loc[name, f"most at {v:g} m/s"] = most
+        return table
+
+    def draw_amplification(self) -> Figure:
+        speed, period = SWING
+        w = 2 * np.pi / period
+        gains, along = {}, {}
+        for name in self.continuous:
+            if name in self.figured and (name, speed) in self.slopes:
+                gap, system = self.slopes[name, speed][0], self.systems[name]
+                gains[name] = self.gain(name, speed, stability.FREQUENCIES)
+                swing = stability.platoon(system, speed, gap, self.length, w)
+                theory = float(self.gain(name, speed, np.array([w]))[0])
+                along[name] = (swing / swing[0], theory ** np.arange(len(swing)))
+        return plot_amplification(gains, stability.FREQUENCIES, along)
+
+    def scenes(self) -> list[Scene]:
+        """Test pairs of the player."""
+        systems = {name: self.systems[name] for name in self.chosen}
+        return scenes(thinned(self.pairs(test=True), FEW), systems)
 
 
 def _units(names: list[str]) -> list[str]:
@@ -471,3 +432,166 @@ def _rises(profile: dict[str, list[float]], best: float, side: int) -> bool:
     """Whether the error rises beyond doubt on a side of the best value within the profile."""
     values, low = np.array(profile["values"]), np.array(profile["low"])
     return bool((low[side * (values - best) > 0] > 0).any())
+
+
+#: Rises of the error up to this are shown, m: beyond it no value is in question.
+SHOWN = 0.6
+
+_BLUE, _RED = OKABE_ITO["blue"], OKABE_ITO["vermillion"]
+
+
+def plot_errors(names: list[str], away: Mapping[str, pd.DataFrame], reference: str) -> Figure:
+    """Differences of candidates to a reference, with intervals, one row per candidate.
+
+    Args:
+        names: from top to bottom.
+        away: what was compared on to ``difference``, ``low`` and ``high`` (m) by candidate.
+    """
+    figure = new_figure(7.2, 0.24 * len(names) + 1.1)
+    ax = figure.subplots()
+    place = np.arange(len(names))[::-1]
+    handles = []
+    for i, (label, table) in enumerate(away.items()):
+        style = curve_style(i)
+        y = place + (0.5 - i) * 0.3
+        ax.hlines(y, table["low"], table["high"], color=style["color"], linewidth=1.4)
+        ax.plot(table["difference"], y, style["marker"], color=style["color"], markersize=4)
+        handles.append(Line2D([], [], **{**style, "linestyle": "-"}, markersize=4, label=label))
+    ax.axvline(0, color=GREY, linewidth=0.8)
+    ax.set_yticks(place, names)
+    ax.set_ylim(-0.8, len(names) - 0.2)
+    # one that blows up on a few pairs must not hide the others
+    ends = pd.concat(away)[["low", "high"]].abs()
+    limit = 1.15 * float(np.nanquantile(ends, 0.9))
+    ax.set_xlim(-limit, limit)
+    dress(ax, x=f"error minus that of {reference} (m)")
+    legend_above(figure, handles, columns=2)
+    return figure
+
+
+def plot_sides(pairs: pd.DataFrame) -> Figure:
+    """Mean speed (m/s) and mean gap (m) of the pairs by ``side`` of a division."""
+    figure = new_figure(5.2, 3.4)
+    ax = figure.subplots()
+    for i, (name, part) in enumerate(pairs.groupby("side", sort=False)):
+        style = curve_style(i)
+        ax.plot(
+            part["speed (m/s)"],
+            part["gap (m)"],
+            style["marker"],
+            color=style["color"],
+            markerfacecolor="none" if i == 0 else style["color"],
+            markersize=5,
+            label=f"{name}: {len(part)} pairs",
+        )
+    dress(ax, x="mean speed of the follower (m/s)", y="mean gap (m)")
+    ax.legend(fontsize=SMALL_FONT, frameon=False)
+    return figure
+
+
+def plot_profiles(
+    points: Mapping[str, Mapping[str, list[float]]],
+    best: Mapping[str, float],
+    units: Mapping[str, str],
+) -> Figure:
+    """The rise of the cost where one parameter is held and all others are calibrated again.
+
+    Args:
+        points: parameter to ``values``, ``rise``, ``low`` and ``high`` (m).
+    """
+    figure = new_figure(2.1 * len(points), 2.5)
+    axes = figure.subplots(1, len(points), sharey=True, squeeze=False)[0]
+    for ax, (name, profile) in zip(axes, points.items(), strict=True):
+        ax.fill_between(
+            profile["values"], profile["low"], profile["high"], color=_BLUE, alpha=0.15, lw=0
+        )
+        ax.plot(profile["values"], profile["rise"], "o-", color=_BLUE, markersize=3, linewidth=1.2)
+        ax.axhline(0, color=GREY, linewidth=0.8)
+        ax.axvline(best[name], color=_RED, linewidth=0.9, linestyle=(0, (4, 2)))
+        dress(ax, x=f"{name} ({units.get(name, '')})")
+        ax.set_xscale("log")
+        ax.minorticks_off()
+        low, high = min(profile["values"]), max(profile["values"])
+        ticks = [t for t in (0.25, 0.5, 1, 2, 5, 10, 20, 50, 100) if low <= t <= high]
+        ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    axes[0].set_ylabel("rise of the error (m)", fontsize=FONT)
+    axes[0].set_ylim(-0.1 * SHOWN, SHOWN)
+    return figure
+
+
+def plot_equilibria(gaps: pd.DataFrame, measured: pd.DataFrame, length: float) -> Figure:
+    """Equilibrium gap by speed, and flow by density, of laws over nearly even driving.
+
+    Args:
+        gaps: equilibrium gaps (m), a column per law, indexed by speed (m/s).
+        measured: samples at nearly even driving: speed ``v`` (m/s) and ``gap`` (m).
+        length: of a vehicle, m.
+    """
+    figure = new_figure(8.6, 3.5)
+    left, right = figure.subplots(1, 2)
+    speeds, v, s = gaps.index.to_numpy(), measured["v"], measured["gap"]
+    for ax, x, y in ((left, v, s), (right, 1e3 / (s + length), 3.6e3 * v / (s + length))):
+        ax.plot(x, y, ".", color=GREY, markersize=1.5, alpha=0.25, rasterized=True)
+    for i, (name, gap) in enumerate(gaps.items()):
+        style = {**curve_style(i), "marker": "", "linewidth": 1.5}
+        left.plot(speeds, gap, **style, label=name)
+        right.plot(1e3 / (gap + length), 3.6e3 * speeds / (gap + length), **style)
+    left.set(xlim=(0, speeds.max()), ylim=(0, s.quantile(0.998)))
+    right.set(xlim=(0, 180), ylim=(0, 3000))
+    dress(left, x="speed (m/s)", y="gap (m)")
+    dress(right, x="density (vehicles/km)", y="flow (vehicles/h)")
+    left.legend(fontsize=SMALL_FONT, loc="upper left")
+    return figure
+
+
+def plot_amplification(
+    gains: Mapping[str, np.ndarray],
+    frequency: np.ndarray,
+    along: Mapping[str, tuple[np.ndarray, np.ndarray]],
+) -> Figure:
+    """How much of a swing one follower passes on, and what it comes to along a platoon.
+
+    Args:
+        gains: law to |G| at frequencies (1/s).
+        along: law to simulated amplitudes by place, over the leader's, and what |G| says.
+    """
+    figure = new_figure(8.6, 3.3)
+    left, right = figure.subplots(1, 2)
+    for i, (name, gain) in enumerate(gains.items()):
+        style = {**curve_style(i), "marker": "", "linewidth": 1.4}
+        left.plot(2 * np.pi / frequency, gain, **style, label=name)
+    left.axhline(1, color=GREY, linewidth=0.8)
+    left.set(xscale="log", xlim=(3, 200), ylim=(0, None))
+    dress(left, x="period of the swing (s)", y="swing of the follower over the leader's")
+    left.legend(fontsize=SMALL_FONT)
+    for i, (simulated, theory) in enumerate(along.values()):
+        style = curve_style(i)
+        place = np.arange(len(simulated))
+        right.plot(place, theory, color=style["color"], linewidth=1.2, linestyle=style["linestyle"])
+        right.plot(place, simulated, style["marker"], color=style["color"], markersize=4)
+    dress(right, x="place behind the leader", y="swing over the leader's")
+    kinds = [
+        Line2D([], [], color=GREY, linewidth=1.2, label="linear theory"),
+        Line2D([], [], color=GREY, marker="o", linestyle="", markersize=4, label="simulated"),
+    ]
+    right.legend(handles=kinds, fontsize=SMALL_FONT)
+    return figure
+
+
+def plot_time_gaps(followers: pd.DataFrame, settings: list[str]) -> Figure:
+    """Time gap ``T`` (s) of each follower, by ``setting`` along the axis and ``make`` within it."""
+    place = followers["setting"].map({name: i for i, name in enumerate(settings)})
+    followers = followers.assign(place=place).dropna(subset="place")
+    figure = new_figure(6.4, 3.2)
+    ax = figure.subplots()
+    makes = followers.sort_values(["place", "make"])["make"].unique()
+    for i, make in enumerate(makes):
+        part = followers[followers["make"] == make]
+        style = {**curve_style(i), "linestyle": "", "fillstyle": "none", "markersize": 5}
+        shift = (i - (len(makes) - 1) / 2) * 0.16
+        ax.plot(part["place"] + shift, part["T"], **style, label=make)
+    ax.set_xticks(range(len(settings)), settings)
+    dress(ax, y="time gap T (s)")
+    ax.legend(fontsize=SMALL_FONT)
+    ax.set_ylim(bottom=0)
+    return figure

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from nnode.data.sequence import Sequence, collate
 from nnode.model.laws import Law
@@ -36,7 +37,7 @@ MAPS = ("krauss", "newell")
 
 
 def acceleration(
-    system: System, gap: np.ndarray, v: np.ndarray, dv: np.ndarray, length: float
+    system: System, gap: ArrayLike, v: ArrayLike, dv: ArrayLike, length: float
 ) -> np.ndarray:
     """m/s² of a law without its effects, elementwise.
 
@@ -47,22 +48,21 @@ def acceleration(
     """
     law = system.find(Law)
     assert law is not None
-    gap, v, dv = np.broadcast_arrays(gap, v, dv)
+    gap, v, dv = (torch.tensor(each) for each in np.broadcast_arrays(gap, v, dv))
     values = {
         "gap": gap + length,
         "v": v,
         "dv": dv,
         "v_1": v - dv,
         "dx_1": v - dv,
-        "length_1": np.full(gap.shape, length),
-        "dt": np.full(gap.shape, 0.1),
+        "length_1": torch.full_like(gap, length),
+        "dt": torch.full_like(gap, 0.1),
     }
-    known = {name: torch.tensor(np.array(x, dtype=float)) for name, x in values.items()}
     # a remembered time gap has faded to the common one where driving is even
     for state in law.dynamics().starts:
-        known[state] = law.get_parameter("T").detach().expand(gap.shape)
+        values[state] = law.get_parameter("T").detach().expand(gap.shape)
     with torch.no_grad():
-        return np.asarray(law.evaluated(known).expand(gap.shape).numpy())
+        return np.asarray(law.evaluated(values).expand(gap.shape).numpy())
 
 
 def equilibrium(system: System, speeds: np.ndarray, length: float) -> np.ndarray:
@@ -72,7 +72,7 @@ def equilibrium(system: System, speeds: np.ndarray, length: float) -> np.ndarray
     """
     gaps = np.full(len(speeds), math.nan)
     for k, v in enumerate(speeds):
-        rate = acceleration(system, GAPS, np.array(v), np.array(0.0), length)
+        rate = acceleration(system, GAPS, v, 0.0, length)
         up = np.flatnonzero((rate[:-1] < 0) & (rate[1:] >= 0))
         if up.size:
             i = int(up[0])

@@ -9,10 +9,10 @@ import pandas as pd
 
 from nnode.data.store import Store
 from nnode.pages.page import Block
-from studies.following import fit, inference, leaders, platoons
-from studies.following.candidates import EVERY, REFERENCE, key
+from studies.following import printed, tasks
 from studies.following.data import LEADERS, PAIRS, PLATOONS, stores
-from studies.following.results import Study
+from studies.following.results import EVEN, SWING, Study
+from studies.following.tasks import DECAY, EVERY, OBJECTIVES, ON_TRACK, REFERENCE, key
 from studies.frame import computed
 from studies.options import FollowingStudyOptions
 from studies.page import page
@@ -43,23 +43,40 @@ def run(options: FollowingStudyOptions, folder: Path) -> list[Block]:
         return computed(tasks, folder, options, prepared, title)
 
     study = Study(options, prepared, run_all(training(options, prepared), "cross-validation"))
-    more = run_all(after(study), "test, precision, platoons")
-    study.results = pd.concat([study.results, more])
-    return page("following", study.tables(), study.figures(), prepared.values(), **study.values())
+    results = run_all(after(study), "test, precision, platoons")
+    study.results = pd.concat([study.results, results])
+    return blocks(study)
+
+
+def blocks(study: Study) -> list[Block]:
+    """The page."""
+    return page(
+        "following",
+        study,
+        study.stores.values(),
+        reference=REFERENCE,
+        key=key,
+        decay=DECAY,
+        left=[name for name in EVERY if name not in study.order],
+        objectives=list(OBJECTIVES),
+        even=EVEN,
+        swing=SWING,
+        run=printed.platoon,
+    )
 
 
 def training(options: FollowingStudyOptions, prepared: Mapping[str, Store]) -> list[Task]:
-    """What chooses a law: nothing here sees a test pair."""
+    """What chooses a law: nothing here depends on a test pair."""
     where = {"folder": str(prepared[PAIRS].folder), "folds": options.folds}
     where |= {"restarts": options.restarts, "seed": options.seed}
     return [
         Task(
             f"cv-{key(name)}",
-            fit.cross_validate,
+            tasks.cross_validate,
             where | {"name": name},
-            cost=len(one.effects) + (one.network or 0) + 2.0,
+            cost=len(law.effects) + (law.network or 0) + 2.0,
         )
-        for name, one in EVERY.items()
+        for name, law in EVERY.items()
         if not options.quick or name in FEW
     ]
 
@@ -72,25 +89,25 @@ def after(study: Study) -> list[Task]:
     )
     search = {"restarts": options.restarts, "seed": options.seed}
     idm = {"name": REFERENCE, **search}
-    rows = study.of("cross_validate")["row"]
+    rows = study.calibrated["row"]
     folds = {"row": rows[REFERENCE], "folds": options.folds}
-    tasks = [
-        Task("reproduced-pairs", fit.reproduced, pairs),
-        Task("reproduced-platoon", platoons.reproduced, track),
-        Task("floor", fit.floor, pairs | idm, cost=6.0),
-        Task("halves", inference.halves, pairs | idm | folds, cost=8.0),
-        Task("leaders", leaders.by_leader, road | idm, cost=6.0),
-        Task("runs", platoons.every_run, track | idm, cost=8.0),
+    every = [
+        Task("reproduced-pairs", tasks.reproduced_pairs, pairs),
+        Task("reproduced-platoon", tasks.reproduced_platoon, track),
+        Task("floor", tasks.floor, pairs | idm, cost=6.0),
+        Task("halves", tasks.halves, pairs | idm | folds, cost=8.0),
+        Task("leaders", tasks.by_leader, road | idm, cost=6.0),
+        Task("runs", tasks.every_run, track | idm, cost=8.0),
     ]
-    for name in study.names:
-        own = pairs | {"name": name, "row": rows[name]}
-        tasks.append(Task(f"test-{key(name)}", fit.tested, own))
+    for name, row in rows.items():
+        fitted = pairs | {"name": name, "row": row}
+        every.append(Task(f"test-{key(name)}", tasks.tested, fitted))
         if name in study.chosen:
             where = pairs | {"name": name} | search
-            tasks.append(Task(f"objectives-{key(name)}", fit.objectives, where, cost=6.0))
-            tasks.append(Task(f"precision-{key(name)}", inference.precision, own, cost=4.0))
-    for name in platoons.CANDIDATES:
+            every.append(Task(f"objectives-{key(name)}", tasks.objectives, where, cost=6.0))
+            every.append(Task(f"precision-{key(name)}", tasks.precision, fitted, cost=4.0))
+    for name in ON_TRACK:
         if not options.quick or name in FEW:
             where = track | {"name": name} | search
-            tasks.append(Task(f"platoon-{key(name)}", platoons.compare, where, cost=5.0))
-    return tasks
+            every.append(Task(f"platoon-{key(name)}", tasks.compare, where, cost=5.0))
+    return every

@@ -15,7 +15,7 @@ from studies.frame import computed
 from studies.options import PredictionStudyOptions
 from studies.page import page
 from studies.prediction import printed, tasks
-from studies.prediction.data import AHEAD, SCENES, SEEN, STEP, stores
+from studies.prediction.tasks import AHEAD, SCENES, SEEN, STEP, stores
 from studies.runner import Task
 from studies.walking import tasks as walking
 from studies.walking.study import errors_by_run
@@ -58,38 +58,44 @@ def run(options: PredictionStudyOptions, folder: Path) -> list[Block]:
         where: dict[str, Any] = {"folders": folders, "held": [name]}
         every.append(Task(f"simple-{name}", walking.baselines, where))
         for law in list(PEOPLE)[: 1 if options.quick else None]:
-            one = {"law": law, "desired": "direction", **where}
-            every.append(Task(f"{law}-{name}", walking.fit, one, cost=10.0))
+            arguments = {"law": law, "desired": "direction", **where}
+            every.append(Task(f"{law}-{name}", walking.fit, arguments, cost=10.0))
     results = computed(every, folder, options, prepared, "prediction study")
-    distances = errors_by_run(results.query("task != 'follow'"), SIMPLE | PEOPLE)
-    tables = {"following": _following(results, options.seed)}
-    tables |= {what: _by_scene(distances, what) for what in ("ade", "fde")}
-    people = distances.groupby("run", sort=False)["people"].first().to_dict()
-    times = {"people": people, "seen": SEEN, "ahead": AHEAD, "step": STEP}
-    return page("prediction", tables, {}, prepared.values(), **times)
+    distances = errors_by_run(results["errors"].dropna(), SIMPLE | PEOPLE)
+    return page(
+        "prediction",
+        stores=prepared.values(),
+        following=following(results, options.seed),
+        ade=by_scene(distances, "ade"),
+        fde=by_scene(distances, "fde"),
+        people=distances.groupby("run", sort=False)["people"].first().to_dict(),
+        seen=SEEN,
+        ahead=AHEAD,
+        step=STEP,
+    )
 
 
-def _following(results: pd.DataFrame, seed: int) -> pd.DataFrame:
+def following(results: pd.DataFrame, seed: int) -> pd.DataFrame:
     """Errors of spacings by law, published ones last."""
     rows: dict[str, dict[str, Any]] = {}
-    for one in results.query("task == 'follow'").to_dict("records"):
-        test = one["test"]
+    for task in results.query("task == 'follow'").to_dict("records"):
+        test = task["test"]
         clusters = np.arange(len(test["error"]))
         weights = group_weights(clusters, DRAWS, np.random.default_rng(seed))
         low, high = np.quantile([tasks.rmspe(test, w) for w in weights], [0.025, 0.975])
-        rows[one["law"]] = {
-            "training": tasks.rmspe(one["train"]),
+        rows[task["law"]] = {
+            "training": tasks.rmspe(task["train"]),
             "test": tasks.rmspe(test),
             "low": low,
             "high": high,
-            "parameters": ", ".join(f"{name} = {value:.3g}" for name, value in one["row"].items()),
+            "parameters": ", ".join(f"{name} = {value:.3g}" for name, value in task["row"].items()),
         }
     rows["idm, published"] = dict(zip(("training", "test"), printed.idm, strict=True))
     rows["learned, published"] = {"test": printed.learned}
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("law")
 
 
-def _by_scene(distances: pd.DataFrame, what: str) -> pd.DataFrame:
+def by_scene(distances: pd.DataFrame, what: str) -> pd.DataFrame:
     """A distance (m) by law and held-out scene, the published one last."""
     order = distances["law"].unique(), distances["run"].unique()
     table = distances.pivot(index="law", columns="run", values=what).loc[*order]

@@ -1,7 +1,8 @@
-"""Tables and figures of the traffic study."""
+"""Tables and figures of the study."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -10,21 +11,29 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from nnode.calibrate.resampling import average_interval, holm
-from nnode.data.sequence import collate
+from nnode.data.sequence import Sequence
 from nnode.data.store import Store
-from nnode.pages.replay import ReplayBlock
-from nnode.plots.style import thinned
+from nnode.pages.replay import Scene
+from nnode.plots.style import (
+    GREY,
+    SMALL_FONT,
+    curve_style,
+    dress,
+    legend_above,
+    new_figure,
+    thinned,
+)
 from nnode.plots.traffic import measured_gaps
-from nnode.simulation.fused import FusedSolver
+from studies.figures import error_bars
 from studies.frame import by_number, by_unit, differences
 from studies.options import TrafficStudyOptions
-from studies.replay import player, scenes
-from studies.traffic import figures, printed, tasks
-from studies.traffic.problem import GAPS, recording, system_of
+from studies.replay import scenes
+from studies.traffic import printed
+from studies.traffic.tasks import BASELINES, GAPS, recording, system_of
 
 LAWS, NETWORKS = ("lin", "log"), ("n2", "n4", "n10")
 MODELS = (*NETWORKS, *LAWS)
@@ -42,18 +51,18 @@ def averaged(table: Any) -> Any:
     return table.assign(**{AVERAGE: table.mean(axis=1)})
 
 
+def as_printed(table: dict[str, Any], averages: dict[str, float]) -> Any:
+    """A table of the paper: a row per model, a column per recording, the averages as printed."""
+    rows = pd.DataFrame(table, index=list(printed.recordings)).T
+    return rows.assign(**{AVERAGE: pd.Series(averages)})
+
+
 def side_by_side(ours: Any, theirs: Any) -> Any:
     """Our rows, the printed ones and the differences, one under the other by model."""
     theirs = theirs.loc[ours.index, ours.columns]
     parts = {"here": ours, "printed": theirs, "difference": ours - theirs}
     stacked = pd.concat(parts, names=["", "model"]).swaplevel()
     return stacked.reindex([(model, part) for model in ours.index for part in parts])
-
-
-def as_printed(table: dict[str, Any], averages: dict[str, float]) -> Any:
-    """A table of the paper: a row per model, a column per recording, the averages as printed."""
-    rows = pd.DataFrame(table, index=list(printed.recordings)).T
-    return rows.assign(**{AVERAGE: pd.Series(averages)})
 
 
 @dataclass
@@ -85,71 +94,45 @@ class Study:
         """Calibrated cost (m² s), and the average over recordings."""
         return averaged(self.take("cost", task, faults, box).astype(float))
 
-    def parameter(self, name: str, models: tuple[str, ...]) -> Any:
+    def parameter(self, name: str, models: tuple[str, ...] = MODELS) -> Any:
         """A scalar parameter of the best fits, and both ends of its bootstrap interval."""
-        values = self.take("parameters").loc[list(models)].map(lambda p: p[name])
+        values = self.take("parameters").loc[list(models)].map(itemgetter(name))
         drawn = self.take("bootstrap").loc[list(models)].map(lambda b: b["values"][name])
-        return values, *(drawn.map(lambda v, q=q: np.quantile(v, q)) for q in (0.025, 0.975))
+        return values, *(drawn.map(np.quantile, q=q) for q in (0.025, 0.975))
+
+    def recording(self, name: str, faults: str = "keep") -> list[Sequence]:
+        """The sequences of a recording."""
+        return recording(str(self.stores[faults].folder), name)
 
     @cached_property
     def heldout(self) -> dict[str, pd.DataFrame]:
         """By treatment of faults, a column of held-out costs (m² s) per model and baseline."""
         every = self.results.query("task == 'cross_validate'").dropna(subset="groups")
-        every = every.explode(["costs", "groups", *tasks.BASELINES])
+        every = every.explode(["costs", "groups", *BASELINES])
         by_faults = {}
         for faults, part in every.groupby("faults"):
             columns = {str(law): rows["costs"] for law, rows in part.groupby("law", sort=False)}
             lin = part[part["law"] == "lin"]
-            columns |= {name: lin[name] for name in tasks.BASELINES}
+            columns |= {name: lin[name] for name in BASELINES}
             by_faults[str(faults)] = by_unit(
                 columns, lin["recording"] + " " + lin["groups"].map(str)
             )
         return by_faults
 
-    # -- tables ------------------------------------------------------------------------------
+    # -- costs -------------------------------------------------------------------------------
 
-    def tables(self) -> dict[str, pd.DataFrame]:
-        """By their names in the template."""
-        ours, theirs = self.costs(), as_printed(printed.costs, printed.average_costs)
-        box, dropped = self.costs(box=True), self.costs(faults="drop")
-        speeds = self.parameter("v0", MODELS)[0] * KMH
-        lengths, low, high = self.parameter("L", LAWS)
-        printed_lengths = as_printed(printed.lengths, printed.average_lengths)
-        table_1 = side_by_side(averaged(lengths), printed_lengths)
-        ends = pd.concat({"95 % low": low, "95 % high": high}, names=["", "model"]).swaplevel()
-        both = pd.concat({"box": box, "free": ours.loc[list(NETWORKS)]}, names=["", "model"])
-        return {
-            "averages": self._averages(),
-            "recordings": self._recordings(),
-            "table_1": pd.concat([table_1, ends]).sort_index(level=0, sort_remaining=False),
-            "table_2": ours,
-            "table_2_printed": side_by_side(ours, theirs),
-            "table_2_lower": self._lower(ours, theirs, printed_lengths),
-            "table_2_box": both.swaplevel().sort_index(),
-            "leader_speeds": averaged(speeds),
-            "laws": self._laws(),
-            "heldout": self._heldout(),
-            "significance": self._significance(),
-            "optimizers": self._optimizers(),
-            "steps": self._steps(),
-            "faulty": self._faulty(ours, dropped),
-            "dominating_sequences": self._dominating(),
-            "table_2_dropped": dropped,
-            "parameters": self._parameters(),
+    def averages(self) -> pd.DataFrame:
+        costs, groups = self.take("costs").map(np.array), self.take("groups").map(np.array)
+        seed = self.options.seed
+        ends = {
+            model: average_interval(list(costs.loc[model]), list(groups.loc[model]), seed)
+            for model in MODELS
         }
-
-    def _averages(self) -> pd.DataFrame:
-        costs, groups = self.take("costs"), self.take("groups")
-        rows = {}
-        for model in MODELS:
-            each, clusters = ([np.array(v) for v in table.loc[model]] for table in (costs, groups))
-            rows[model] = average_interval(each, clusters, self.options.seed)
-        ends = pd.DataFrame(rows, index=["95 % low", "95 % high"]).T
         return pd.DataFrame(
             {
                 "printed": printed.average_costs,
                 "here": self.costs()[AVERAGE],
-                **ends,
+                **pd.DataFrame(ends, index=["95 % low", "95 % high"]).T,
                 "paper's optimiser": self.costs("descend")[AVERAGE],
                 "weights in box": self.costs(box=True)[AVERAGE],
                 "faults dropped": self.costs(faults="drop")[AVERAGE],
@@ -157,58 +140,60 @@ class Study:
             index=pd.Index(MODELS, name="model"),
         )
 
-    def _recordings(self) -> pd.DataFrame:
+    def recordings(self) -> pd.DataFrame:
         kept, dropped = (self.stores[p].manifest["recordings"] for p in ("keep", "drop"))
-        groups = self.take("groups").loc["lin"]
-        rows = {}
-        for number, name in enumerate(groups.index, 1):
-            sequences = recording(str(self.stores["keep"].folder), name)
-            rows[number] = {
-                "recording": name,
-                "sequences": kept[name]["kept"],
-                "without faults": dropped[name]["kept"],
-                "groups": int(max(groups[name])) + 1,
-                "vehicles": sum(s.n_agents for s in sequences),
-                "longest (s)": max(s.time[-1] - s.time[0] for s in sequences),
-            }
-        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("number")
+        rows = []
+        for name, groups in self.take("groups").loc["lin"].items():
+            sequences = self.recording(str(name))
+            rows.append(
+                {
+                    "recording": name,
+                    "sequences": kept[name]["kept"],
+                    "without faults": dropped[name]["kept"],
+                    "groups": max(groups) + 1,
+                    "vehicles": sum(s.n_agents for s in sequences),
+                    "longest (s)": max(s.time[-1] - s.time[0] for s in sequences),
+                }
+            )
+        return pd.DataFrame(rows, index=pd.RangeIndex(1, len(rows) + 1, name="number"))
 
-    def _lower(self, ours: Any, theirs: Any, lengths: Any) -> pd.DataFrame:
+    def lengths(self) -> pd.DataFrame:
+        lengths, low, high = self.parameter("L", LAWS)
+        theirs = as_printed(printed.lengths, printed.average_lengths)
+        table = side_by_side(averaged(lengths), theirs)
+        ends = pd.concat({"95 % low": low, "95 % high": high}, names=["", "model"]).swaplevel()
+        return pd.concat([table, ends]).sort_index(level=0, sort_remaining=False)
+
+    def beside_printed(self) -> pd.DataFrame:
+        return side_by_side(self.costs(), as_printed(printed.costs, printed.average_costs))
+
+    def lower(self) -> pd.DataFrame:
         """The printed costs that are lower, with all that the searches found."""
-        here = ours.drop(columns=AVERAGE).stack()
-        table = pd.DataFrame({"printed": theirs.stack().reindex(here.index), "here": here})
+        here = self.take("cost").astype(float).stack()
+        theirs = pd.DataFrame(printed.costs, index=printed.recordings).T.stack()
+        table = pd.DataFrame({"printed": theirs.reindex(here.index), "here": here})
         table = table[table["printed"] <= table["here"] - 0.005]
-        again = "before" in self.results
-        table["first search"] = self.take("before").stack() if again else np.nan
-        table["best tenth of starts"] = self.take("starts").stack().map(itemgetter(1))
+        searched = "before" in self.results
+        table["first search"] = self.take("before").stack() if searched else np.nan
+        table["best tenth of starts"] = self.take("best_tenth").stack().astype(float)
         scans = self.results.query("task == 'scan'").set_index(["model", "recording"])
         table["grid"] = scans["cost"]
+        lengths = pd.DataFrame(printed.lengths, index=printed.recordings)
         table["grid, printed L"] = pd.Series(
             {
                 (model, name): scan["by_length"][
-                    int(np.abs(np.array(scan["lengths"]) - lengths.loc[model, name]).argmin())
+                    np.abs(np.array(scan["lengths"]) - lengths.loc[name, model]).argmin()
                 ]
                 for (model, name), scan in scans.iterrows()
             }
         )
         return table
 
-    def _speeds_by_gap(self, box: bool) -> dict[str, pd.DataFrame]:
-        """By recording, a column of speeds (m/s) per model."""
-        by_recording = self.take("speeds")
-        if box:
-            by_recording.update(self.take("speeds", box=True))
-        return {
-            str(n): pd.DataFrame(dict(by_recording[n]), index=list(GAPS))
-            for n in by_recording.columns
-        }
+    def box(self) -> pd.DataFrame:
+        costs = {"box": self.costs(box=True), "free": self.costs().loc[list(NETWORKS)]}
+        return pd.concat(costs, names=["", "model"]).swaplevel().sort_index()
 
-    def _laws(self) -> pd.DataFrame:
-        speeds = pd.concat(self._speeds_by_gap(False), names=["recording", "gap"])
-        shown = speeds.index.get_level_values("gap") == 20.0
-        return pd.concat([speeds[shown], speeds[~shown]])
-
-    def _heldout(self) -> pd.DataFrame:
+    def heldout_costs(self) -> pd.DataFrame:
         parts = {
             faults: pd.DataFrame(
                 {
@@ -221,80 +206,37 @@ class Study:
             for faults, costs in self.heldout.items()
         }
         stacked = pd.concat(parts, names=["faults", "model"])
-        order = [*tasks.BASELINES, *LAWS, *(m + s for m in NETWORKS for s in ("-box", ""))]
+        order = [*BASELINES, *LAWS, *(m + s for m in NETWORKS for s in ("-box", ""))]
         return stacked.reindex([(f, m) for f in ("keep", "drop") for m in order])
 
-    def _significance(self) -> pd.DataFrame:
+    def significance(self) -> Any:
         models = [*LAWS, *(m + "-box" for m in NETWORKS), "no_interaction"]
-        pairs = differences(self.heldout["keep"], combinations(models, 2), self.options.seed)
-        pairs = pairs.assign(**{"first is better (%)": 100 * pairs.pop("better")})
+        pairs: Any = differences(self.heldout["keep"], combinations(models, 2), self.options.seed)
+        pairs["first is better (%)"] = 100 * pairs.pop("better")
         pairs.index = pd.Index([" − ".join(pair) for pair in pairs.index], name="pair")
-        corrected = holm(dict(zip(map(str, pairs.index), pairs["p"], strict=True)))
-        return pairs.assign(**{"p, Holm": list(corrected.values())})
+        return pairs.assign(**{"p, Holm": pd.Series(holm(pairs["p"].to_dict()))})
 
-    def _optimizers(self) -> pd.DataFrame:
+    def optimizers(self) -> pd.DataFrame:
         start = self.take("history", "descend").map(lambda h: h[0][1]).mean(axis=1)
-        costs = {k: self.costs(t)[AVERAGE] for k, t in (("BFGS", "fit"), ("ADADELTA", "descend"))}
-        left = {
-            f"residual, {k}": self.take("residual", t).astype(float).median(axis=1)
-            for k, t in (("BFGS", "fit"), ("ADADELTA", "descend"))
+        names = {"BFGS": "fit", "ADADELTA": "descend"}
+        costs = {name: self.costs(task)[AVERAGE] for name, task in names.items()}
+        residuals = {
+            f"residual, {name}": self.take("residual", task).astype(float).median(axis=1)
+            for name, task in names.items()
         }
-        return pd.DataFrame({"at the start": start, **costs, **left}).loc[list(MODELS)]
+        return pd.DataFrame({"at the start": start, **costs, **residuals}).loc[list(MODELS)]
 
-    def _steps(self) -> pd.DataFrame:
-        steps, costs = self.take("steps_costs"), self.take("cost")
-        changes = {}
-        for step in sorted(map(float, steps.iloc[0, 0]), reverse=True):
-            ratio = steps.map(lambda s, h=step: s[f"{h:g}"]) / costs
-            changes[f"{step:g} s"] = 100 * (ratio.astype(float).median(axis=1) - 1)
-        return pd.DataFrame(changes)
-
-    @cached_property
-    def by_sequence(self) -> pd.DataFrame:
-        """A row per sequence, and by model its share of the recording's cost (%)."""
-        store, costs = self.stores["keep"], self.take("costs")
-        kinds: dict[str, set[str]] = {}
-        for fault in store.manifest["faults"]:
-            kinds.setdefault(fault["sequence"], set()).add(fault["kind"])
-        rows = [
-            {
-                "number": number,
-                "sequence": s.name,
-                "vehicles": s.n_agents,
-                "start (s)": float(s.time[0]),
-                "faults": ", ".join(sorted(kinds.get(s.name, ()))) or "none found",
-            }
-            for number, name in enumerate(costs.columns, 1)
-            for s in recording(str(store.folder), name)
-        ]
-        shares = costs.map(lambda each: 100 * np.array(each) / np.sum(each))
-        return pd.DataFrame(rows).assign(
-            **{f"share {model} (%)": np.concatenate(list(shares.loc[model])) for model in MODELS}
-        )
-
-    def _faulty(self, ours: Any, dropped: Any) -> pd.DataFrame:
-        """What faulty sequences are of all, of the cost, and how much lower it is without them."""
-        every = self.by_sequence
-        faulty = every["faults"] != "none found"
-        shares = every.filter(like="share ").mul(faulty, axis=0).groupby(every["number"]).sum()
+    def steps(self) -> pd.DataFrame:
+        costs, cost = self.take("steps_costs"), self.take("cost")
+        ratios = {
+            f"{step} s": costs.map(itemgetter(step)) / cost
+            for step in sorted(costs.iloc[0, 0], key=float, reverse=True)
+        }
         return pd.DataFrame(
-            {
-                "faulty sequences": int(faulty.sum()),
-                "all sequences": len(every),
-                "their share of the cost (%)": shares.mean().to_numpy(),
-                "cost over that without them": (ours[AVERAGE] / dropped[AVERAGE])[list(MODELS)],
-            },
-            index=pd.Index(MODELS, name="model"),
+            {step: 100 * (r.astype(float).median(axis=1) - 1) for step, r in ratios.items()}
         )
 
-    def _dominating(self) -> Any:
-        shares = [f"share {model} (%)" for model in SPLIT]
-        columns = ["sequence", "vehicles", "start (s)", *shares, "faults"]
-        table = self.by_sequence.sort_values(shares[0], ascending=False)
-        table = table.groupby("number").head(NAMED).sort_values("number", kind="stable")
-        return table.set_index("number")[columns]
-
-    def _parameters(self) -> pd.DataFrame:
+    def parameters(self) -> pd.DataFrame:
         optimizers = {"fit": "bfgs", "descend": "adadelta"}
         fits = self.results.dropna(subset="parameters")
         fits = fits.assign(optimizer=fits["task"].map(optimizers), J=fits["cost"])
@@ -302,77 +244,235 @@ class Study:
         table = by_number(fits[[*names, "parameters", "J"]], "parameters")
         return table[[*names, "parameter", "index", "value", "J"]]
 
-    # -- figures -----------------------------------------------------------------------------
-
-    def figures(self) -> dict[str, Figure | ReplayBlock]:
-        """By their names in the template."""
-        folder = str(self.stores["keep"].folder)
-        gaps = {str(n): measured_gaps(recording(folder, n)) for n in self.take("cost").columns}
-        drawn = self.take("bootstrap")
-        bands = {str(n): {m: np.array(drawn.loc[m, n]["speeds"]) for m in MODELS} for n in drawn}
-        return {
-            "leader_speeds": figures.leader_speeds(
-                *(KMH * p for p in self.parameter("v0", MODELS))
-            ),
-            "laws_box": figures.law_panels(GAPS, self._speeds_by_gap(True), {}, gaps),
-            "laws": figures.law_panels(GAPS, self._speeds_by_gap(False), bands, gaps),
-            "descents": figures.descents(self._descents()),
-            "dominating_sequence": self._drawn(),
-            "replay": self._replay(),
-        }
-
-    def _descents(self) -> dict[str, np.ndarray]:
+    def draw_descents(self) -> Figure:
         """Simulations, and the average cost above the least known, of the better run."""
-        history, costs = self.take("history", "descend"), self.costs()
-        least = np.minimum(costs, self.costs("descend")).drop(columns=AVERAGE)
+        history = self.take("history", "descend").map(np.array)
+        lowest = np.minimum(self.costs(), self.costs("descend"))
         curves = {}
-        for model in MODELS:
-            each = [
-                np.array(h)[:, 1] - c
-                for h, c in zip(history.loc[model], least.loc[model], strict=True)
-            ]
-            count = np.array(history.loc[model].iloc[0])[:, 0] * GRADIENT * 2
-            above = np.mean(each, axis=0).clip(min=1e-6)
-            curves[model] = np.stack([np.maximum(count, 1), above], 1)
-        return curves
+        for model, runs in history.iterrows():
+            above = [run[:, 1] - lowest.loc[model, name] for name, run in runs.items()]
+            simulations = np.maximum(runs.iloc[0][:, 0] * GRADIENT * 2, 1)
+            curves[model] = np.stack([simulations, np.mean(above, axis=0).clip(min=1e-6)], 1)
+        return plot_descents(curves)
+
+    # -- laws --------------------------------------------------------------------------------
+
+    def leader_speeds(self) -> pd.DataFrame:
+        return averaged(self.parameter("v0")[0] * KMH)
+
+    def draw_leader_speeds(self) -> Figure:
+        return plot_leader_speeds(*(KMH * values for values in self.parameter("v0")))
+
+    def speeds_by_gap(self, box: bool) -> dict[str, pd.DataFrame]:
+        """By recording, a column of speeds (m/s) per model."""
+        by_recording = self.take("speeds")
+        if box:
+            by_recording.update(self.take("speeds", box=True))
+        return {n: pd.DataFrame(dict(by_recording[n]), index=list(GAPS)) for n in by_recording}
+
+    def laws(self) -> pd.DataFrame:
+        speeds = pd.concat(self.speeds_by_gap(False), names=["recording", "gap"])
+        shown = speeds.index.get_level_values("gap") == 20.0
+        return pd.concat([speeds[shown], speeds[~shown]])
+
+    def draw_laws(self, box: bool) -> Figure:
+        drawn = {} if box else self.take("bootstrap").map(lambda b: np.array(b["speeds"]))
+        speeds = self.speeds_by_gap(box)
+        gaps = {name: measured_gaps(self.recording(name)) for name in speeds}
+        return plot_law_panels(speeds, drawn, gaps)
+
+    # -- sequences ---------------------------------------------------------------------------
+
+    @cached_property
+    def by_sequence(self) -> pd.DataFrame:
+        """A row per sequence, and by model its share of the recording's cost (%)."""
+        costs = self.take("costs")
+        faults: Any = pd.DataFrame(
+            self.stores["keep"].manifest["faults"], columns=["sequence", "kind"]
+        )
+        kinds = faults.groupby("sequence")["kind"].agg(lambda kind: ", ".join(sorted(set(kind))))
+        rows = [
+            {
+                "number": number,
+                "sequence": s.name,
+                "vehicles": s.n_agents,
+                "start (s)": float(s.time[0]),
+                "faults": kinds.get(s.name, "none found"),
+            }
+            for number, name in enumerate(costs.columns, 1)
+            for s in self.recording(name)
+        ]
+        shares = costs.map(lambda each: 100 * np.array(each) / np.sum(each))
+        return pd.DataFrame(rows).assign(
+            **{f"share {model} (%)": np.concatenate(list(shares.loc[model])) for model in MODELS}
+        )
+
+    def faulty(self) -> pd.DataFrame:
+        """What faulty sequences are of all, of the cost, and how much lower it is without them."""
+        every = self.by_sequence
+        faulty = every["faults"] != "none found"
+        shares = every.filter(like="share ").mul(faulty, axis=0).groupby(every["number"]).sum()
+        ratio = self.costs()[AVERAGE] / self.costs(faults="drop")[AVERAGE]
+        return pd.DataFrame(
+            {
+                "faulty sequences": faulty.sum(),
+                "all sequences": len(every),
+                "their share of the cost (%)": shares.mean().to_numpy(),
+                "cost over that without them": ratio[list(MODELS)],
+            },
+            index=pd.Index(MODELS, name="model"),
+        )
+
+    def dominating_sequences(self) -> Any:
+        shares = [f"share {model} (%)" for model in SPLIT]
+        columns = ["sequence", "vehicles", "start (s)", *shares, "faults"]
+        table = self.by_sequence.sort_values(shares[0], ascending=False)
+        table = table.groupby("number").head(NAMED).sort_values("number", kind="stable")
+        return table.set_index("number")[columns]
 
     @property
     def dominating(self) -> str:
         """The sequence of the greatest share of its recording's cost under the linear law."""
         return str(self.by_sequence.set_index("sequence")["share lin (%)"].idxmax())
 
-    def _drawn(self) -> Figure:
+    def draw_dominating(self) -> Figure:
         name = self.dominating.rsplit("/", 1)[0]
-        every = recording(str(self.stores["keep"].folder), name)
-        (sequence,) = (s for s in every if s.name == self.dominating)
-        simulated = {}
-        for model in SPLIT:
-            system = system_of(model, self.take("parameters").loc[model, name])
-            with torch.no_grad():
-                run = FusedSolver(self.options.dt)(system, collate([sequence]))
-            simulated[model] = run.x[:, 0, :, 0].numpy()
+        (sequence,) = (s for s in self.recording(name) if s.name == self.dominating)
+        parameters = self.take("parameters")[name]
+        systems = {model: system_of(model, parameters[model]) for model in SPLIT}
+        (scene,) = scenes([sequence], systems, self.options.dt)
         marked = [
             (int(agent), float(fault["time"]))
             for fault in self.stores["keep"].manifest["faults"]
             if fault["sequence"] == sequence.name and fault["time"] is not None
             for agent in fault["agents"]
         ]
-        return figures.space_time(sequence, simulated, marked)
+        return plot_space_time(scene, marked)
 
-    def _replay(self) -> ReplayBlock:
-        parameters = self.take("parameters", faults="drop")
-        every, number = [], 0
-        for name in parameters.columns:
-            sequences = recording(str(self.stores["drop"].folder), name)
-            systems = {m: system_of(m, parameters.loc[m, name]) for m in SHOWN}
-            every += scenes(thinned(sequences, FEW), systems, self.options.dt)
-            number += len(sequences)
-        what = (
-            "Sequences without a fault of every recording, as measured and as simulated by "
-            f"{' and '.join(SHOWN)}, which are calibrated to the recording."
+    def scenes(self) -> list[Scene]:
+        """Sequences without a fault, of the player."""
+        shown = []
+        for name, parameters in self.take("parameters", faults="drop").items():
+            systems = {m: system_of(m, parameters[m]) for m in SHOWN}
+            sequences = thinned(self.recording(str(name), "drop"), FEW)
+            shown += scenes(sequences, systems, self.options.dt)
+        return shown
+
+
+#: Speeds outside are cut, m/s.
+LIMITS = (-8.0, 38.0)
+
+
+def plot_leader_speeds(speeds: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -> Figure:
+    """Identified speed of the leading vehicle by recording, and its mean by model.
+
+    Args:
+        speeds: km/h; a row per model, a column per recording.
+        low, high: ends of their intervals, the same layout, NaN where there is none.
+
+    Source: Göttlich & Totzeck, figure (veloLength).
+    """
+    figure = new_figure(7.2, 4.0)
+    ax = figure.subplots()
+    error_bars(ax, speeds, low, high, 0.14, linestyle="")
+    handles = []
+    for i, (model, mean) in enumerate(speeds.mean(axis=1).items()):
+        style = curve_style(i)
+        ax.axhline(mean, color=style["color"], linestyle=style["linestyle"], linewidth=1)
+        label = f"{model}: mean {mean:.0f} km/h"
+        handles.append(Line2D([], [], **style, markersize=4.5, label=label))
+    numbered = [f"{n}\n{name}" for n, name in enumerate(speeds.columns, 1)]
+    ax.set_xticks(range(len(numbered)), numbered)
+    dress(ax, x="recording", y="leader's speed v0 (km/h)")
+    legend_above(figure, handles)
+    return figure
+
+
+def plot_law_panels(
+    speeds: Mapping[str, pd.DataFrame],
+    bands: Mapping[str, Mapping[str, np.ndarray]],
+    measured: Mapping[str, np.ndarray],
+) -> Figure:
+    """Speed against gap, one panel per recording, all models.
+
+    Args:
+        speeds: recording to m/s, a column per model, indexed by the gap, m.
+        bands: recording to model to ``(2, G)`` ends of the interval, m/s; may be empty.
+        measured: recording to measured gaps, m; a bar below shows their middle 90 %.
+
+    Source: Göttlich & Totzeck, figure (interactionForce).
+    """
+    rows = -(-len(speeds) // 5)
+    figure = new_figure(11.0, 2.5 * rows + 0.4)
+    axes = figure.subplots(rows, 5, sharex=True, sharey=True, squeeze=False)
+    handles: list[Line2D] = []
+    for n, (name, table) in enumerate(speeds.items()):
+        ax, handles = axes.flat[n], []
+        for i, (model, speed) in enumerate(table.items()):
+            style = {**curve_style(i), "marker": ""}
+            ax.plot(table.index, speed.clip(-1e3, 1e3), linewidth=1.2, **style)
+            handles.append(Line2D([], [], **style, label=model))
+            if name in bands:
+                low, high = np.clip(bands[name][str(model)], -1e3, 1e3)
+                ax.fill_between(
+                    table.index, low, high, color=style["color"], alpha=0.10, linewidth=0
+                )
+        span = np.quantile(measured[name], [0.05, 0.95])
+        ax.plot(span, [LIMITS[0] + 1.5] * 2, color=GREY, linewidth=4, solid_capstyle="butt")
+        last = n // 5 == rows - 1
+        dress(
+            ax,
+            x="gap (m)" if last else "",
+            y="speed W (m/s)" if n % 5 == 0 else "",
+            title=f"{n + 1}: {name}",
         )
-        return player(every, what, number)
+    for ax in axes.flat[len(speeds) :]:
+        ax.set_axis_off()
+    axes[0, 0].set(xlim=(table.index.min(), table.index.max()), ylim=LIMITS)
+    handles.append(Line2D([], [], color=GREY, linewidth=4, label="middle 90 % of measured gaps"))
+    legend_above(figure, handles, len(handles))
+    return figure
 
-    def values(self) -> dict[str, Any]:
-        """What else the template refers to."""
-        return {"options": self.options, "dominating": self.dominating, "gradient": GRADIENT}
+
+def plot_descents(curves: Mapping[str, np.ndarray]) -> Figure:
+    """Average cost above the least one known, against simulations, one curve per model.
+
+    Args:
+        curves: model to ``(P, 2)`` simulations and excess of the average cost, m² s.
+    """
+    figure = new_figure(5.6, 3.2)
+    ax = figure.subplots()
+    for i, (model, values) in enumerate(curves.items()):
+        ax.plot(*values.T, **{**curve_style(i), "marker": ""}, linewidth=1.3, label=model)
+    ax.set(xscale="log", yscale="log")
+    ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-3))  # lower values are rounding errors
+    dress(ax, x="simulations", y="average J above the least (m² s)")
+    ax.legend(fontsize=SMALL_FONT, frameon=False)
+    return figure
+
+
+def plot_space_time(scene: Scene, marked: list[tuple[int, float]]) -> Figure:
+    """One traffic sequence: measured positions and simulated ones.
+
+    Args:
+        marked: vehicles and times (s) at which a fault of the measurement was found.
+    """
+    figure = new_figure(6.4, 3.8)
+    ax = figure.subplots()
+    sequence = scene.sequence
+    t = sequence.time - sequence.time[0]
+    handles = [Line2D([], [], color=GREY, marker="o", markersize=4, label="measured")]
+    ax.plot(t, sequence.x[:, :, 0], color=GREY, marker="o", markersize=4, linewidth=1)
+    for i, (name, x) in enumerate(scene.simulated.items()):
+        style = {**curve_style(i), "marker": ""}
+        ax.plot(t, x[:, :, 0], **style, linewidth=1.3)
+        handles.append(Line2D([], [], **style, label=name))
+    for agent, time in marked:
+        k = int(np.abs(sequence.time - time).argmin())
+        ax.plot(t[k], sequence.x[k, agent, 0], "s", color="black", fillstyle="none", markersize=10)
+    if marked:
+        box: dict[str, Any] = {"marker": "s", "fillstyle": "none", "markersize": 8, "linestyle": ""}
+        handles.append(Line2D([], [], color="black", **box, label="fault of the measurement"))
+    dress(ax, x="time in the sequence (s)", y="position along the lane (m)", title=sequence.name)
+    ax.legend(handles=handles, fontsize=SMALL_FONT)
+    return figure

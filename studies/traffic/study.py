@@ -19,7 +19,7 @@ from studies.options import TrafficStudyOptions
 from studies.page import page
 from studies.runner import Task
 from studies.traffic import printed, tasks
-from studies.traffic.results import LAWS, MODELS, NETWORKS, Study
+from studies.traffic.results import GRADIENT, LAWS, MODELS, NETWORKS, Study
 
 TITLE = "Traffic: five models on ten recordings"
 SUBTITLE = (
@@ -54,30 +54,30 @@ def run(options: TrafficStudyOptions, folder: Path) -> list[Block]:
     stores = {policy: _prepared(options, policy, folder) for policy in ("keep", "drop")}
     every = list(_tasks(options, stores))
     results = computed(every, folder, options, stores, "traffic study")
-    again = {} if options.quick else wider(every, results["cost"])
-    if again:
-        more = computed(list(again.values()), folder, options, stores, "wider search")
-        more = more.set_axis(list(again)).assign(before=results["cost"])
-        more = more[more["cost"] < more["before"]]
-        results = pd.concat([results.drop(more.index), more]).loc[results.index]
+    repeats = {} if options.quick else wider(every, results["cost"])
+    if repeats:
+        wide = computed(list(repeats.values()), folder, options, stores, "wider search")
+        wide = wide.set_axis(list(repeats)).assign(before=results["cost"])
+        wide = wide[wide["cost"] < wide["before"]]
+        results = pd.concat([results.drop(wide.index), wide]).loc[results.index]
     study = Study(options, stores, results)
-    return page("traffic", study.tables(), study.figures(), [stores["keep"]], **study.values())
+    return page("traffic", study, [stores["keep"]], gradient=GRADIENT)
 
 
 def wider(every: list[Task], costs: Any) -> dict[str, Task]:
     """Twice the search, from other starts, by the task whose printed cost of a network is lower."""
-    again = {}
+    repeats = {}
     for task in every:
         how = task.arguments
         if not task.key.startswith("fit-keep-") or how["box"] or how["model"] in LAWS:
             continue
         theirs = printed.costs[how["model"]][printed.recordings.index(how["recording_name"])]
         if theirs < costs[task.key]:
-            more = {key: 2 * how[key] for key in ("restarts", "iterations")}
-            more = {**how, **more, "seed": how["seed"] + 1}
+            twice = {key: 2 * how[key] for key in ("restarts", "iterations")}
+            arguments = {**how, **twice, "seed": how["seed"] + 1}
             key = task.key.replace("fit-", "wider-", 1)
-            again[task.key] = Task(key, tasks.fit, more, 4 * task.cost)
-    return again
+            repeats[task.key] = Task(key, tasks.fit, arguments, 4 * task.cost)
+    return repeats
 
 
 def _prepared(options: TrafficStudyOptions, policy: str, folder: Path) -> Store:
@@ -93,13 +93,12 @@ def _tasks(options: TrafficStudyOptions, stores: dict[str, Store]) -> Iterator[T
     """Model × recording × treatment of faults: fits, held-out costs, the paper's optimiser."""
     for policy, store in stores.items():
         # the time of a gradient goes with the measured positions of followers
-        sizes: dict[str, int] = {}
-        for entry in store.index:
-            size = (entry["n_agents"] - 1) * entry["n_samples"]
-            sizes[entry["recording"]] = sizes.get(entry["recording"], 0) + size
+        index = pd.DataFrame(store.index)
+        positions = (index["n_agents"] - 1) * index["n_samples"]
+        sizes = positions.groupby(index["recording"], sort=False).sum()
         for name, size in sizes.items():
             # as much time for a small recording as for the largest: it has as many minima
-            share = min(_MOST, max(sizes.values()) / size)
+            share = min(_MOST, sizes.max() / size)
             for model in MODELS:
                 where: dict[str, Any] = {"folder": str(store.folder), "recording_name": name}
                 where |= {"model": model, "dt": options.dt, "seed": options.seed}
@@ -116,33 +115,33 @@ def _of_model(
         starts = options.restarts / (4 if model in LAWS or box else _TIMES[model] / _TIMES["n4"])
         starts /= 2 if policy == "drop" else 1
         if box is None or policy == "keep":
-            more: dict[str, Any] = {
+            search: dict[str, Any] = {
                 "box": box,
                 "restarts": max(2, round(starts * share)),
                 "iterations": options.iterations,
                 "bootstrap": options.bootstrap if box is None else 0,
                 "steps": STEPS,
             }
-            yield Task(f"fit-{policy}-{place}{suffix}", tasks.fit, where | more, 3 * time)
-        more = {
+            yield Task(f"fit-{policy}-{place}{suffix}", tasks.fit, where | search, 3 * time)
+        search = {
             "box": box,
             "restarts": max(2, options.restarts // 4),
             "iterations": max(20, options.iterations * 2 // 3),
             "folds": options.folds,
         }
         key = f"heldout-{policy}-{place}{suffix}"
-        yield Task(key, tasks.cross_validate, where | more, 3 * time)
+        yield Task(key, tasks.cross_validate, where | search, 3 * time)
     if policy == "drop":
         return
-    more = {
+    descent = {
         "restarts": 2,
         "steps": options.descent_steps,
         "updates_dt": options.descent_dt,
         "lr": options.descent_lr,
         "batch_size": options.batch_size,
     }
-    yield Task(f"descent-{place}", tasks.descend, where | more, 2 * time)
+    yield Task(f"descent-{place}", tasks.descend, where | descent, 2 * time)
     if model in LAWS:
         scan = {k: v for k, v in where.items() if k != "seed"}
-        scan |= {"points": 21 if options.quick else 81}
+        scan["points"] = 21 if options.quick else 81
         yield Task(f"scan-{place}", tasks.scan, scan, time)

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
+from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError
 from nnode.pages.page import Block
-from nnode.pages.replay import ReplayBlock
+from nnode.pages.replay import Scene
 from nnode.plots.style import thinned
 from studies.figures import horizon_costs
 from studies.frame import by_number, by_unit, computed, differences
 from studies.options import WalkingStudyOptions
 from studies.page import page
 from studies.pooled import filled
-from studies.replay import player, scenes
+from studies.replay import scenes
 from studies.runner import Task
 from studies.walking import tasks
-from studies.walking.data import RUNS, measured_before, prepare_runs
-from studies.walking.laws import DESIRED, LABELS, LAWS, SIMPLE, new_system
+from studies.walking.tasks import (
+    DESIRED,
+    LABELS,
+    LAWS,
+    RUNS,
+    Result,
+    measured_before,
+    new_system,
+    prepare_runs,
+)
 
 TITLE = "Walking: pedestrian laws in two-way flows"
 SUBTITLE = (
@@ -61,11 +71,7 @@ def run(options: WalkingStudyOptions, folder: Path) -> list[Block]:
         every, title = _tasks(options, horizon, folders), f"walking study, {horizon:g} s"
         results = computed(every, folder, options, stores, title)
         parts.append(results.assign(horizon=horizon))
-    study = Walking(options, pd.concat(parts))
-    figures = {f"walking_{desired}": study.figure(desired) for desired in DESIRED}
-    return page(
-        "walking", study.tables(), {**figures, "replay": study.replay(folders)}, desired=DESIRED
-    )
+    return page("walking", Walking(options, pd.concat(parts), folders), desired=DESIRED)
 
 
 def _tasks(options: WalkingStudyOptions, horizon: float, folders: list[str]) -> list[Task]:
@@ -86,46 +92,43 @@ def _tasks(options: WalkingStudyOptions, horizon: float, folders: list[str]) -> 
     return every
 
 
-def errors_by_run(task_results: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
+def errors_by_run(errors: Iterable[Result], labels: Mapping[str, str]) -> pd.DataFrame:
     """A row per law and held-out run in which somebody is predicted.
 
     Args:
-        task_results: results of :mod:`studies.walking.tasks`.
+        errors: of the tasks, by law and run, see :func:`studies.walking.tasks.fit`.
         labels: of the laws.
 
     Returns:
-        ``law``, ``run``, ``people``, and their mean errors, see :func:`studies.walking.tasks.fit`.
+        ``law``, ``run``, ``people``, and their mean errors.
     """
-    rows = []
-    for one in task_results.to_dict("records"):
-        fitted = one["task"] == "fit"
-        laws = {one["law"]: one["errors"]} if fitted else {name: one[name] for name in SIMPLE}
-        rows += [
-            {"law": labels[law], "run": run, **errors}
-            for law, runs in laws.items()
-            for run, errors in runs.items()
-            if errors["people"]
+    return pd.DataFrame(
+        [
+            {"law": labels[law], "run": run, **means}
+            for by_law in errors
+            for law, runs in by_law.items()
+            for run, means in runs.items()
+            if means["people"]
         ]
-    return pd.DataFrame(rows)
+    )
 
 
 @dataclass
 class Walking:
-    """Options, and a row of results per task."""
+    """Options, a row of results per task, and the folders of the longest horizon."""
 
     options: WalkingStudyOptions
     results: Any
+    folders: list[str]
 
     def costs(self, desired: str, horizon: float, what: str = "mean") -> pd.DataFrame:
         """A row per person of every run, a column per law: m²."""
-        at_horizon = self.results.query("horizon == @horizon")
-        chosen = at_horizon.query("desired == @desired")
-        if desired == DESIRED[0]:
-            chosen = pd.concat([chosen, at_horizon.query("task == 'baselines'")])
-        table: Any = errors_by_run(chosen, LABELS).pivot(index="run", columns="law")
+        simple = "or task == 'baselines'" if desired == DESIRED[0] else ""
+        chosen = self.results.query(f"horizon == @horizon and (desired == @desired {simple})")
+        table: Any = errors_by_run(chosen["errors"], LABELS).pivot(index="run", columns="law")
         table = table.loc[table.index.repeat(table["people"].iloc[:, 0])][what]
         order = [label for label in LABELS.values() if label in table]
-        return by_unit({law: table[law] for law in order}, table.index)
+        return by_unit(table[order], table.index)
 
     def means(self, desired: str, what: str = "mean") -> pd.DataFrame:
         """Mean cost (m²) by law and horizon."""
@@ -133,39 +136,29 @@ class Walking:
         by_horizon = {f"{h:g} s": self.costs(desired, h, what).mean() for h in horizons}
         return pd.DataFrame(by_horizon).rename_axis(None)
 
-    def tables(self) -> dict[str, pd.DataFrame]:
-        """By their names in the template."""
-        by_name = {"walking_parameters": self._parameters()}
-        for desired in DESIRED:
-            by_name[f"walking_{desired}"] = self.means(desired)
-            by_name[f"walking_{desired}_end"] = self.means(desired, "end")
-            by_name[f"walking_{desired}_differences"] = self.differences(desired)
-        return by_name
-
-    def differences(self, desired: str) -> Any:
+    def paired_differences(self, desired: str) -> Any:
         """Of every model from no interaction, by horizon; runs are what is resampled."""
-        parts = {}
+        parts, alone = {}, LABELS["alone"]
         for h in self.options.horizons:
-            costs, alone = self.costs(desired, h), LABELS["alone"]
+            costs = self.costs(desired, h)
             pairs = [(str(law), alone) for law in costs if law != alone]
             parts[h] = differences(costs, pairs, self.options.seed).droplevel("second")
         stacked: Any = pd.concat(parts, names=["horizon (s)", "model"]).drop(columns="better")
         return stacked.reset_index("horizon (s)").sort_index(
-            kind="stable", key=lambda laws: [list(LABELS.values()).index(law) for law in laws]
+            kind="stable", key=lambda laws: laws.map(list(LABELS.values()).index)
         )
 
-    def figure(self, desired: str) -> Any:
+    def draw(self, desired: str) -> Figure:
         """Errors relative to those without interaction, by horizon."""
         horizons, laws = self.options.horizons, [LABELS[law] for law in LAWS]
-        mean = self.means(desired).loc[laws]
-        away = self.differences(desired).set_index("horizon (s)", append=True)
+        mean = self.means(desired).loc[laws].set_axis(horizons, axis=1)
+        away = self.paired_differences(desired).set_index("horizon (s)", append=True)
         low, high = (
-            away[end].unstack().reindex(laws).set_axis(mean.columns, axis=1) + mean.iloc[0]
-            for end in ("low", "high")
+            away[end].unstack().reindex(laws)[horizons] + mean.iloc[0] for end in ("low", "high")
         )
-        return horizon_costs(horizons, mean, low, high)
+        return horizon_costs(mean, low, high)
 
-    def _parameters(self) -> pd.DataFrame:
+    def parameters(self) -> pd.DataFrame:
         fits = self.results.query("task == 'fit'")
         table = pd.DataFrame(
             {
@@ -181,21 +174,21 @@ class Walking:
         table["training error (m²)"] = table.pop("training error (m²)")  # the last column
         return table
 
-    def replay(self, folders: list[str]) -> ReplayBlock:
-        """The runs of the first group at the longest horizon, beside laws that did not see them."""
-        horizon, desired = self.options.horizons[-1], DESIRED[0]
+    @property
+    def tested(self) -> list[Sequence]:
+        """The sequences of the first group of runs at the longest horizon."""
         held = groups(self.options.folds)[0]
-        seen = [s for folder in folders for s in measured_before(folder) if s.recording in held]
-        complete = [s for s in seen if np.isfinite(np.array(s.preferred)).all()]
+        every = [s for folder in self.folders for s in measured_before(folder)]
+        return [s for s in every if s.recording in held]
+
+    def scenes(self, desired: str) -> list[Scene]:
+        """Sequences of the player, simulated by laws that were calibrated on the other groups."""
+        horizon, rows = self.options.horizons[-1], self.results["row"]
+        complete = [s for s in self.tested if np.isfinite(np.array(s.preferred)).all()]
         mean = self.costs(desired, horizon).mean()
         best = min(list(LAWS)[1:], key=lambda law: mean[LABELS[law]])
-        rows = self.results["row"]
         systems = {
             LABELS[law]: filled(new_system(law, desired), rows[f"{law}-{desired}-{horizon:g}s-0"])
             for law in ("alone", best)
         }
-        what = (
-            f"Sequences of {horizon:g} s of held-out runs, as measured and as simulated by "
-            f"{' and '.join(systems)}; desired velocity: *{desired}*."
-        )
-        return player(scenes(thinned(complete, FEW), systems), what, len(seen))
+        return scenes(thinned(complete, FEW), systems)

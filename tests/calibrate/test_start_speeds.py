@@ -18,7 +18,7 @@ from nnode.data.smooth import start_smoothed
 from nnode.errors import ConfigError
 from nnode.model import System
 from nnode.simulation import FusedSolver
-from studies.following.candidates import EVERY
+from studies.following.tasks import EVERY
 from tests.app.following import pairs
 from tests.studies.following.test_fit import HELLY, driven
 

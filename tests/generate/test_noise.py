@@ -15,6 +15,7 @@ from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError, DataError
 from nnode.generate.fit import fit_noise
 from nnode.generate.noise import (
+    SLOWEST,
     DifferentDrivers,
     Noise,
     allows_driver_differences,
@@ -22,7 +23,6 @@ from nnode.generate.noise import (
     free_running,
     sample,
 )
-from nnode.generate.people import SLOWEST
 from nnode.generate.scores import band
 from nnode.model import System, Traffic, build_model
 from nnode.model.laws import make_law
@@ -143,8 +143,8 @@ def test_noise_is_found_again(domain: str, noise: Noise, number: int, seconds: f
     if led:
         error[:, :, -1] = 0.0
     given = {} if led else {"preferred": batch.v[0]}
-    seen = replace(batch, x=sampled.x + torch.from_numpy(error), v=sampled.v, **given)
-    fitted = fit_noise(model(domain), [seen], np.arange(number), seed=2)
+    measured_batch = replace(batch, x=sampled.x + torch.from_numpy(error), v=sampled.v, **given)
+    fitted = fit_noise(model(domain), [measured_batch], np.arange(number), seed=2)
     assert fitted.sigma is not None
     assert fitted.tau is not None
     assert fitted.drivers is not None
@@ -274,10 +274,10 @@ def test_a_sequence_that_has_ended_stands_still() -> None:
 
 
 @pytest.mark.parametrize(
-    ("domain", "seconds", "least"), [("traffic", 2.0, "3"), ("crowd", 0.6, r"0\.75")]
+    ("domain", "seconds", "shortest"), [("traffic", 2.0, "3"), ("crowd", 0.6, r"0\.75")]
 )
-def test_bad_input_is_refused(domain: str, seconds: float, least: str) -> None:
-    with pytest.raises(DataError, match=f"more than {least} s"):
+def test_bad_input_is_refused(domain: str, seconds: float, shortest: str) -> None:
+    with pytest.raises(DataError, match=f"more than {shortest} s"):
         fit_noise(model(domain), [measured(domain, 2, seconds)], np.arange(2))
     with pytest.raises(ConfigError, match="positive time"):
         Noise(0.1, 0.0)

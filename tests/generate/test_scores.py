@@ -16,12 +16,12 @@ from nnode.generate.scores import Scores, band, crps, mean_of, nearest
 def test_crps_of_a_gaussian_is_the_closed_form(value: float) -> None:
     mean, sigma, repeats = 0.4, 1.7, 40_000
     samples = np.random.default_rng(3).normal(mean, sigma, (5, repeats))
-    found = crps(samples, np.full(repeats, value))
+    result = crps(samples, np.full(repeats, value))
     z = (value - mean) / sigma
     # Gneiting & Raftery 2007, equation (5), of a score that is to be small
     closed = sigma * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / math.sqrt(math.pi))
     # unbiased from as few as five samples
-    assert abs(found.mean() - closed) < 4 * found.std() / math.sqrt(repeats)
+    assert abs(result.mean() - closed) < 4 * result.std() / math.sqrt(repeats)
 
 
 def test_crps_is_the_double_sum_over_pairs() -> None:
@@ -51,14 +51,14 @@ def test_bands_cover_their_level_whatever_the_distribution(level: float, number:
 
 def test_intervals_of_means_go_by_cluster() -> None:
     rng = np.random.default_rng(0)
-    own = rng.normal(size=40).repeat(25)
+    individual = rng.normal(size=40).repeat(25)
     label = np.arange(40).repeat(25)
-    found = mean_of(own, np.ones(1000), label)
-    assert found.low is not None
-    assert found.high is not None
-    spread = (found.high - found.low) / (2 * 1.96)
-    assert spread == pytest.approx(np.unique(own).std() / math.sqrt(40), rel=0.1)
-    assert mean_of(own, np.ones(1000), np.zeros(1000, int)).low is None
+    result = mean_of(individual, np.ones(1000), label)
+    assert result.low is not None
+    assert result.high is not None
+    spread = (result.high - result.low) / (2 * 1.96)
+    assert spread == pytest.approx(np.unique(individual).std() / math.sqrt(40), rel=0.1)
+    assert mean_of(individual, np.ones(1000), np.zeros(1000, int)).low is None
 
 
 def test_scores_of_known_samples() -> None:

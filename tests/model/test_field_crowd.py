@@ -15,7 +15,7 @@ from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, DataError
 from nnode.model import Crowd, build_model
 from nnode.model.laws import PEDESTRIAN_LAWS
-from studies.walking.laws import without_walls
+from studies.walking.tasks import without_walls
 from tests.builders import straight
 
 R = 0.25

@@ -22,14 +22,15 @@ TEMPLATE = """
 ## First
 
 Of {{ number | digits }} numbers.
-{% call table("t", digits={"": 1, "b": 3}, least=["a"], head=2) %}
+{% call table("t", study, digits={"": 1, "b": 3}, lowest=["a"], head=2) %}
 Two
 rows.
 {% endcall %}
 ### Second
-{% call figure("f", "A line.") %}A figure.{% endcall %}
+{% call figure("f", drawn, "A line.") %}A figure.{% endcall %}
 End.
 """
+TABLE = pd.DataFrame({"a": [3.0, 2.0, 1.0], "b": [1.0, 2.0, 3.0]}, index=["x", "y", "z"])
 
 
 @pytest.fixture
@@ -39,32 +40,28 @@ def loader(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_blocks_stand_in_the_template_s_order(loader: None) -> None:
-    table = pd.DataFrame({"a": [3.0, 2.0, 1.0], "b": [1.0, 2.0, 3.0]})
-    blocks = page.page("x", {"t": table}, {"f": new_figure(1, 1)}, number=2.0)
-    first, text, one, second, figure, end, _ = blocks
+    blocks = page.page("x", TABLE, number=2.0, drawn=new_figure(1, 1))
+    first, text, table, second, figure, end, _ = blocks
     assert (first, second) == (Heading("First", 2), Heading("Second", 3))
     assert (text, end) == (Text("Of 2.00 numbers."), Text("End."))
-    assert isinstance(one, TableBlock)
-    assert (one.caption, one.digits) == ("Two rows.", {"a": 1, "b": 3})
-    assert len(one.frame) == 2
-    assert one.full is table
-    assert one.bold is not None
-    assert one.bold["a"].tolist() == [False, True]
+    assert isinstance(table, TableBlock)
+    assert (table.caption, table.digits) == ("Two rows.", {"a": 1, "b": 3})
+    assert len(table.frame) == 2
+    assert table.full is TABLE
+    assert table.bold is not None
+    assert table.bold["a"].tolist() == [False, True]
     assert isinstance(figure, FigureBlock)
     assert (figure.caption, figure.alt) == ("A figure.", "A line.")
 
 
 def test_what_the_template_misses_is_an_error(loader: None) -> None:
     with pytest.raises(jinja2.UndefinedError, match="number"):
-        page.page("x", {}, {})
-    with pytest.raises(KeyError, match="t"):
-        page.page("x", {}, {}, number=1.0)
+        page.page("x", TABLE)
 
 
 def test_bold_cells_are_the_least_among_some_rows_or_in_a_row() -> None:
-    table = pd.DataFrame({"a": [3.0, 2.0, 1.0], "b": [1.0, 2.0, 3.0]}, index=["x", "y", "z"])
-    assert page.least_cells(table, ["a"], ["x", "y"])["a"].tolist() == [False, True, False]
-    assert page.least_cells(table, row=["a", "b"]).to_numpy().tolist() == [
+    assert page.lowest_cells(TABLE, ["a"], ["x", "y"])["a"].tolist() == [False, True, False]
+    assert page.lowest_cells(TABLE, ["a", "b"], axis=1).to_numpy().tolist() == [
         [False, True],
         [True, True],
         [True, False],
@@ -73,8 +70,8 @@ def test_bold_cells_are_the_least_among_some_rows_or_in_a_row() -> None:
 
 def test_one_row_per_task_and_one_per_number() -> None:
     tasks = [Task(f"k{x}", square, {"x": x}) for x in (1, 2)]
-    found = frame.tidy(tasks, {"k1": {"y": 1}, "k2": {"y": 4}})
-    assert found.to_dict("index") == {
+    frames = frame.tidy(tasks, {"k1": {"y": 1}, "k2": {"y": 4}})
+    assert frames.to_dict("index") == {
         "k1": {"task": "square", "x": 1, "y": 1},
         "k2": {"task": "square", "x": 2, "y": 4},
     }

@@ -9,8 +9,9 @@ import pytest
 
 from nnode.data.sequence import Sequence
 from nnode.errors import SimulationError
+from nnode.pages.replay import ReplayBlock
 from studies import replay
-from studies.traffic.problem import system_of
+from studies.traffic.tasks import system_of
 from tests.studies.traffic.invented import platoons
 
 V0, L = 25.0, 5.0
@@ -40,8 +41,7 @@ def test_after_a_blow_up_nobody_is_there(monkeypatch: pytest.MonkeyPatch) -> Non
     x = scene.simulated["lin"]
     np.testing.assert_array_equal(x[0], s.x[0])
     assert np.isnan(x[1:]).all()
-    block = replay.player([scene], "One.", 7)
-    text, said = block.data()
+    text, said = ReplayBlock("replay", [scene], "One.", "One.", total=7).data()
     assert said.startswith("The player contains 1 of 7 sequences.")
     rows = json.loads(text)["scenes"][0]["simulated"][0]["x"]
     assert all(row[1:] == [None] * (s.n_samples - 1) for row in rows)

@@ -1,4 +1,4 @@
-"""Tasks in real processes: kept, gone on with, interrupted, killed, failing."""
+"""Tasks here, in other processes and on a Dask cluster: kept, interrupted, killed, failing."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +21,8 @@ import torch
 
 from benchmarks.speed.problems import Shape, pose
 from nnode import progress
-from nnode.errors import StudyError
+from nnode.calibrate.interrupt import Interrupted
+from nnode.errors import ConfigError, StudyError
 from nnode.simulation import TorchdiffeqSolver
 from studies import runner
 from studies.runner import Task, kept_results, run_tasks
@@ -58,8 +61,8 @@ def test_kept_results_are_those_of_one_function_and_fingerprint(tmp_path: Path) 
     cubes = [Task("cube-1", work.cube, {"x": 1.0, "log": str(tmp_path / "calls")})]
     run_tasks(cubes, tmp_path, workers=1, fingerprint="f")
     (tmp_path / "tasks" / "broken.json").write_text("{")
-    found = kept_results(tmp_path, work.square, "f")
-    assert found == {"square-1": {"y": 1.0}, "square-3": {"y": 9.0}}
+    outcome = kept_results(tmp_path, work.square, "f")
+    assert outcome == {"square-1": {"y": 1.0}, "square-3": {"y": 9.0}}
 
 
 @pytest.fixture
@@ -71,35 +74,53 @@ def threads() -> Iterator[int]:
     torch.set_num_threads(before)
 
 
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """The address of a Dask cluster on this machine."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        yield str(cluster.scheduler_address)
+
+
+@pytest.fixture(params=["here", "processes", "cluster"])
+def where(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """Options of the runner: this process, others, or the workers of a cluster."""
+    if request.param == "cluster":
+        return {"workers": 1, "cluster": request.getfixturevalue("scheduler")}
+    return {"workers": 1 if request.param == "here" else 2}
+
+
 @pytest.mark.thorough
-@pytest.mark.parametrize("workers", [1, 2])
-def test_results_are_the_same_in_any_number_of_processes(
-    workers: int, tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch
+def test_results_are_the_same_wherever_tasks_run(
+    where: dict[str, Any], tmp_path: Path, threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
     todo = [*squares(tmp_path, 3.0, 1.0, 2.0), Task("conditions", work.conditions, {})]
-    found = run_tasks(todo, tmp_path, workers=workers, fingerprint="f")
-    assert list(found) == ["square-3", "square-1", "square-2", "conditions"]
-    assert [found[task.key].get("y") for task in todo] == [9.0, 1.0, 4.0, None]
-    nan, *rest = found["conditions"]["values"]
+    outcome = run_tasks(todo, tmp_path, fingerprint="f", **where)
+    assert list(outcome) == ["square-3", "square-1", "square-2", "conditions"]
+    assert [outcome[task.key].get("y") for task in todo] == [9.0, 1.0, 4.0, None]
+    nan, *others = outcome["conditions"]["values"]
     assert math.isnan(nan)
-    assert rest == [math.inf, -0.1, 1e-300]
-    assert found["conditions"]["text"] == "κ"
-    assert found["conditions"]["threads"] == 1
-    assert (found["conditions"]["process"] == os.getpid()) == (workers == 1)
-    if workers > 1:
-        assert found["conditions"]["blas"] == "1"
+    assert others == [math.inf, -0.1, 1e-300]
+    assert outcome["conditions"]["text"] == "κ"
+    assert outcome["conditions"]["threads"] == 1
+    assert (outcome["conditions"]["process"] == os.getpid()) == (where == {"workers": 1})
+    if where["workers"] > 1:
+        assert outcome["conditions"]["blas"] == "1"
     assert torch.get_num_threads() == threads
-    again = run_tasks(todo, tmp_path, workers=workers, fingerprint="f")
-    assert json.dumps(again) == json.dumps(found)
+    # nothing is computed twice, here or elsewhere
+    repeated = run_tasks(todo, tmp_path, workers=1, fingerprint="f")
+    assert json.dumps(repeated) == json.dumps(outcome)
     assert len(calls(tmp_path)) == 3
 
 
 def test_what_was_kept_holds_only_for_the_same_task(tmp_path: Path, monkeypatch) -> None:
     def run(*todo: Task, fingerprint: str = "f") -> dict[str, float]:
         (tmp_path / "calls").write_text("")
-        found = run_tasks(list(todo), tmp_path, workers=1, fingerprint=fingerprint)
-        return {key: result["y"] for key, result in found.items()}
+        outcome = run_tasks(list(todo), tmp_path, workers=1, fingerprint=fingerprint)
+        return {key: result["y"] for key, result in outcome.items()}
 
     log = {"log": str(tmp_path / "calls")}
     run(*squares(tmp_path, 1.0, 2.0, 3.0))
@@ -122,20 +143,20 @@ def test_a_damaged_result_is_computed_again(text: str, tmp_path: Path, caplog) -
     todo = squares(tmp_path, 2.0)
     run_tasks(todo, tmp_path, workers=1, fingerprint="f")
     (tmp_path / "tasks" / "square-2.json").write_text(text, encoding="latin-1")
-    found = run_tasks(todo, tmp_path, workers=1, fingerprint="f")
-    assert found == {"square-2": {"y": 4.0}}
+    outcome = run_tasks(todo, tmp_path, workers=1, fingerprint="f")
+    assert outcome == {"square-2": {"y": 4.0}}
     assert "square-2.json is damaged" in caplog.text
     assert calls(tmp_path) == ["2", "2"]
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("workers", [1, 2])
-def test_failing_tasks_let_the_others_finish(workers: int, tmp_path: Path) -> None:
+def test_failing_tasks_let_the_others_finish(where: dict[str, Any], tmp_path: Path) -> None:
+    workers = where["workers"]
     kinds = ["data", "python", "list", "object"] + ["exit", "killed"] * (workers > 1)
     bad = [Task(kind, work.fail, {"kind": kind}, cost=2.0) for kind in kinds]
     good = squares(tmp_path, 1.0, 2.0)
     with pytest.raises(StudyError) as caught:
-        run_tasks(bad + good, tmp_path, workers=workers, fingerprint="f")
+        run_tasks(bad + good, tmp_path, fingerprint="f", **where)
     text = str(caught.value)
     assert f"{len(kinds)} of {len(kinds) + 2} tasks failed" in text
     assert "data: recording 7: no rows" in text
@@ -185,9 +206,31 @@ def test_an_interrupted_study_goes_on_where_it_stopped(
     eventually(lambda: all(gone(int(sign.read_text())) for sign in signs))
     assert {p.name for p in (tmp_path / "tasks").iterdir()} == {"quick-1.json", "quick-2.json"}
     (tmp_path / "awake").write_text("")
-    found = run_tasks(work.tasks(tmp_path), tmp_path, workers=1, fingerprint="f")
-    assert len(found) == 4
+    outcome = run_tasks(work.tasks(tmp_path), tmp_path, workers=1, fingerprint="f")
+    assert len(outcome) == 4
     assert sorted(calls(tmp_path)) == ["1", "2"]
+
+
+def test_a_request_to_stop_waits_for_no_task_of_a_cluster(scheduler: str, tmp_path: Path) -> None:
+    tasks = [Task("sleep", work.sleep, {"folder": str(tmp_path), "name": "a"})]
+
+    def stop() -> None:
+        eventually((tmp_path / "sign-a").exists)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=stop, daemon=True).start()
+    start = time.monotonic()
+    with pytest.raises(Interrupted, match="0 of 1 tasks"):
+        run_tasks(tasks, tmp_path, workers=1, fingerprint="f", cluster=scheduler)
+    assert time.monotonic() - start < 30
+
+
+@pytest.mark.thorough
+def test_nobody_at_the_address_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("studies.workers.ANSWER", 0.5)
+    tasks = [Task("where", work.conditions, {})]
+    with pytest.raises(ConfigError, match="no scheduler answers"):
+        run_tasks(tasks, tmp_path, workers=1, fingerprint="f", cluster="tcp://127.0.0.1:9")
 
 
 @pytest.mark.slow
@@ -204,11 +247,11 @@ def test_workers_leave_with_the_process_that_started_them(tmp_path: Path) -> Non
 def test_several_processes_may_compile_at_once(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("NNODE_CACHE", str(tmp_path / "cache"))
     todo = [Task(f"simulate-{i}", work.simulate, {"law": "lin"}) for i in range(2)]
-    found = run_tasks(todo, tmp_path, workers=2, fingerprint="f")
+    outcome = run_tasks(todo, tmp_path, workers=2, fingerprint="f")
     assert list((tmp_path / "cache").rglob("*.nbi"))
     problem = pose(Shape("traffic", ("lin",), 3, 3, 2, 10, 0.02), "lin", torch.float64)
     exact = TorchdiffeqSolver("euler", "discrete", 0.02)(problem.system, problem.batch).x[-1]
-    for result in found.values():
+    for result in outcome.values():
         np.testing.assert_allclose(result["x"], exact.detach(), rtol=1e-12)
 
 

@@ -19,8 +19,8 @@ def run(options: StudyOptions, folder: Path) -> list[Block]:
     """Compute two squares, and wait where the folder does not say to stay awake."""
     assert options.workers is not None
     folder.mkdir(parents=True, exist_ok=True)
-    found = run_tasks(
+    outcome = run_tasks(
         work.tasks(folder), folder, workers=options.workers, fingerprint="f", title="tiny"
     )
-    squares = {key: result["y"] for key, result in found.items() if "y" in result}
+    squares = {key: result["y"] for key, result in outcome.items() if "y" in result}
     return [TableBlock("squares", pd.Series(squares, name="y").to_frame(), "Squares.")]

@@ -29,7 +29,7 @@ from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law
 from nnode.model.term import Interval, State
 from nnode.simulation import alone as simulate
 from nnode.simulation.alone import PersonAlone
-from studies.walking.laws import without_walls
+from studies.walking.tasks import without_walls
 from tests.discover import walkers
 from tests.discover.agreement import differences, distance, residuals
 from tests.discover.walkers import model

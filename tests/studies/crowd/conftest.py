@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from studies.crowd import fit
+from studies.crowd import tasks
 
 
 @pytest.fixture(autouse=True, scope="package")
 def one_precision() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, "DTYPE", dict.fromkeys(fit.DTYPE, torch.float64))
+        patch.setattr(tasks, "DTYPE", dict.fromkeys(tasks.DTYPE, torch.float64))
         yield

@@ -20,14 +20,14 @@ def sequence(rng: np.random.Generator, number: int, samples: int, people: int) -
     """People at random places who walk either way; their positions are those of free walkers."""
     x = np.stack([rng.uniform(-2, 2, people), rng.uniform(0.4, 3.6, people)], -1)
     v = np.stack([rng.choice([-1.0, 1.0], people), rng.normal(0, 0.1, people)], -1)
-    more = {
+    extra = {
         "start": number,
         "name": f"made/{number:03d}",
         "walls": np.array([[-5.0, 0.0, 5.0, 0.0], [5.0, 4.0, -5.0, 4.0]]),
         "agents": tuple(f"{number}-{i}" for i in range(people)),
         "destination": x + (DT * (samples - 1) + 2) * v,
     }
-    return replace(straight(x, v, samples, DT, **more), v=None)
+    return replace(straight(x, v, samples, DT, **extra), v=None)
 
 
 def walkers(

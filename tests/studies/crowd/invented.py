@@ -11,7 +11,7 @@ import numpy as np
 from nnode.data.sequence import Sequence
 from nnode.data.store import Store, write_store
 from studies.crowd.data import parts
-from studies.crowd.fit import new_system, row_of, silence
+from studies.crowd.tasks import new_system, row_of, silence
 from studies.stores import sequences
 from tests.studies.crowd.corridor import DT, sequence
 
@@ -108,11 +108,9 @@ def baselines(folder: str) -> dict[str, Any]:
 def transfer(folder: str, rows: dict[str, list[float]]) -> dict[str, Any]:
     """In place of :func:`studies.crowd.tasks.transfer`."""
     assert rows["sf"] == FORCE[_horizon(folder)]
-    runs = {
-        run: {
-            "people": [6],
-            "costs": {model: {"a": cost} for model, cost in {**costs, **SIMPLE}.items()},
+    return {
+        "runs": {
+            run: {model: {"a": cost} for model, cost in {**costs, **SIMPLE}.items()}
+            for run, costs in ELSEWHERE.items()
         }
-        for run, costs in ELSEWHERE.items()
     }
-    return {"runs": runs}

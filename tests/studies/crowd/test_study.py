@@ -15,9 +15,8 @@ from nnode.plots.interaction import evaluate_force, interaction
 from studies.crowd import forces as crowd_forces
 from studies.crowd import printed
 from studies.crowd.data import ALL, fold_of, parts, time_groups, turned
-from studies.crowd.fit import calibrate, costs, new_system, row_of, system_of
 from studies.crowd.results import beside_printed
-from studies.crowd.tasks import even_pace
+from studies.crowd.tasks import calibrate, costs, even_pace, new_system, row_of, system_of
 from tests.studies.crowd.corridor import corridor, sequence, walkers
 
 TRUE = np.array([0.05, 40.0, 12.0])
@@ -53,8 +52,8 @@ def test_nobody_is_on_both_sides_and_each_sequence_is_held_out_at_most_once(tmp_
 
 def test_a_sequence_across_the_border_is_in_no_block():
     starts = np.array([0.0, 4.0, 5.0, 9.5])
-    found = fold_of(starts, starts + 1.5, 2, (0.0, 11.0))
-    assert found.tolist() == [0, 0, -1, 1]
+    result = fold_of(starts, starts + 1.5, 2, (0.0, 11.0))
+    assert result.tolist() == [0, 0, -1, 1]
 
 
 def test_stretches_of_time_are_numbered_by_recording():
@@ -101,11 +100,11 @@ def test_known_parameters_are_found_from_the_papers_starts(seed):
 
 
 def test_weights_choose_the_sequences():
-    both = collate(
+    batch_of_two = collate(
         walkers(seed, system=system_of("sf", row), samples=26, people=60, number=1)[0]
         for seed, row in ((1, TRUE), (2, 2 * TRUE))
     )
-    row, _ = calibrate("sf", both, TRUE, weights=np.array([0.0, 1.0]))
+    row, _ = calibrate("sf", batch_of_two, TRUE, weights=np.array([0.0, 1.0]))
     assert row == pytest.approx(2 * TRUE, rel=1e-3)
 
 
@@ -133,21 +132,21 @@ def test_even_pace_arrives_in_time_and_never_hurries():
 def test_force_by_distance_is_that_of_the_formula():
     measured = crowd_forces.Measured.of(corridor(5, people=120, number=2))
     system = system_of("sf", [0.5, 30.0, 0.0])
-    found = crowd_forces.away_by_distance(system, measured)
+    result = crowd_forces.away_by_distance(system, measured)
     distance = np.linalg.norm(measured.dx, axis=1)
     inside = (distance >= 0.25) & (distance < 0.5) & measured.facing
     assert inside.sum() >= crowd_forces.LEAST
     d = distance[inside]
     expected = (0.5 * np.exp((0.5 - d) / 0.05) + 30.0 * (0.5 - d)).mean()
-    assert found.loc[0.375, "facing"] == pytest.approx(expected, rel=1e-6)
+    assert result.loc[0.375, "facing"] == pytest.approx(expected, rel=1e-6)
 
 
 def test_parts_add_up_to_what_the_model_adds_to_the_relaxation():
     measured = crowd_forces.Measured.of(corridor(6))
     system = new_system("nn", 8)
-    found = crowd_forces.accelerations(system, measured)
-    np.testing.assert_allclose(found["sum"], found["pair"] + found["wall"])
-    assert found["sum"].shape == (int(measured.scenes.agent.sum()), 2)
+    result = crowd_forces.accelerations(system, measured)
+    np.testing.assert_allclose(result["sum"], result["pair"] + result["wall"])
+    assert result["sum"].shape == (int(measured.scenes.agent.sum()), 2)
     assert interaction(system) is system.terms[1]
 
 

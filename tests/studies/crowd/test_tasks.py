@@ -10,7 +10,7 @@ import pytest
 from nnode.data.store import write_store
 from studies.crowd import tasks
 from studies.crowd.data import chosen
-from studies.crowd.fit import costs, system_of
+from studies.crowd.tasks import costs, system_of
 from tests.studies.crowd.corridor import DT, walkers
 
 TRUE = np.array([0.05, 40.0, 12.0])
@@ -34,37 +34,35 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def test_a_fit_finds_the_truth_without_the_block_that_is_held_out(folder: str) -> None:
-    found = tasks.fit("sf", folder, "fold-1", 2, [0.0, 31.0], 0, (1.2 * TRUE).tolist(), 4)
-    assert found["row"] == pytest.approx(TRUE, rel=1e-3)
-    assert list(found["train"]) == ["made/0", "made/1"]
-    assert list(found["heldout"]) == ["made/2", "made/3"]
-    assert found["J"] == pytest.approx(np.mean(list(found["train"].values())))
+    result = tasks.fit("sf", folder, "fold-1", 2, [0.0, 31.0], 0, (1.2 * TRUE).tolist(), 4)
+    assert result["row"] == pytest.approx(TRUE, rel=1e-3)
+    assert list(result["train"]) == ["made/0", "made/1"]
+    assert list(result["heldout"]) == ["made/2", "made/3"]
+    assert result["J"] == pytest.approx(np.mean(list(result["train"].values())))
     # those who were held out move by the same law
     lost = tasks.baselines(folder)["costs"]["relaxation"]
-    assert max(found["heldout"].values()) < 1e-4 * min(lost.values())
+    assert max(result["heldout"].values()) < 1e-4 * min(lost.values())
 
 
 def test_refits_to_resampled_data_without_noise_stay_where_they_are(folder: str) -> None:
-    found = tasks.resample(folder, TRUE.tolist(), 5, 1, 4, 0)
-    assert np.array(found["rows"]).shape == (3, 3)
-    for row in found["rows"]:
+    result = tasks.resample(folder, TRUE.tolist(), 5, 1, 4, 0)
+    assert np.array(result["rows"]).shape == (3, 3)
+    for row in result["rows"]:
         assert row == pytest.approx(TRUE, rel=1e-3)
 
 
 def test_baselines_calibrate_nothing(folder: str) -> None:
-    found = tasks.baselines(folder)
+    result = tasks.baselines(folder)
     names = [f"made/{number}" for number in range(4)]
-    assert all(list(by_name) == names for by_name in found["costs"].values())
+    assert all(list(by_name) == names for by_name in result["costs"].values())
     # no interaction is the social force without strength
     none = costs("sf", [0.0, 0.0, 0.0], chosen(folder, range(4)))
-    assert list(found["costs"]["relaxation"].values()) == pytest.approx(none.tolist(), rel=1e-9)
+    assert list(result["costs"]["relaxation"].values()) == pytest.approx(none.tolist(), rel=1e-9)
 
 
 def test_a_force_without_directions_holds_in_a_corridor_that_lies_another_way(folder: str) -> None:
-    found = tasks.transfer(folder, {"sf": TRUE.tolist()})["runs"]["made"]
-    assert found["people"] == [PEOPLE] * 4
-    there = tasks.baselines(folder)["costs"]
-    for name in ("relaxation", "constant_velocity", "even_pace", "printed"):
-        turned = list(found["costs"][name].values())
-        assert turned == pytest.approx(list(there[name].values()), rel=1e-6)
-    assert max(found["costs"]["sf"].values()) < 1e-4 * min(there["relaxation"].values())
+    result = tasks.transfer(folder, {"sf": TRUE.tolist()})["runs"]["made"]
+    baselines = tasks.baselines(folder)["costs"]
+    for name, costs_along in baselines.items():
+        assert result[name] == pytest.approx(costs_along, rel=1e-6)
+    assert max(result["sf"].values()) < 1e-4 * min(baselines["relaxation"].values())

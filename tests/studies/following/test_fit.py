@@ -12,15 +12,15 @@ from nnode.data.clusters import folds
 from nnode.data.sequence import Sequence, collate
 from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
 from nnode.simulation.fused import FusedSolver
-from studies.following import data, fit, inference, leaders, printed
-from studies.following.candidates import EVERY, decay, key, published_law, starts
+from studies.following import data, printed, tasks
+from studies.following.tasks import EVERY, decay, key, published_law, starts
 
 HELLY = {"c_s": 0.15, "c_v": 0.7, "T": 1.4, "s0": 3.0}
 
 
 def driven(number: int = 6, time_gaps: np.ndarray | None = None) -> list[Sequence]:
     """Followers by Helly's law, stepped here by a plain loop, behind leaders that swing."""
-    found = []
+    result = []
     time = 0.1 * np.arange(301)
     for i in range(number):
         lead_v = 10 + 2 * np.sin(0.3 * time + i) + np.cos(0.11 * time * (1 + i / 5))
@@ -34,7 +34,7 @@ def driven(number: int = 6, time_gaps: np.ndarray | None = None) -> list[Sequenc
             a -= HELLY["c_v"] * (v[k] - lead_v[k])
             v[k + 1] = v[k] + 0.1 * a
             x[k + 1] = x[k] + 0.1 * (v[k] + v[k + 1]) / 2
-        found.append(
+        result.append(
             Sequence(
                 name=f"r/{i}",
                 recording="r",
@@ -46,11 +46,11 @@ def driven(number: int = 6, time_gaps: np.ndarray | None = None) -> list[Sequenc
                 split="train",
             )
         )
-    return found
+    return result
 
 
 @pytest.fixture
-def known(monkeypatch: pytest.MonkeyPatch) -> list[Sequence]:
+def pairs_by_helly(monkeypatch: pytest.MonkeyPatch) -> list[Sequence]:
     pairs = driven()
     monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
     monkeypatch.setattr(data, "batch", lambda folder, test=False: collate(pairs))
@@ -87,40 +87,39 @@ def test_followers_of_a_platoon_keep_their_leaders() -> None:
     assert np.diff(last.x[0, :, 0]) == pytest.approx(40)
 
 
-def test_cross_validation_finds_the_hidden_law(known: list[Sequence]) -> None:
-    found = fit.cross_validate("", "helly", restarts=2, folds=2, seed=0)
-    assert found["parameters"] == pytest.approx(HELLY, rel=1e-3)
-    assert max(found["heldout"]["spacing"]) < 1e-3
-    assert found["limits"] == []
-    assert len(found["starts"]) == 2
+def test_cross_validation_finds_the_hidden_law(pairs_by_helly: list[Sequence]) -> None:
+    result = tasks.cross_validate("", "helly", restarts=2, folds=2, seed=0)
+    assert result["parameters"] == pytest.approx(HELLY, rel=1e-3)
+    assert max(result["heldout"]["spacing"]) < 1e-3
+    assert result["limits"] == []
 
 
 @pytest.mark.thorough  # calibrations of every pair, some thirty times
 def test_numbers_of_a_pair_that_last_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
-    pairs = driven(time_gaps=own)
+    gap_times = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
+    pairs = driven(time_gaps=gap_times)
     monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
     row = [HELLY[n] for n in ("c_s", "c_v", "T", "s0")]
-    found = inference.halves("", "helly", row, folds=2, restarts=1, seed=0)
-    assert found["names"] == ["c_s", "c_v", "T", "s0"]
+    result = tasks.halves("", "helly", row, folds=2, restarts=1, seed=0)
+    assert result["names"] == ["c_s", "c_v", "T", "s0"]
     # the spread of the middle of the six time gaps, whose 5 % quantiles the ends are moved to
-    tame = np.clip(own, *np.quantile(own, [0.05, 0.95]))
-    assert found["spread"][2] == pytest.approx(np.std(tame, ddof=1), rel=0.05)
-    assert max(found["alone"]) < 0.01
-    assert np.mean(found["pooled"]) > 0.5
-    assert np.mean(found["shrunk"]) < 0.1 * np.mean(found["pooled"])
+    tame = np.clip(gap_times, *np.quantile(gap_times, [0.05, 0.95]))
+    assert result["spread"][2] == pytest.approx(np.std(tame, ddof=1), rel=0.05)
+    assert max(result["alone"]) < 0.01
+    assert np.mean(result["pooled"]) > 0.5
+    assert np.mean(result["shrunk"]) < 0.1 * np.mean(result["pooled"])
 
 
-def test_a_profile_is_least_at_the_best_value(known: list[Sequence]) -> None:
+def test_a_profile_is_least_at_the_best_value(pairs_by_helly: list[Sequence]) -> None:
     cost = ResidualProblem(
-        EVERY["helly"].system(), collate(known), FusedSolver(), Convention.spacing
+        EVERY["helly"].system(), collate(pairs_by_helly), FusedSolver(), Convention.spacing
     )
-    best = np.array([HELLY[n] for n in fit.named(cost, cost.start)])
+    best = np.array([HELLY[n] for n in tasks.named(cost, cost.start)])
     before = cost.low.copy()
-    found = inference.profile(cost, best, 2, np.arange(6))
-    rise = np.array(found["rise"])
-    assert found["values"] == sorted(found["values"])
-    assert found["values"][int(rise.argmin())] == pytest.approx(HELLY["T"], rel=1e-9)
+    result = tasks.profile(cost, best, 2, np.arange(6))
+    rise = np.array(result["rise"])
+    assert list(result["values"]) == sorted(result["values"])
+    assert result["values"][int(rise.argmin())] == pytest.approx(HELLY["T"], rel=1e-9)
     assert (rise >= -1e-9).all()
     assert cost.low.tolist() == before.tolist()
 
@@ -129,11 +128,11 @@ def test_networks_are_penalised_and_laws_are_not() -> None:
     batch = collate(driven(2))
     law = ResidualProblem(EVERY["helly"].system(), batch, FusedSolver())
     assert decay(law) is None
-    beside = ResidualProblem(EVERY["idm + network 4"].system(), batch, FusedSolver())
-    penalty = decay(beside)
+    with_network = ResidualProblem(EVERY["idm + network 4"].system(), batch, FusedSolver())
+    penalty = decay(with_network)
     assert penalty is not None
     assert (penalty[1] == 0).sum() == 5
-    rows = starts(EVERY["idm + network 4"], beside, 3, seed=1)
+    rows = starts(EVERY["idm + network 4"], with_network, 3, seed=1)
     assert rows[0, :5] == pytest.approx([30, 1.2, 2, 1.3, 1.7])
     assert len(np.unique(rows[:, 0])) == 3
 
@@ -147,4 +146,4 @@ def test_the_jackknife_of_a_mean_is_its_usual_interval() -> None:
     values = np.random.default_rng(0).normal(size=(10, 2))
     without = (values.sum(0) - values) / 9
     usual = values.std(0, ddof=1) / np.sqrt(10)
-    assert leaders.jackknifed(without) == pytest.approx(usual * stats.t.ppf(0.975, 9))
+    assert tasks.jackknifed(without) == pytest.approx(usual * stats.t.ppf(0.975, 9))

@@ -10,16 +10,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from nnode.data.sequence import collate
 from nnode.pages.page import TableBlock, write_page
 from studies.following import printed, stability
-from studies.following.candidates import EVERY, key
 from studies.following.data import LEADERS, PAIRS, PLATOONS
-from studies.following.fit import OBJECTIVES, named
 from studies.following.results import Study
-from studies.following.study import after, training
+from studies.following.study import after, blocks, training
+from studies.following.tasks import EVERY, OBJECTIVES, costs_of, key, named
 from studies.frame import tidy
 from studies.options import FollowingStudyOptions
-from studies.page import page
 from studies.runner import Task
 from tests.studies.following.test_fit import driven
 
@@ -29,7 +28,7 @@ MAKES = list(printed.platoon_errors)
 
 
 def invented() -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {
+    result: dict[str, dict[str, Any]] = {
         "floor": {"costs": [1.0] * 6, "limits": [[]] * 5 + [["v0"]]},
         "reproduced-platoon": {"law": printed.platoon_errors, "stopped": printed.platoon_errors},
         "reproduced-pairs": {
@@ -39,24 +38,19 @@ def invented() -> dict[str, dict[str, Any]]:
         },
     }
     for name, (held, test) in ERRORS.items():
-        system = EVERY[name].system()
-        row = [float(p.detach()) for p in system.parameters()]
-        cost = cast(
-            Any,
-            SimpleNamespace(names=[f"x.{n.split('.')[-1]}" for n, _ in system.named_parameters()]),
-        )
-        values = named(cost, np.array(row))
+        cost = costs_of(EVERY[name], collate(driven(1)))
+        row, values = cost.start.tolist(), named(cost, cost.start)
         noise = 0.1 * np.arange(6)
-        found[f"cv-{key(name)}"] = {
+        result[f"cv-{key(name)}"] = {
             "row": row,
             "parameters": values,
             "limits": [],
             "clusters": [0, 0, 1, 1, 2, 2],
-            "train": {o: (noise + held - 0.5).tolist() for o in OBJECTIVES},
+            "train": (noise + held - 0.5).tolist(),
             "heldout": {o: (noise + held).tolist() for o in OBJECTIVES},
         }
-        found[f"test-{key(name)}"] = {o: (noise + test).tolist() for o in OBJECTIVES}
-        found[f"objectives-{key(name)}"] = {
+        result[f"test-{key(name)}"] = {"costs": (noise + test).tolist()}
+        result[f"objectives-{key(name)}"] = {
             o: {
                 "reached": {x: 1.0 + (x != o) for x in OBJECTIVES},
                 "parameters": values,
@@ -66,7 +60,7 @@ def invented() -> dict[str, dict[str, Any]]:
         }
         factors = np.array([0.5, 0.8, 1.0, 1.25, 2.0])
         rise = np.log(factors) ** 2
-        found[f"precision-{key(name)}"] = {
+        result[f"precision-{key(name)}"] = {
             "names": list(values),
             "row": row,
             "half": [0.2] * len(row),
@@ -81,8 +75,8 @@ def invented() -> dict[str, dict[str, Any]]:
                 for n, v in values.items()
             },
         }
-    idm = found["cv-idm"]["parameters"]
-    found["halves"] = {
+    idm = result["cv-idm"]["parameters"]
+    result["halves"] = {
         "names": list(idm),
         "centre": list(idm.values()),
         "spread": [0.1] * 5,
@@ -95,7 +89,7 @@ def invented() -> dict[str, dict[str, Any]]:
         "clusters": [0, 0, 1, 1, 2, 2],
     }
     for name, fold, heldout in (("idm", 2.0, 3.0), ("helly", 3.0, 1.0)):
-        found[f"platoon-{name}"] = {
+        result[f"platoon-{name}"] = {
             "makes": MAKES,
             "chosen": [fold] * 4,
             "train": [fold] * 4,
@@ -103,7 +97,7 @@ def invented() -> dict[str, dict[str, Any]]:
             "parameters": [idm] * 4,
             "limits": [[]] * 4,
         }
-    found["runs"] = {
+    result["runs"] = {
         "runs": ["a", "a", "b", "b"],
         "makes": MAKES,
         "settings": ["min", "max", "none", "min"],
@@ -112,7 +106,7 @@ def invented() -> dict[str, dict[str, Any]]:
         "parameters": [{**idm, "T": T} for T in (0.8, 2.5, 1.5, 1.0)],
     }
     rows = {"both": [30, 1.2, 2, 1.3, 1.7], "HV": [30, 1.0, 2, 1.3, 1.7], "CAV": [30, 1.5, 2, 1, 2]}
-    found["leaders"] = {
+    result["leaders"] = {
         "names": list(idm),
         "kinds": ["HV", "CAV"] * 3,
         "clusters": [0, 0, 1, 1, 2, 2],
@@ -123,7 +117,7 @@ def invented() -> dict[str, dict[str, Any]]:
         "heldout": {k: [1.0] * 6 for k in rows},
         "costs": {k: [1.0] * 6 for k in rows},
     }
-    return found
+    return result
 
 
 @pytest.fixture
@@ -131,21 +125,21 @@ def study(monkeypatch: pytest.MonkeyPatch) -> Study:
     store = SimpleNamespace(folder="", manifest={"files": {}})
     stores = cast(Any, dict.fromkeys((PAIRS, PLATOONS, LEADERS), store))
     monkeypatch.setattr(Study, "pairs", lambda self, test=False: tuple(driven()))
-    monkeypatch.setattr(stability, "platoon", lambda *args, **more: np.full(11, 0.05))
+    monkeypatch.setattr(stability, "platoon", lambda *args, **extra: np.full(11, 0.05))
     options, results = FollowingStudyOptions(), invented()
 
     def done(tasks: list[Task]) -> pd.DataFrame:
         return tidy([task for task in tasks if task.key in results], results)
 
-    found = Study(options, stores, done(training(options, stores)))
-    found.results = pd.concat([found.results, done(after(found))])
-    return found
+    result = Study(options, stores, done(training(options, stores)))
+    result.results = pd.concat([result.results, done(after(result))])
+    return result
 
 
 @pytest.mark.thorough
 def test_tables_hold_what_was_found(study: Study, tmp_path: Path) -> None:
-    blocks = page("following", study.tables(), study.figures(), **study.values())
-    tables = {b.name: b.frame for b in blocks if isinstance(b, TableBlock)}
+    placed = blocks(study)
+    tables = {b.name: b.frame for b in placed if isinstance(b, TableBlock)}
     assert study.order == ["idm + memory", "helly", "idm"] == list(tables["candidates"].index)
     away = tables["candidates"].loc["idm + memory", ["minus idm", "from", "to"]]
     assert list(away) == pytest.approx([-1.0, -1.0, -1.0])
@@ -160,13 +154,13 @@ def test_tables_hold_what_was_found(study: Study, tmp_path: Path) -> None:
     assert tables["time_gaps"].loc["ACC, min", "median"] == pytest.approx(0.9)
     ends = tables["leaders"][["from", "to"]].astype(float).prod(axis=1)
     assert list(ends.index[ends > 0]) == ["T", "a", "b"]
-    paths = write_page(blocks, tmp_path, title="Car following")
+    paths = write_page(placed, tmp_path, title="Car following")
     assert all(path.stat().st_size for path in paths)
 
 
 def test_every_task_has_a_key_of_its_own(study: Study) -> None:
-    first, rest = training(study.options, study.stores), after(study)
+    first, later = training(study.options, study.stores), after(study)
     assert {task.key for task in first} == {f"cv-{key(name)}" for name in EVERY}
-    keys = [task.key for task in (*first, *rest)]
+    keys = [task.key for task in (*first, *later)]
     assert len(set(keys)) == len(keys)
     assert {"precision-idm", "precision-idm-memory"} < set(keys)

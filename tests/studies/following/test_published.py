@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.following import fit, platoons, printed
+from studies.following import printed, tasks
 from studies.following.data import PAIRS, PLATOONS, stores
 from studies.options import FollowingStudyOptions
 
@@ -18,21 +18,21 @@ pytestmark = pytest.mark.real
 def folders(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     if not (real_data / "ngsim_pairs").is_dir():
         pytest.skip(f"{real_data} has no ngsim_pairs")
-    found = stores(
+    result = stores(
         FollowingStudyOptions(source=str(real_data)), tmp_path_factory.mktemp("following")
     )
-    return {name: str(store.folder) for name, store in found.items()}
+    return {name: str(store.folder) for name, store in result.items()}
 
 
 def test_nine_errors_of_test_pairs(folders: dict[str, str]) -> None:
-    found = fit.reproduced(folders[PAIRS])
+    result = tasks.reproduced_pairs(folders[PAIRS])
     for law, theirs in printed.errors.items():
         for objective, value in zip(printed.objectives, theirs, strict=True):
-            errors = found[f"{law} {objective}"]
+            errors = result[f"{law} {objective}"]
             assert len(errors) == 20
             assert np.mean(errors) == pytest.approx(value, abs=0.01), (law, objective)
 
 
 def test_four_errors_on_the_track(folders: dict[str, str]) -> None:
-    found = platoons.reproduced(folders[PLATOONS])
-    assert found["stopped"] == pytest.approx(printed.platoon_errors, abs=0.03)
+    result = tasks.reproduced_platoon(folders[PLATOONS])
+    assert result["stopped"] == pytest.approx(printed.platoon_errors, abs=0.03)

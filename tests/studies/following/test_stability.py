@@ -9,8 +9,8 @@ from nnode.model.build import build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.system import System
 from studies.following import stability
-from studies.following.candidates import EVERY
 from studies.following.stability import FREQUENCIES, Slopes, passed
+from studies.following.tasks import EVERY
 
 LENGTH = 4.5
 
@@ -34,26 +34,26 @@ def idm_gap(v: float) -> float:
 
 def test_equilibrium_of_idm() -> None:
     speeds = np.array([2.0, 8.0, 15.0])
-    found = stability.equilibrium(system("idm"), speeds, LENGTH)
-    assert found == pytest.approx([idm_gap(v) for v in speeds], abs=2e-3)
+    result = stability.equilibrium(system("idm"), speeds, LENGTH)
+    assert result == pytest.approx([idm_gap(v) for v in speeds], abs=2e-3)
 
 
 def test_slopes_of_idm() -> None:
     v, a, b, wish = 8.0, 1.3, 1.7, 2 + 1.2 * 8.0
     s = idm_gap(v)
-    found = stability.slopes(system("idm"), s, v, LENGTH)
-    assert found.s == pytest.approx(2 * a * wish**2 / s**3, rel=1e-5)
-    assert found.v == pytest.approx(-a * (4 * v**3 / 30**4 + 2 * wish * 1.2 / s**2), rel=1e-5)
-    assert found.dv == pytest.approx(-a * 2 * wish * v / (2 * np.sqrt(a * b) * s**2), rel=1e-5)
+    result = stability.slopes(system("idm"), s, v, LENGTH)
+    assert result.s == pytest.approx(2 * a * wish**2 / s**3, rel=1e-5)
+    assert result.v == pytest.approx(-a * (4 * v**3 / 30**4 + 2 * wish * 1.2 / s**2), rel=1e-5)
+    assert result.dv == pytest.approx(-a * 2 * wish * v / (2 * np.sqrt(a * b) * s**2), rel=1e-5)
 
 
 @pytest.mark.parametrize("name", [n for n in EVERY if not n.startswith(stability.MAPS)])
 def test_every_candidate_has_slopes(name: str) -> None:
     # found.s is what a platoon passes on by: of no candidate it is nothing at every gap
     one = EVERY[name].system()
-    found = [stability.slopes(one, gap, 6.0, LENGTH).s for gap in (8.0, 12.0, 20.0)]
-    assert np.isfinite(found).all()
-    assert np.abs(found).max() > 0
+    result = [stability.slopes(one, gap, 6.0, LENGTH).s for gap in (8.0, 12.0, 20.0)]
+    assert np.isfinite(result).all()
+    assert np.abs(result).max() > 0
 
 
 @pytest.mark.parametrize("dv", [0.0, -0.3, -1.0])

@@ -14,10 +14,10 @@ from nnode.data.sequence import Sequence
 from nnode.data.store import write_store
 from nnode.model.build import build_model
 from studies.prediction import printed, study, tasks
-from studies.prediction.data import AHEAD, SCENES, SEEN, events, scene
+from studies.prediction.tasks import AHEAD, SCENES, SEEN, events, scene
 from studies.walking import tasks as walking
-from studies.walking.data import chosen
 from studies.walking.study import errors_by_run
+from studies.walking.tasks import chosen
 from tests.builders import lane
 
 FREE = {"parameters": {"v0": "12 m/s"}, "rate": {"x": "v0"}}
@@ -26,8 +26,8 @@ FREE = {"parameters": {"v0": "12 m/s"}, "rate": {"x": "v0"}}
 def pair(number: int, v0: float, split: str) -> Sequence:
     """A follower at a constant speed, 40 m and 4 m of length behind a leader who is as fast."""
     x = v0 * 0.1 * np.arange(31)[:, None] + np.array([0.0, 44.0])
-    more = {"agents": (f"f{number}", f"l{number}"), "length": np.array([np.nan, 4.0])}
-    return lane(x, 0.1, v=v0, name=f"{split}/{number}", split=split, **more)
+    extra = {"agents": (f"f{number}", f"l{number}"), "length": np.array([np.nan, 4.0])}
+    return lane(x, 0.1, v=v0, name=f"{split}/{number}", split=split, **extra)
 
 
 def test_the_metric_is_that_of_all_samples_together() -> None:
@@ -42,11 +42,11 @@ def test_the_metric_is_that_of_all_samples_together() -> None:
 
 
 def test_a_calibration_uses_training_events_alone(tmp_path: Path) -> None:
-    both = [pair(1, 9.0, "train"), pair(2, 9.0, "train"), pair(3, 11.0, "test")]
-    write_store(tmp_path, both, {"dt": 0.1})
-    found = tasks.follow("newell", str(tmp_path), 2, 0)
-    assert tasks.rmspe(found["train"]) < 0.01
-    assert len(found["test"]["error"]) == 1
+    pairs = [pair(1, 9.0, "train"), pair(2, 9.0, "train"), pair(3, 11.0, "test")]
+    write_store(tmp_path, pairs, {"dt": 0.1})
+    result = tasks.follow("newell", str(tmp_path), 2, 0)
+    assert tasks.rmspe(result["train"]) < 0.01
+    assert len(result["test"]["error"]) == 1
 
 
 @pytest.mark.real
@@ -56,10 +56,11 @@ def test_constant_velocity_has_nearly_the_published_errors(real_data: Path, tmp_
         pytest.skip("eth_ucy is not there")
     for name in SCENES[1:]:
         store = prepare(scene(name, str(real_data)), tmp_path / name)
-        found = walking.baselines([str(store.folder)], [name])["constant_velocity"][name]
+        errors = walking.baselines([str(store.folder)], [name])["errors"]
+        result = errors["constant_velocity"][name]
         ade, fde = printed.constant_velocity[name]
-        assert found["ade"] == pytest.approx(ade, rel=0.08)
-        assert found["fde"] == pytest.approx(fde, rel=0.08)
+        assert result["ade"] == pytest.approx(ade, rel=0.08)
+        assert result["fde"] == pytest.approx(fde, rel=0.08)
         (batch,) = chosen([str(store.folder)], [name], test=True)
         assert batch.n_samples == AHEAD + 1
         assert batch.preferred is not None
@@ -70,30 +71,30 @@ def test_constant_velocity_has_nearly_the_published_errors(real_data: Path, tmp_
 
 @pytest.mark.real
 def test_the_configurations_are_those_of_the_study(real_data: Path) -> None:
-    for name, own in (("waymo_pairs", events(str(real_data))), ("eth_ucy", scene("x", ""))):
-        shipped = data_options(name, {"path": own.path, "source": own.source})
+    for name, option in (("waymo_pairs", events(str(real_data))), ("eth_ucy", scene("x", ""))):
+        shipped = data_options(name, {"path": option.path, "source": option.source})
         chosen = ("columns", "time_unit", "frame_rate", "velocity", "history", "t_seq")
-        for key in (key for key in chosen if hasattr(own, key)):
-            assert getattr(shipped, key) == pytest.approx(getattr(own, key)), key
+        for key in (key for key in chosen if hasattr(option, key)):
+            assert getattr(shipped, key) == pytest.approx(getattr(option, key)), key
 
 
 def test_tables_of_errors() -> None:
     sums = {"error": [1.0, 9.0], "spacing": [100.0, 100.0]}
     run = {"people": 4, "ade": 0.5, "fde": 1.0}
-    found = pd.DataFrame(
+    result = pd.DataFrame(
         [
             {"task": "follow", "law": "idm", "row": {"T": 1.5}, "train": sums, "test": sums},
-            {"task": "baselines", **{name: {"eth_univ": run} for name in study.SIMPLE}},
-            {"task": "fit", "law": "alone", "errors": {"eth_univ": {**run, "ade": 0.25}}},
+            {"errors": {name: {"eth_univ": run} for name in study.SIMPLE}},
+            {"errors": {"alone": {"eth_univ": {**run, "ade": 0.25}}}},
         ]
     )
-    table = study._following(found, 0)
+    table = study.following(result, 0)
     assert table.loc["idm", "test"] == pytest.approx(np.sqrt(10 / 200))
     assert table.loc["idm", "low"] < table.loc["idm", "test"] < table.loc["idm", "high"]
     assert table.loc["idm", "parameters"] == "T = 1.5"
     assert list(table.index[1:]) == ["idm, published", "learned, published"]
-    distances = errors_by_run(found.query("task != 'follow'"), study.SIMPLE | study.PEOPLE)
-    ade = study._by_scene(distances, "ade")["eth_univ"]
+    distances = errors_by_run(result["errors"].dropna(), study.SIMPLE | study.PEOPLE)
+    ade = study.by_scene(distances, "ade")["eth_univ"]
     assert ade.to_dict() == {
         "constant velocity": 0.5,
         "mean speed with the stream": 0.5,

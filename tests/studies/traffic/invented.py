@@ -9,7 +9,7 @@ import numpy as np
 from nnode.data.sequence import Sequence
 from nnode.model import build_model
 from studies.traffic import printed
-from studies.traffic.problem import GAPS, model_options
+from studies.traffic.tasks import GAPS, model_options
 from tests.builders import lane
 
 #: Cost above the printed one, m² s; all others lie 1 below it. The second is of a wider search.
@@ -40,13 +40,13 @@ def printed_cost(model: str, name: str) -> float:
 
 def _parameters(model: str, name: str) -> dict[str, Any]:
     system = build_model(model_options(model))
-    found = {
+    result = {
         key.removeprefix("terms.0."): value.tolist() for key, value in system.named_parameters()
     }
-    found["v0"] = V0_LIN if model == "lin" else V0
-    if "L" in found:
-        found["L"] = L_LEAST if (model, name) == ("lin", LEAST_IN) else L
-    return found
+    result["v0"] = V0_LIN if model == "lin" else V0
+    if "L" in result:
+        result["L"] = L_LEAST if (model, name) == ("lin", LEAST_IN) else L
+    return result
 
 
 def fit(
@@ -66,7 +66,7 @@ def fit(
     cost += 5.0 if box else ABOVE.get((model, recording_name), (-1.0, -1.0))[seed]
     cost /= 2 if folder.endswith("drop") else 1
     parameters = _parameters(model, recording_name)
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "cost": cost,
         "costs": [share * cost for share in SHARES],
         "groups": [0, 1, 2],
@@ -74,10 +74,10 @@ def fit(
         "residual": 1e-3,
         "speeds": [15.0] * len(GAPS),
         "steps_costs": {f"{step:g}": cost * (1 + step) for step in steps},
-        "starts": [cost + k for k in range(5)],
+        "best_tenth": cost + 1,
     }
     if bootstrap:
-        found["bootstrap"] = {
+        result["bootstrap"] = {
             "values": {
                 key: np.linspace(parameters[key] - 2, parameters[key] + 2, 101).tolist()
                 for key in ("v0", "L")
@@ -85,7 +85,7 @@ def fit(
             },
             "speeds": [[14.0] * len(GAPS), [16.0] * len(GAPS)],
         }
-    return found
+    return result
 
 
 def cross_validate(

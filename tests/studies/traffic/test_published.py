@@ -16,10 +16,10 @@ from nnode.model.build import build_model
 from nnode.model.system import System
 from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver
 from studies.crowd.data import prepared
-from studies.crowd.fit import system_of
+from studies.crowd.tasks import system_of
 from studies.options import CrowdStudyOptions
 from studies.traffic import printed
-from studies.traffic.problem import Problem, model_options, recording
+from studies.traffic.tasks import Problem, model_options, recording
 
 PUBLISHED = Path(__file__).parents[3] / "docs" / "studies" / "traffic"
 DT = 0.002
@@ -46,12 +46,12 @@ def calibrated(parameters: pd.DataFrame, model: str, name: str) -> System:
         & (p.recording == name)
     ]
     system = build_model(model_options(model))
-    own = dict(system.named_parameters())
-    assert len(chosen) == sum(value.numel() for value in own.values())
+    values_by_name = dict(system.named_parameters())
+    assert len(chosen) == sum(value.numel() for value in values_by_name.values())
     with torch.no_grad():
         for row in chosen.itertuples():
             place = tuple(int(i) for i in str(row.index_).split()) if row.index_ else ()
-            own[f"terms.0.{row.parameter}"][place] = float(row.value)
+            values_by_name[f"terms.0.{row.parameter}"][place] = float(row.value)
     return system
 
 
@@ -99,13 +99,13 @@ def test_crowd_costs_follow_from_the_parameters(
             return float(sequence_costs(solver(system, batch), batch).mean())
 
     systems = [system_of(model, one["value"].to_list()) for _, one in rows.groupby("start")]
-    found = [cost(system, FusedSolver()) for system in systems]
+    result = [cost(system, FusedSolver()) for system in systems]
     # the best one by another solver as well
-    best = systems[int(np.argmin(found))]
-    again = cost(best, TorchdiffeqSolver("euler", "discrete"))
-    assert again == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
-    assert min(found) == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
-    assert 25 * min(found) == pytest.approx(told.loc[label, "here (m²)"], rel=1e-6)
+    best = systems[int(np.argmin(result))]
+    repeated = cost(best, TorchdiffeqSolver("euler", "discrete"))
+    assert repeated == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
+    assert min(result) == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
+    assert 25 * min(result) == pytest.approx(told.loc[label, "here (m²)"], rel=1e-6)
 
 
 @pytest.mark.parametrize("study", ["traffic", "crowd"])

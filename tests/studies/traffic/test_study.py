@@ -15,7 +15,7 @@ from nnode.errors import ConfigError
 from studies.options import TrafficStudyOptions
 from studies.traffic import printed, tasks
 from studies.traffic import study as traffic
-from studies.traffic.problem import Problem
+from studies.traffic.tasks import Problem
 from tests.builders import linear
 
 V0, L = 24.0, 5.0
@@ -80,8 +80,8 @@ def test_held_out_costs_do_not_know_their_own_sequence(store: str, monkeypatch) 
     x[1:, 0] -= 4.0
     spoiled = [Sequence(name=items[0].name, recording="r", time=items[0].time, x=x), *items[1:]]
     monkeypatch.setattr(tasks, "recording", lambda *_: spoiled)
-    again = tasks.cross_validate(store, "r", "lin", None, 4, 3, 0.02, 40, 0)
-    changed = ~np.isclose(honest["costs"], again["costs"], rtol=1e-4, atol=1e-9)
+    repeated = tasks.cross_validate(store, "r", "lin", None, 4, 3, 0.02, 40, 0)
+    changed = ~np.isclose(honest["costs"], repeated["costs"], rtol=1e-4, atol=1e-9)
     assert changed[0]
     rng = np.random.default_rng(0)
     fold = (rng.permutation(8) % 4)[np.array(honest["groups"])]

@@ -14,9 +14,8 @@ from nnode.data.store import write_store
 from studies.frame import differences
 from studies.options import WalkingStudyOptions
 from studies.walking import tasks
-from studies.walking.data import RUNS, chosen
-from studies.walking.laws import GRID, LABELS, LAWS, new_system
 from studies.walking.study import Walking, groups
+from studies.walking.tasks import GRID, LABELS, LAWS, RUNS, SIMPLE, chosen, new_system
 
 
 def walker(run: str, tau: float, known: bool = True) -> Sequence:
@@ -39,12 +38,13 @@ def test_every_run_is_held_out_once() -> None:
 
 def test_a_calibration_finds_the_law_and_tests_it_elsewhere(tmp_path: Path) -> None:
     write_store(tmp_path, [walker("a", 0.8), walker("b", 0.8, known=False)], {"dt": 0.05})
-    found = tasks.fit("alone", "direction", [str(tmp_path)], ["b"])
-    assert found["row"]["tau"] == pytest.approx(0.8, rel=0.05)  # Euler's steps are 0.05 s
+    result = tasks.fit("alone", "direction", [str(tmp_path)], ["b"])
+    assert result["row"]["tau"] == pytest.approx(0.8, rel=0.05)  # Euler's steps are 0.05 s
     # who was not measured before is not asked for
-    assert found["errors"]["b"]["people"] == 1
-    assert found["errors"]["b"]["mean"] < 1e-4
-    simple = tasks.baselines([str(tmp_path)], ["b"])
+    errors = result["errors"]["alone"]["b"]
+    assert errors["people"] == 1
+    assert errors["mean"] < 1e-4
+    simple = tasks.baselines([str(tmp_path)], ["b"])["errors"]
     gone = 0.6 * 0.05 * np.arange(21) - walker("b", 0.8).x[:, 0, 0]
     wanted = float((gone[1:] ** 2).mean())
     assert simple["constant_velocity"]["b"]["mean"] == pytest.approx(wanted, rel=1e-9)
@@ -66,17 +66,16 @@ def test_errors_are_means_over_people() -> None:
             "task": "baselines",
             "desired": np.nan,
             "horizon": 1.0,
-            "constant_velocity": {f"r{i}": one},
-            "preferred": {f"r{i}": one},
+            "errors": {name: {f"r{i}": one} for name in SIMPLE},
         }
         for i, one in enumerate(runs)
     ]
-    study = Walking(WalkingStudyOptions(horizons=[1.0], folds=2), pd.DataFrame(rows))
+    study = Walking(WalkingStudyOptions(horizons=[1.0], folds=2), pd.DataFrame(rows), [])
     label = LABELS["preferred"]
     assert study.costs("direction", 1.0)[label].mean() == 1.0
     assert study.costs("direction", 1.0, "end")[label].mean() == 0.75
-    both = [(label, LABELS["constant_velocity"])]
-    same = differences(study.costs("direction", 1.0), both, 0).iloc[0]
+    compared = [(label, LABELS["constant_velocity"])]
+    same = differences(study.costs("direction", 1.0), compared, 0).iloc[0]
     assert (same["difference"], same["low"], same["high"]) == (0, 0, 0)
 
 
