@@ -20,8 +20,9 @@ from nnode.model.formula import crowd_of
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.kernels import crowds
 from tests.builders import social_forces, straight
-from tests.simulation.fused.compare import difference
-from tests.simulation.fused.test_crowd import gradient
+from tests.simulation.fused.compare import compare, difference, gradient
+
+DT = 0.02
 
 
 @cache
@@ -123,49 +124,41 @@ def hall(n: int, samples: int = 3, dt: float = 0.04, walls: int = 2) -> Batch:
     return collate(items)
 
 
+A, MASS = 3.0, 2.0
+
+
+def omitted(batch: Batch, decay: float = 0.05, **options: float) -> float:
+    """The largest error of a person's acceleration, m/s², by partners beyond a cutoff."""
+    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0, B=decay, mass=MASS))
+    with torch.no_grad():
+        v = FusedSolver(batch.dt, **options)(model, batch).v
+        exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
+    assert v is not None
+    assert exact is not None
+    return float((v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt)
+
+
 @pytest.mark.parametrize("cutoff_error", [1e-3, 1e-6, 1e-10])
 def test_the_bound_holds(cutoff_error: float) -> None:
-    A, mass, n = 3.0, 2.0, 300
-    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0, mass=mass))
     # wall points would be averaged over their own number: one bound at a time
     for walls in (False, True):
-        batch = hall(n, walls=2 * walls)
-        with torch.no_grad():
-            v = FusedSolver(batch.dt, cutoff_error=cutoff_error)(model, batch).v
-            exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
-        assert v is not None
-        assert exact is not None
-        away = (v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt
+        error = omitted(hall(300, walls=2 * walls), cutoff_error=cutoff_error)
         # pairs and walls are two means, each within the bound
-        assert away <= (1 + walls) * cutoff_error * A / mass + 1e-12
+        assert error <= (1 + walls) * cutoff_error * A / MASS + 1e-12
         if cutoff_error == 1e-3:
-            assert away > 0  # something was left out
+            assert error > 0  # something was left out
 
 
 @pytest.mark.parametrize("cutoff", [0.8, 1.5])
 def test_the_bound_of_a_given_distance(cutoff: float) -> None:
-    A, decay, mass = 3.0, 0.1, 2.0
-    batch = hall(40, walls=0)  # small crowds have a cutoff where one is given
-    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0, B=decay, mass=mass))
-    with torch.no_grad():
-        v = FusedSolver(batch.dt, cutoff=cutoff, cutoff_error=0)(model, batch).v
-        exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
-    assert v is not None
-    assert exact is not None
-    away = (v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt
-    assert 0 < away < math.exp((0.5 - cutoff) / decay) * A / mass
+    # small crowds have a cutoff where one is given
+    error = omitted(hall(40, walls=0), decay=0.1, cutoff=cutoff, cutoff_error=0)
+    assert 0 < error < math.exp((0.5 - cutoff) / 0.1) * A / MASS
 
 
-@pytest.mark.thorough  # compiled for
-def test_no_error_is_everybody() -> None:
-    batch = hall(crowds.LISTS_FROM + 20)
-    model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0))
-    with torch.no_grad():
-        exact = TorchdiffeqSolver("euler", "discrete")(model, batch).x
-        for error, same in ((0.0, True), (1e-3, False)):
-            found = FusedSolver(batch.dt, cutoff_error=error)(model, batch).x
-            away = float((found - exact)[batch.valid].abs().max())
-            assert (away < 1e-13) is same
+def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
+    # the force on one person, not divided by the number of people
+    assert omitted(hall(2000, walls=0)) * MASS * 2000 < 1e-6 * A
 
 
 @pytest.mark.parametrize(
@@ -206,20 +199,6 @@ def test_models_that_cannot_have_a_cutoff() -> None:
         assert torch.equal(solver(alone, batch).x, FusedSolver()(alone, batch).x)
 
 
-def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
-    # the force on one person, not divided by the number of people
-    A, n = 3.0, 2000
-    batch = hall(n, walls=0)
-    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0))
-    with torch.no_grad():
-        law = crowds.supports(model, batch)
-        assert law is not None
-        v = crowds.simulate(model, law, batch, 1)[..., 2:]
-        exact = crowds.simulate(model, law, batch, 1, cutoff_error=0)[..., 2:]
-    away = (v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt
-    assert away * n < 1e-6 * A
-
-
 def test_the_formula_of_the_bound() -> None:
     for reach, decay, error in ((0.5, 0.05, 1e-10), (0.25, 0.1, 1e-3)):
         c = crowds.cutoff_distance(reach, decay, error)
@@ -231,26 +210,21 @@ def test_the_formula_of_the_bound() -> None:
 def test_lists_give_the_gradient(walls: bool) -> None:
     batch = hall(crowds.LISTS_FROM + 20)
     model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0, walls=walls))
-    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
-    for threads in (1, 2):
-        found, own = gradient(model, FusedSolver(0.02, threads), batch)
-        mask = batch.valid[..., None].expand_as(exact.x)
-        torch.testing.assert_close(found.x[mask], exact.x[mask], rtol=0, atol=1e-9)
-        assert difference(own, wanted) < 1e-8
-        # the lists were used, and a cutoff that reaches everybody leaves nothing out
-        assert (found.x[mask] != exact.x[mask]).any()
-    _, own = gradient(model, FusedSolver(0.02, cutoff=100.0), batch)
-    assert difference(own, wanted) < 1e-10
+    compare(model, batch, DT, FusedSolver(DT), FusedSolver(DT, 2), limit=1e-8, rtol=0, atol=1e-9)
+    # a cutoff that reaches everybody leaves nothing out
+    compare(model, batch, DT, FusedSolver(DT, cutoff=100.0))
+    with torch.no_grad():  # the lists were used
+        assert not torch.equal(
+            FusedSolver(DT)(model, batch).x, FusedSolver(DT, cutoff=100.0)(model, batch).x
+        )
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("walls", [False, True])
 def test_lists_in_single_precision(walls: bool) -> None:
-    batch = hall(crowds.LISTS_FROM + 20)
     model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0, walls=walls))
-    _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
-    single = gradient(model.to(torch.float32), FusedSolver(0.02), batch.to(dtype=torch.float32))
-    assert difference(single[1], wanted) < 1e-4
+    batch, close = hall(crowds.LISTS_FROM + 20), {"limit": 1e-4, "rtol": 1e-4, "atol": 1e-4}
+    compare(model, batch, DT, FusedSolver(DT), single_precision=True, **close)
 
 
 def networks(oneself: bool) -> Crowd:
@@ -263,24 +237,20 @@ def networks(oneself: bool) -> Crowd:
     )
 
 
+# the gradient is compiled for as long as everything above
+@pytest.mark.parametrize("grad", [False, pytest.param(True, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("oneself", [False, True])
-def test_networks_with_a_cutoff(oneself: bool) -> None:
+def test_networks_with_a_cutoff(oneself: bool, grad: bool) -> None:
     batch, model = hall(40), networks(oneself)
-    with torch.no_grad():
-        exact = TorchdiffeqSolver("euler", "discrete", 0.02)(model, batch).x[batch.valid]
-        for cutoff, same in ((100.0, True), (2.0, False)):
-            found = FusedSolver(0.02, cutoff=cutoff)(model, batch).x[batch.valid]
-            assert (float((found - exact).abs().max()) < 1e-12) is same
-
-
-@pytest.mark.thorough  # compiled for as long as everything above
-@pytest.mark.parametrize("oneself", [False, True])
-def test_the_gradient_of_networks_with_a_cutoff(oneself: bool) -> None:
-    batch, model = hall(40), networks(oneself)
-    _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
-    for cutoff, same in ((100.0, True), (2.0, False)):
-        _, own = gradient(model, FusedSolver(0.02, cutoff=cutoff), batch)
-        assert (difference(own, wanted) < 1e-10) is same
+    solvers = [TorchdiffeqSolver("euler", "discrete", DT)]
+    solvers += [FusedSolver(DT, cutoff=cutoff) for cutoff in (100.0, 2.0)]
+    if grad:
+        exact, same, near = (gradient(model, solver, batch)[1] for solver in solvers)
+    else:
+        with torch.no_grad():
+            exact, same, near = (solver(model, batch).x[batch.valid] for solver in solvers)
+    assert difference(same, exact) < 1e-10 if grad else 1e-13
+    assert difference(near, exact) > 1e-10
 
 
 SCALE = """
