@@ -28,14 +28,14 @@ def acceleration(t: float, y: np.ndarray, strengths: np.ndarray) -> np.ndarray:
     big, k, kappa = strengths
     x, v = y[:2], y[2:]
     ahead = (GOAL - x) / np.linalg.norm(GOAL - x)
-    found = (np.linalg.norm(v) * ahead - v) / TAU
+    total = (np.linalg.norm(v) * ahead - v) / TAU
     for place in OTHERS + PACE * t:
         d = float(np.linalg.norm(x - place))
         n, touch = (x - place) / d, max(2 * R - d, 0.0)
         along = np.array([-n[1], n[0]])
         push = (big * np.exp((2 * R - d) / B) + k * touch) * n
-        found += (push + kappa * touch * ((PACE - v) @ along) * along) / 3
-    return found
+        total += (push + kappa * touch * ((PACE - v) @ along) * along) / 3
+    return total
 
 
 def integrated(change: np.ndarray, steps: int, contact: float) -> np.ndarray:
@@ -79,22 +79,22 @@ def run(steps: int, contact: float) -> RunAlone:
     ).double()
     window = torch.zeros(1, dtype=torch.long)
     around = Surroundings(system.scene(batch), batch.x, batch.v, window, window, SECONDS / steps)
-    own = {name: p.detach()[None] for name, p in system.named_parameters()}
+    values = {name: p.detach()[None] for name, p in system.named_parameters()}
     start = torch.cat([batch.x[0], batch.v[0]], -1)
-    states = PersonAlone(around, system, own).simulated(start, steps)[:, 0]
+    states = PersonAlone(around, system, values).simulated(start, steps)[:, 0]
     return RunAlone(around, system, states)
 
 
 def errors(steps: int, contact: float) -> np.ndarray:
     """Of the responses to each change, the largest by the size of the response."""
-    one = run(steps, contact)
-    by_start, by_push = (part[0].numpy() for part in one.unit_responses())
-    columns = [one.of_people(field)[0].numpy() for field in one.parameters([1e-4] * 3)]
+    linear = run(steps, contact)
+    by_start, by_push = (part[0].numpy() for part in linear.unit_responses())
+    columns = [linear.of_people(field)[0].numpy() for field in linear.parameters([1e-4] * 3)]
     columns.append(np.concatenate([pushed(t) for t in np.linspace(0.0, SECONDS, steps + 1)]))
-    found = [*np.moveaxis(by_start, -1, 0), *(by_push @ column for column in columns)]
+    responses = [*np.moveaxis(by_start, -1, 0), *(by_push @ column for column in columns)]
     small = 1e-5
     away = []
-    for unit, response in zip(np.eye(8), found, strict=True):
+    for unit, response in zip(np.eye(8), responses, strict=True):
         after, before = (integrated(s * small * unit, steps, contact) for s in (1, -1))
         wanted = (after - before) / (2 * small)
         away.append(np.abs(response - wanted).max() / np.abs(wanted).max())

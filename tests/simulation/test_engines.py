@@ -153,21 +153,21 @@ def platoons(numbers: tuple[int, ...] = (4, 2, 3)) -> Batch:
 def lane_of(law: str, leader: str, *effects: str) -> Traffic:
     chosen = [{"name": e, **EFFECTS.get(e, {})} for e in effects]
     if law in CAR_FOLLOWING_LAWS:
-        own = {**CAR_FOLLOWING_LAWS[law], "remembered": 4} if law == "newell" else law
-        found = model(own, *chosen, leader=leader)
+        own_law = {**CAR_FOLLOWING_LAWS[law], "remembered": 4} if law == "newell" else law
+        system = model(own_law, *chosen, leader=leader)
     elif law in OWN:
         given = dict(OWN[law])
-        more = {"network": given.pop("network")} if "network" in given else {}
-        found = model(given, *chosen, leader=leader, **more)
+        network = {"network": given.pop("network")} if "network" in given else {}
+        system = model(given, *chosen, leader=leader, **network)
     else:
         built = build_model({"name": law, "leader": leader, "effects": chosen, **PAPER[law]})
         assert isinstance(built, Traffic)
-        found = built
+        system = built
     with torch.no_grad():  # nothing stays at a kink, or at the neutral value of a network
-        for i, p in enumerate(found.parameters()):
+        for i, p in enumerate(system.parameters()):
             if p.ndim:
                 p.add_(0.05 * torch.cos(torch.arange(p.numel()) + i).reshape(p.shape))
-    return found
+    return system
 
 
 def weights(batch: Batch, states: int) -> Tensor:
@@ -258,13 +258,15 @@ def check(system: System, batch: Batch, method: str, *engines: Any) -> None:
     states, wanted = with_slopes(exact, system, batch, method)
     assert wanted["x"].abs().max() > 0
     for engine in engines:
-        found, own = (
+        simulated, slopes = (
             engine(system, batch, method)
             if engine is by_tangents
             else with_slopes(engine, system, batch, method)
         )
-        torch.testing.assert_close(found[batch.valid], states[batch.valid], rtol=1e-12, atol=1e-11)
-        for name, slope in own.items():
+        torch.testing.assert_close(
+            simulated[batch.valid], states[batch.valid], rtol=1e-12, atol=1e-11
+        )
+        for name, slope in slopes.items():
             size = float(wanted[name].abs().max())
             away = float((slope - wanted[name]).abs().max())
             # of cancelling sums rounding remains, in units of the largest part of the gradient
@@ -274,14 +276,14 @@ def check(system: System, batch: Batch, method: str, *engines: Any) -> None:
 def cases(laws: Iterable[str]) -> list[Any]:
     """Laws with the methods that they have: a map has no stages in between. Large networks are
     formulas like small ones."""
-    found = []
+    rows = []
     for law in laws:
         for method in METHODS:
             large = law in ("n4", "n10", "a4", "a10") and method != "rk4"
             if not (method == "rk4" and _is_map(law)):
                 marks = [pytest.mark.thorough] if large else []
-                found.append(pytest.param(law, method, marks=marks))
-    return found
+                rows.append(pytest.param(law, method, marks=marks))
+    return rows
 
 
 #: Effects that act on each other, and several memories.
@@ -300,7 +302,7 @@ def _is_map(law: str, *effects: str) -> bool:
 
 def with_effects() -> list[Any]:
     """One effect of each kind on a law of each order."""
-    found = []
+    rows = []
     for law, order in (("lin", 1), ("idm", 2)):
         for effect in CATALOGUE.of("traffic", every=True):
             if order not in effect.rules:
@@ -310,8 +312,8 @@ def with_effects() -> list[Any]:
                     continue
                 often = method in ("rk4", "ballistic" if effect.name == "pure_delay" else "")
                 marks = [] if often else [pytest.mark.thorough]
-                found.append(pytest.param(law, effect.name, method, marks=marks))
-    return found + [(law, effects, "euler") for law, effects in TOGETHER]
+                rows.append(pytest.param(law, effect.name, method, marks=marks))
+    return rows + [(law, effects, "euler") for law, effects in TOGETHER]
 
 
 @pytest.fixture
@@ -352,28 +354,28 @@ def test_compiled_runs_and_tangents(law: str, method: str) -> None:
 
 def room() -> Batch:
     """Crowds of one to nine people, of different duration, with none to three walls."""
-    found = []
+    crowds = []
     for n, walls, samples in ((6, 1, 6), (9, 2, 4), (1, 3, 6), (2, 0, 6)):
         draw = np.random.default_rng(n)
         x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
         wish = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
         group = tuple("ab"[i % 2] for i in range(n))
-        more = {"walls": WALLS[:walls], "preferred": wish, "group": group}
-        found.append(straight(x, v, samples, 0.04, name=f"{n}", **more))
-    return collate(found)
+        fields = {"walls": WALLS[:walls], "preferred": wish, "group": group}
+        crowds.append(straight(x, v, samples, 0.04, name=f"{n}", **fields))
+    return collate(crowds)
 
 
 def crowd_of(law: str, *effects: str) -> System:
     chosen = [{"name": e, **CROWD_EFFECTS[e]} for e in effects]
     if law in FORCES:
         return build_model({**model_options({"name": law, **FORCES[law]}), "effects": chosen}, 3)
-    own = OWN_FORCES.get(law) or PEDESTRIAN_LAWS[law]
-    options = model_options({"term": "formula", "name": law, "law": own})
-    found = build_model({**options, "desired": "direction", "effects": chosen})
+    own_law = OWN_FORCES.get(law) or PEDESTRIAN_LAWS[law]
+    options = model_options({"term": "formula", "name": law, "law": own_law})
+    system = build_model({**options, "desired": "direction", "effects": chosen})
     if law == "ttc":  # milder, so that nobody is thrown out of the room
         with torch.no_grad():
-            found.terms[0].k.fill_(0.2)  # type: ignore[union-attr, operator]
-    return found
+            system.terms[0].k.fill_(0.2)  # type: ignore[union-attr, operator]
+    return system
 
 
 @pytest.mark.parametrize(

@@ -127,8 +127,8 @@ def test_cost_and_discrete_gradient_in_traffic(name: str, leader: str) -> None:
     def cost(u: np.ndarray) -> np.ndarray:
         return traffic_loop(speed, item, u, 10, leader == "measured")
 
-    found, slope = gradient(model, collate([item]), "discrete", 0.02)
-    assert found == pytest.approx(cost(flat(model)).real, rel=1e-10)
+    simulated_cost, slope = gradient(model, collate([item]), "discrete", 0.02)
+    assert simulated_cost == pytest.approx(cost(flat(model)).real, rel=1e-10)
     expected = complex_gradient(cost, flat(model))
     np.testing.assert_allclose(slope, expected, rtol=1e-10, atol=1e-10 * abs(expected).max())
 
@@ -139,8 +139,8 @@ def test_cost_and_discrete_gradient_in_crowds() -> None:
     item = replace(item, walls=None, x=shaken)
     model = people()
     expected = complex_gradient(lambda u: social_force_loop(item, u, 5), flat(model))
-    found, slope = gradient(model, collate([item]), "discrete", 0.04)
-    assert found == pytest.approx(social_force_loop(item, flat(model), 5).real, rel=1e-9)
+    simulated_cost, slope = gradient(model, collate([item]), "discrete", 0.04)
+    assert simulated_cost == pytest.approx(social_force_loop(item, flat(model), 5).real, rel=1e-9)
     assert abs(expected).min() > 0
     # the package smooths distances at 1e-6 m, which changes them by 1e-12 of a square metre
     np.testing.assert_allclose(slope, expected, rtol=1e-9)

@@ -131,9 +131,9 @@ def test_without_gradient_nothing_changes(people: list[Sequence]) -> None:
     for name in ("sf", "nn"):
         batch, model = collate(people), Crowd(MODELS[name]())
         with torch.no_grad():
-            found = FusedSolver(DT)(model, batch).x
-        assert not found.requires_grad
-        torch.testing.assert_close(found, FusedSolver(DT)(model, batch).x, rtol=1e-14, atol=1e-14)
+            x = FusedSolver(DT)(model, batch).x
+        assert not x.requires_grad
+        torch.testing.assert_close(x, FusedSolver(DT)(model, batch).x, rtol=1e-14, atol=1e-14)
 
 
 def test_a_blow_up_is_reported() -> None:
@@ -173,8 +173,8 @@ def test_what_is_covered(people: list[Sequence]) -> None:
     alone.neighbours = "measured"
     assert not compiled.supports(alone)
     # what sums run over is one for all of them, and only networks' may be over oneself
-    both = [*MODELS["nn_self"](), CATALOGUE.effects["alignment"](c=0.2)]
-    assert not compiled.supports(Crowd(both))
+    terms = [*MODELS["nn_self"](), CATALOGUE.effects["alignment"](c=0.2)]
+    assert not compiled.supports(Crowd(terms))
     batch.destination.requires_grad_()
     assert not compiled.supports(Crowd(MODELS["sf"]()), batch)
 
@@ -198,15 +198,15 @@ def test_loops_are_vector_code(name: str) -> None:
     source = CrowdSource(law)
     module = compiled.compiled(source)
     for kind in (np.float64, np.float32):
-        room, q = np.ones(module.ROWS * SIZE, kind), np.ones(len(source.uniform), kind)
+        buffer, q = np.ones(module.ROWS * SIZE, kind), np.ones(len(source.uniform), kind)
         loops = ("law_others_vjp", "law_points_vjp", "slopes_others", "slopes_points")
-        divide = [getattr(module, one) for one in loops if hasattr(module, one)]
+        divide = [getattr(module, name) for name in loops if hasattr(module, name)]
         assert len(divide) == 2
         for function in divide:
             if function.__name__.startswith("law"):
-                function(room, 0, 32, q, kind(0), kind(1), 0, np.zeros(len(q)))
+                function(buffer, 0, 32, q, kind(0), kind(1), 0, np.zeros(len(q)))
             else:
-                function(room, *(np.ones(32, kind) for _ in range(3)), 32, kind(1))
+                function(buffer, *(np.ones(32, kind) for _ in range(3)), 32, kind(1))
             text = function.inspect_asm(function.signatures[-1])
             assert re.findall(PACKED[platform.machine()], text), function.__name__
 

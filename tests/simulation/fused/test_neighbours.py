@@ -61,23 +61,30 @@ def near(a: np.ndarray, b: np.ndarray, cutoff: float) -> set[tuple[int, int]]:
     return {(int(i), int(j)) for i, j in np.argwhere(away < cutoff**2)}
 
 
+def pairs_of(x: np.ndarray, cutoff: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """The order of people in the cells, pairs of places in it, and the number of those that
+    count."""
+    cells = neighbours().grid(x[:, 0], x[:, 1], cutoff)
+    assert cells[4] * cells[5] <= 4 * len(x) + 16
+    order, cell, start = neighbours().sort(x[:, 0], x[:, 1], cells)
+    y, small = x[order].T, np.empty((2, 1), np.int32)
+    return order, *neighbours().people_near(y[0], y[1], cells, cell, start, cutoff, small)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("cutoff", [0.7, 1.0, 1.65, 100.0])
 @pytest.mark.parametrize("name", PLACES)
 def test_all_pairs_once(name: str, cutoff: float) -> None:
     x = arrangement(name)
-    cells = neighbours().grid(x[:, 0], x[:, 1], cutoff)
-    assert cells[4] * cells[5] <= 4 * len(x) + 16
-    order, cell, start = neighbours().sort(x[:, 0], x[:, 1], cells)
+    order, pairs, number = pairs_of(x, cutoff)
     assert sorted(order) == list(range(len(x)))
-    y, room = x[order], np.empty((2, 1), np.int32)
-    pairs, number = neighbours().people_near(y[:, 0], y[:, 1], cells, cell, start, cutoff, room)
-    found = [tuple(sorted((order[i], order[j]))) for i, j in pairs[:, :number].T]
-    assert len(set(found)) == len(found)
-    assert set(found) == {pair for pair in near(x, x, cutoff) if pair[0] < pair[1]}
-    both, twice = neighbours().both_ways(pairs, number)
+    indices = [tuple(sorted((order[i], order[j]))) for i, j in pairs[:, :number].T]
+    assert len(set(indices)) == len(indices)
+    assert set(indices) == {pair for pair in near(x, x, cutoff) if pair[0] < pair[1]}
+    directed, twice = neighbours().both_ways(pairs, number)
     assert twice == 2 * number
-    assert {(j, i) for i, j in both[:, :twice].T} == {(i, j) for i, j in both[:, :twice].T}
+    directed = {(int(i), int(j)) for i, j in directed[:, :twice].T}
+    assert {(j, i) for i, j in directed} == directed
 
 
 @pytest.mark.thorough
@@ -87,27 +94,20 @@ def test_people_and_wall_points(name: str, points: str) -> None:
     x, wall, cutoff = arrangement(name), arrangement(points, 80) + np.array([1.0, 0.5]), 1.4
     cells = neighbours().grid(wall[:, 0], wall[:, 1], cutoff)
     order, _, start = neighbours().sort(wall[:, 0], wall[:, 1], cells)
-    there, room = wall[order], np.empty((2, 1), np.int32)
+    placed, pairs_buffer = wall[order], np.empty((2, 1), np.int32)
     pairs, number = neighbours().points_near(
-        x[:, 0], x[:, 1], there[:, 0], there[:, 1], cells, start, cutoff, room
+        x[:, 0], x[:, 1], placed[:, 0], placed[:, 1], cells, start, cutoff, pairs_buffer
     )
-    found = [(i, int(order[p])) for i, p in pairs[:, :number].T]
-    assert len(set(found)) == len(found)
-    assert set(found) == near(x, wall, cutoff)
+    indices = [(i, int(order[p])) for i, p in pairs[:, :number].T]
+    assert len(set(indices)) == len(indices)
+    assert set(indices) == near(x, wall, cutoff)
 
 
 def test_pairs_grow_with_people() -> None:
     # at one person per square metre, half of pi cutoff^2 partners each
-    shares = []
-    for n in (500, 10_000):
-        x = arrangement("square", n)
-        cells = neighbours().grid(x[:, 0], x[:, 1], 1.65)
-        order, cell, start = neighbours().sort(x[:, 0], x[:, 1], cells)
-        y, room = x[order], np.empty((2, 1), np.int32)
-        _, number = neighbours().people_near(y[:, 0], y[:, 1], cells, cell, start, 1.65, room)
-        shares.append(number / n)
-    assert shares[1] == pytest.approx(math.pi * 1.65**2 / 2, rel=0.05)
-    assert shares[1] / shares[0] < 1.3
+    few, many = (pairs_of(arrangement("square", n), 1.65)[2] / n for n in (500, 10_000))
+    assert many == pytest.approx(math.pi * 1.65**2 / 2, rel=0.05)
+    assert many / few < 1.3
 
 
 def hall(n: int, samples: int = 3, dt: float = 0.04, walls: int = 2) -> Batch:

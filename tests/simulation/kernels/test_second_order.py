@@ -76,8 +76,8 @@ def test_a_platoon_keeps_the_gap_of_equilibrium() -> None:
     x = np.array([0.0, gap, 2 * gap]) + v * 0.1 * np.arange(50)[:, None]
     batch = collate([lane(x, 0.1)])
     with torch.no_grad():
-        found = FusedSolver(0.01)(system, batch).x
-    np.testing.assert_allclose(found.numpy(), batch.x.numpy(), rtol=0, atol=1e-9)
+        simulated_x = FusedSolver(0.01)(system, batch).x
+    np.testing.assert_allclose(simulated_x.numpy(), batch.x.numpy(), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("effects", [[], [{"name": "relative_speed", "kappa": 0.3}]])
