@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 from matplotlib.figure import Figure
@@ -194,32 +194,15 @@ def _facts(blocks: list[Block]) -> dict[str, str]:
 
 
 def _markdown(blocks: list[Block], title: str, subtitle: str, stem: str) -> str:
-    parts = [f"# {tables.markdown(title)}"]
-    if subtitle:
-        parts.append(_without_html(subtitle))
-    for block in blocks:
-        match block:
-            case Heading(text, level):
-                parts.append(f"{'#' * level} {tables.markdown(text)}")
-            case Text(markdown):
-                parts.append(_without_html(markdown))
-            case TableBlock():
-                parts.append(f'<a id="table-{block.name}"></a>{_without_html(block.caption)}')
-                parts.append(_markdown_table(block))
-                parts.append(f"[{block.name}.csv]({block.name}.csv)")
-            case FigureBlock():
-                alt = tables.markdown(block.alt.replace("[", "(").replace("]", ")")).strip()
-                parts.append(f"![{alt}]({FIGURES}/{block.name}.png)")
-                parts.append(f'<a id="figure-{block.name}"></a>{_without_html(block.caption)}')
-            case ReplayBlock():
-                place = f"Player (in {stem}.html)"  # sites of Markdown have no such page
-                parts.append(
-                    f'<a id="figure-{block.name}"></a>{place}: {_without_html(block.caption)}'
-                )
-    if facts := _facts(blocks):
-        lines = [f"- {name}: {tables.markdown(fact)}" for name, fact in facts.items()]
-        parts += ["---", "\n".join(lines)]
-    return "\n\n".join(parts) + "\n"
+    text = _ENVIRONMENT.get_template("page.md").render(
+        title=title,
+        subtitle=subtitle,
+        blocks=blocks,
+        stem=stem,
+        figures=FIGURES,
+        facts=_facts(blocks),
+    )
+    return text.strip() + "\n"
 
 
 def _markdown_table(block: TableBlock) -> str:
@@ -283,14 +266,7 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
             case ReplayBlock():
                 data, said = block.data()
                 add("replay", block, alt=block.alt.strip(), data=Markup(data), said=said)
-    environment = Environment(
-        loader=PackageLoader("nnode.pages", "template"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("page.html").render(
+    return _ENVIRONMENT.get_template("page.html").render(
         title=title,
         subtitle=Markup(text.renderInline(subtitle)),
         parts=parts,
@@ -298,6 +274,20 @@ def _html(blocks: list[Block], folder: Path, title: str, subtitle: str) -> str:
         contents=contents,
         facts=_facts(blocks),
     )
+
+
+_ENVIRONMENT = Environment(
+    loader=PackageLoader("nnode.pages", "template"),
+    autoescape=select_autoescape(),  # of HTML; Markdown has filters
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_ENVIRONMENT.filters |= {
+    "escaped": tables.markdown,
+    "harmless": _without_html,
+    "table": _markdown_table,
+}
 
 
 def _slug(words: str, taken: Counter[str]) -> str:

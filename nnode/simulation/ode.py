@@ -31,15 +31,8 @@ GRADIENTS = ("adjoint", "discrete")
 
 def whole_steps(func: Any, y0: Tensor, t: Tensor) -> Tensor:
     """Time grid with one step per unit between the first and the last time, in either direction."""
-    n = round(float((t[-1] - t[0]).abs()))
-    return (
-        torch.linspace(0, 1, n + 1, dtype=torch.float64, device=t.device)
-        .mul_(n)
-        .round_()
-        .mul_(1.0 if t[-1] >= t[0] else -1.0)
-        .to(t)
-        + t[0]
-    )
+    steps = torch.arange(round(float((t[-1] - t[0]).abs())) + 1)
+    return t[0] + (t[-1] - t[0]).sign() * steps.to(t)
 
 
 class Rates(nn.Module):

@@ -66,33 +66,18 @@ def test_the_other_B_does_not_give_the_printed_table() -> None:
     assert table["force_blue"][0] == pytest.approx((0.0, 2.1052), abs=HALF + 1e-5)
 
 
-def test_settings_of_networks_are_the_papers() -> None:
-    force = make_law("network_force", generator=torch.Generator().manual_seed(0))
-    _, table = six_settings(Crowd([force]))
-    assert list(table.columns) == [
-        "setting",
-        "x_blue",
-        "x_red",
-        "v_blue",
-        "v_red",
-        "force_blue",
-        "force_red",
-    ]
-    assert list(table["setting"]) == ["S1", "S2", "S3", "S4", "S5", "S6"]
+def test_settings_and_parts_of_networks() -> None:
+    force = make_law("network_force", generator=torch.Generator().manual_seed(0)).double()
+    table, *parts = (six_settings(Crowd([force]), part=part)[1] for part in (None, "pair", "wall"))
+    columns = "setting x_blue x_red v_blue v_red force_blue force_red"
+    assert list(table.columns) == columns.split()
+    assert list(table["setting"]) == [*TABLE]
     blue = [(0, 4), (0, 4), (0.01, 4), (0.01, 4), (0.5, 0), (0.5, 0)]
     assert list(table["x_blue"]) == blue
     assert list(table["x_red"]) == [(-x, -y) for x, y in blue]
     assert list(table["v_blue"]) == [(0, -1), (0, 1)] * 3
     assert set(table["v_red"]) == {(0, 1)}
-
-
-def test_networks_add_pair_and_wall() -> None:
-    force = make_law("network_force", generator=torch.Generator().manual_seed(0)).double()
-    system = Crowd([force])
-    total, pair, wall = (
-        np.array([*six_settings(system, part=part)[1]["force_red"]])
-        for part in (None, "pair", "wall")
-    )
+    total, pair, wall = (np.array([*part["force_red"]]) for part in (table, *parts))
     np.testing.assert_allclose(total, pair + wall, rtol=1e-12)
     # red of S2: x_red - x_blue = (0, -8), equal velocities
     with torch.no_grad():

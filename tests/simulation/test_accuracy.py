@@ -1,4 +1,4 @@
-"""Trajectories against plain loops and against an analytic solution.
+"""Trajectories against an analytic solution, in single precision, and models that blow up.
 
 A follower of the law Lin behind a leader at v0 has dg/dt = v0 - v0 (1 - L / g) = v0 L / g, so its
 gap is g(t) = sqrt(g(0)² + 2 v0 L t).
@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from nnode.data.sequence import collate
+from nnode.data.sequence import Sequence, collate
 from nnode.errors import SimulationError
-from nnode.model import Crowd, Traffic, make_law
+from nnode.model import Crowd, System, Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver
 from tests.builders import social_forces
+from tests.simulation.fused.compare import compare
 from tests.simulation.scenes import crowd, platoon
 
 V0, LENGTH, GAP = 20.0, 5.0, 8.0
@@ -62,61 +63,22 @@ def test_adaptive_methods_meet_their_tolerance(method: str) -> None:
     assert error[1e-10] < error[1e-5] / 1e3
 
 
-def lin(gap: float) -> float:
-    return 25.0 * (1 - 4.5 / gap)
-
-
-def log(gap: float) -> float:
-    return 25.0 * np.log(gap / 4.5)
-
-
-@pytest.mark.parametrize(("term", "law"), [("lin", lin), ("log", log)])
-def test_euler_in_traffic_is_the_plain_loop(term, law) -> None:  # type: ignore[no-untyped-def]
-    item = platoon([12.0, 30.0, 9.0], samples=5)
-    found = TorchdiffeqSolver("euler", dt=0.01)(
-        Traffic([make_law(term, v0=25.0, L=4.5)]), collate([item])
-    )
-    x = item.x[0, :, 0].copy()
-    for k in range(5):
-        np.testing.assert_allclose(found.x[k, 0, :, 0].detach(), x, rtol=1e-13)
-        for _ in range(20):
-            rate = [law(x[i + 1] - x[i]) for i in range(3)] + [25.0]
-            x = x + 0.01 * np.array(rate)
-
-
-def test_euler_in_crowds_is_the_plain_loop() -> None:
-    item = crowd(3, samples=4)
-    model = Crowd([make_law("relaxation", tau=0.5)])
-    found = TorchdiffeqSolver("euler", dt=0.05)(model, collate([item]))
-    x, v = item.x[0].copy(), item.velocity()[0].copy()
-    for k in range(4):
-        np.testing.assert_allclose(found.x[k, 0].detach(), x, rtol=1e-10)
-        np.testing.assert_allclose(found.v[k, 0].detach(), v, rtol=1e-10)
-        for _ in range(4):
-            way = item.destination - x
-            speed = np.linalg.norm(v, axis=1, keepdims=True)
-            desired = speed * way / np.linalg.norm(way, axis=1, keepdims=True)
-            x, v = x + 0.05 * v, v + 0.05 * (desired - v) / 0.5
-
-
-def test_single_precision_stays_close() -> None:
-    for model, items in (
+@pytest.mark.parametrize(
+    ("model", "item"),
+    [
         (
             Traffic([make_law("lin", v0=25.0, L=4.5)]),
-            [platoon([12.0, 30.0], samples=13, start=900.0)],
+            platoon([12.0, 30.0], samples=13, start=900.0),
         ),
-        (
-            Crowd(social_forces(A=1.0)),
-            [crowd(4)],
-        ),
-    ):
-        double = TorchdiffeqSolver("euler", dt=0.01)(model, collate(items)).x
-        single = TorchdiffeqSolver("euler", dt=0.01)(
-            model.to(torch.float32), collate(items).to(dtype=torch.float32)
-        ).x
-        # rounding of one step, 6e-8 of the position, over at most 240 steps
-        torch.testing.assert_close(single.double(), double, rtol=6e-8 * 240, atol=1e-5)
-        assert not torch.equal(single.double(), double)
+        (Crowd(social_forces(A=1.0)), crowd(4)),
+    ],
+    ids=["lane", "crowd"],
+)
+def test_single_precision_stays_close(model: System, item: Sequence) -> None:
+    # rounding of one step, 6e-8 of the position, over at most 240 steps
+    close = {"limit": 1e-3, "rtol": 6e-8 * 240, "atol": 1e-5}
+    solver = TorchdiffeqSolver("euler", "discrete", 0.01)
+    compare(model, collate([item]), 0.01, solver, single_precision=True, **close)
 
 
 def test_the_gradient_does_not_change_the_trajectory() -> None:

@@ -80,9 +80,9 @@ def test_autograd_solves_the_adjoint_equation(method, dt, gradient) -> None:  # 
     solver = TorchdiffeqSolver(method, gradient, dt, rtol=1e-10, atol=1e-10)
     cost = sequence_costs(solver(model, batch), batch).sum()
     cost.backward()
-    found = [model.terms[0].v0.grad.item(), model.terms[0].L.grad.item()]
+    by_autograd = [model.terms[0].v0.grad.item(), model.terms[0].L.grad.item()]
     assert cost.item() == pytest.approx(expected_cost, rel=1e-7)
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    np.testing.assert_allclose(by_autograd, expected, rtol=1e-6)
 
 
 def test_the_paper_s_cost_is_the_limit_of_ever_denser_samples() -> None:
@@ -108,8 +108,8 @@ def test_the_paper_s_cost_is_the_limit_of_ever_denser_samples() -> None:
         model, batch = Traffic([make_law("lin", v0=V0, L=LENGTH)]), collate([item])
         solver = TorchdiffeqSolver("rk4", "discrete", item.dt)
         sequence_costs(solver(model, batch), batch).sum().backward()
-        found = np.array([model.terms[0].v0.grad.item(), model.terms[0].L.grad.item()])
-        errors.append(abs(found - expected) / abs(expected))
+        by_autograd = np.array([model.terms[0].v0.grad.item(), model.terms[0].L.grad.item()])
+        errors.append(abs(by_autograd - expected) / abs(expected))
     # the sum over samples is a Riemann sum of the integral
     assert np.all(errors[1] < 0.02)
     np.testing.assert_allclose(errors[0] / errors[1], 2.0, rtol=0.05)

@@ -1,6 +1,6 @@
 """The linear response of people in contact, where the derivative of the social force jumps.
 
-The force of the equation, its integration by small steps and the differences are written out here.
+The force of the equation and the differences are written out here; SciPy integrates the equation.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 
 from nnode.data.sequence import Sequence, collate
 from nnode.model import Crowd, make_law
@@ -27,39 +28,31 @@ def acceleration(t: float, y: np.ndarray, strengths: np.ndarray) -> np.ndarray:
     big, k, kappa = strengths
     x, v = y[:2], y[2:]
     ahead = (GOAL - x) / np.linalg.norm(GOAL - x)
-    found = (np.linalg.norm(v) * ahead - v) / TAU
+    total = (np.linalg.norm(v) * ahead - v) / TAU
     for place in OTHERS + PACE * t:
         d = float(np.linalg.norm(x - place))
         n, touch = (x - place) / d, max(2 * R - d, 0.0)
         along = np.array([-n[1], n[0]])
         push = (big * np.exp((2 * R - d) / B) + k * touch) * n
-        found += (push + kappa * touch * ((PACE - v) @ along) * along) / 3
-    return found
+        total += (push + kappa * touch * ((PACE - v) @ along) * along) / 3
+    return total
 
 
-def integrated(change: np.ndarray, steps: int, fine: int, contact: float) -> np.ndarray:
-    """``(steps + 1, 2)`` positions by Runge and Kutta's method in small steps.
+def integrated(change: np.ndarray, steps: int, contact: float) -> np.ndarray:
+    """``(steps + 1, 2)`` positions.
 
     Args:
         change: of x, y, vx and vy at the start, of A, k and kappa, and of the size of a push.
         contact: factor of k and kappa.
     """
-    h, strengths = SECONDS / steps / fine, STRENGTHS * [1.0, contact, contact] + change[4:7]
-    y = START + change[:4]
-    found = [y[:2]]
+    strengths = STRENGTHS * [1.0, contact, contact] + change[4:7]
 
     def rate(t: float, y: np.ndarray) -> np.ndarray:
         return np.append(y[2:], acceleration(t, y, strengths) + change[7] * pushed(t))
 
-    for i in range(steps * fine):
-        t = i * h
-        k1 = rate(t, y)
-        k2 = rate(t + h / 2, y + h / 2 * k1)
-        k3 = rate(t + h / 2, y + h / 2 * k2)
-        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(t + h, y + h * k3))
-        if (i + 1) % fine == 0:
-            found.append(y[:2])
-    return np.stack(found)
+    time = np.linspace(0.0, SECONDS, steps + 1)
+    tight = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-11, "max_step": 0.01}
+    return solve_ivp(rate, (0.0, SECONDS), START + change[:4], t_eval=time, **tight).y[:2].T
 
 
 def pushed(t: float) -> np.ndarray:
@@ -86,23 +79,23 @@ def run(steps: int, contact: float) -> RunAlone:
     ).double()
     window = torch.zeros(1, dtype=torch.long)
     around = Surroundings(system.scene(batch), batch.x, batch.v, window, window, SECONDS / steps)
-    own = {name: p.detach()[None] for name, p in system.named_parameters()}
+    values = {name: p.detach()[None] for name, p in system.named_parameters()}
     start = torch.cat([batch.x[0], batch.v[0]], -1)
-    states = PersonAlone(around, system, own).simulated(start, steps)[:, 0]
+    states = PersonAlone(around, system, values).simulated(start, steps)[:, 0]
     return RunAlone(around, system, states)
 
 
 def errors(steps: int, contact: float) -> np.ndarray:
     """Of the responses to each change, the largest by the size of the response."""
-    one = run(steps, contact)
-    by_start, by_push = (part[0].numpy() for part in one.unit_responses())
-    columns = [one.of_people(field)[0].numpy() for field in one.parameters([1e-4] * 3)]
+    linear = run(steps, contact)
+    by_start, by_push = (part[0].numpy() for part in linear.unit_responses())
+    columns = [linear.of_people(field)[0].numpy() for field in linear.parameters([1e-4] * 3)]
     columns.append(np.concatenate([pushed(t) for t in np.linspace(0.0, SECONDS, steps + 1)]))
-    found = [*np.moveaxis(by_start, -1, 0), *(by_push @ column for column in columns)]
-    fine, small = 400 // steps, 1e-5
+    responses = [*np.moveaxis(by_start, -1, 0), *(by_push @ column for column in columns)]
+    small = 1e-5
     away = []
-    for unit, response in zip(np.eye(8), found, strict=True):
-        after, before = (integrated(s * small * unit, steps, fine, contact) for s in (1, -1))
+    for unit, response in zip(np.eye(8), responses, strict=True):
+        after, before = (integrated(s * small * unit, steps, contact) for s in (1, -1))
         wanted = (after - before) / (2 * small)
         away.append(np.abs(response - wanted).max() / np.abs(wanted).max())
     return np.array(away)

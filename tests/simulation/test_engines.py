@@ -7,7 +7,8 @@ Crowds are always compiled.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,14 +17,14 @@ import torch
 from torch import Tensor
 
 from nnode.app.python.inputs import model_options
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.model import System, Traffic, build_model
 from nnode.model.effects import CATALOGUE
 from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS
 from nnode.model.steps import METHODS
 from nnode.simulation import FusedSolver, TorchdiffeqSolver, Trajectory
 from nnode.simulation.kernels import lanes
-from tests.builders import straight
+from tests.builders import lane, straight
 from tests.model.effects.test_crowd_effects import VALUES
 from tests.model.following import model
 from tests.simulation.fused.compare import RungeKutta
@@ -85,28 +86,12 @@ EFFECTS: dict[str, dict[str, Any]] = {
 #: Laws that are compiled in the thorough tests: one of each kind.
 COMPILED = ("lin", "speed_ahead", "state", "beside", "ovm", "fvdm", "helly", "gipps", "a2")
 
+SOCIAL = {"term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1}
 #: Forces of the paper, as options of the model.
 FORCES: dict[str, dict[str, Any]] = {
-    "sf": {"term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1},
-    "sf_opposing": {
-        "term": "social_force",
-        "A": 2.0,
-        "k": 30.0,
-        "kappa": 9.0,
-        "B": 0.1,
-        "r": 0.3,
-        "mass": 2.0,
-        "tau": 0.7,
-        "opposing_wall_friction": True,
-    },
-    "sf_open": {
-        "term": "social_force",
-        "A": 2.0,
-        "k": 30.0,
-        "kappa": 9.0,
-        "B": 0.1,
-        "walls": False,
-    },
+    "sf": SOCIAL,
+    "sf_opposing": {**SOCIAL, "r": 0.3, "mass": 2.0, "tau": 0.7, "opposing_wall_friction": True},
+    "sf_open": {**SOCIAL, "walls": False},
     "nn": {"term": "network_force"},
     "nn_open": {"term": "network_force", "hidden": 3, "mass": 2.0, "walls": False},
     "nn_self": {"term": "network_force", "self_interaction": True},
@@ -149,130 +134,113 @@ OFTEN = ("sf", "nn", "nn_self", "cfsm", "sums")
 WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 2.5, 0.0, 2.5], [1.0, 0.5, 2.5, 2.0]])
 
 
-def platoons() -> Batch:
-    """Three platoons of different numbers of vehicles and of samples, in a wave; of cars and
+def platoons(numbers: tuple[int, ...] = (4, 2, 3)) -> Batch:
+    """Platoons of different numbers of vehicles and of samples, in a wave; of cars and
     trucks."""
-    found = []
-    for i, n in enumerate((4, 2, 3)):
-        t = 0.1 * torch.arange(6 - i, dtype=torch.float64)[:, None]
-        late = t - 0.3 * torch.arange(n - 1, -1, -1)
-        x = 12 * late + 2 * torch.sin(late + i) + (22.3 + i) * torch.arange(n)
-        v = 12 + 2 * torch.cos(late + i)
-        found.append(
-            Sequence(
-                name=f"p{i}",
-                recording="r",
-                time=t[:, 0].numpy(),
-                x=x[..., None].numpy(),
-                v=v[..., None].numpy(),
-                length=torch.where(torch.arange(n) == 1, 9.0, 4.0).numpy(),
-                kind=tuple("truck" if j == 1 else "car" for j in range(n)),
-            )
+    items = []
+    for i, n in enumerate(numbers):
+        late = 0.1 * np.arange(6 - i)[:, None] - 0.3 * np.arange(n)[::-1]
+        x = 12 * late + 2 * np.sin(late + i) + (22.3 + i) * np.arange(n)
+        truck = np.arange(n) == 1
+        kind = tuple(np.where(truck, "truck", "car").tolist())
+        length = np.where(truck, 9.0, 4.0)
+        items.append(
+            lane(x, 0.1, v=12 + 2 * np.cos(late + i), name=f"p{i}", length=length, kind=kind)
         )
-    return collate(found)
+    return collate(items)
 
 
 def lane_of(law: str, leader: str, *effects: str) -> Traffic:
     chosen = [{"name": e, **EFFECTS.get(e, {})} for e in effects]
     if law in CAR_FOLLOWING_LAWS:
-        own = {**CAR_FOLLOWING_LAWS[law], "remembered": 4} if law == "newell" else law
-        found = model(own, *chosen, leader=leader)
+        own_law = {**CAR_FOLLOWING_LAWS[law], "remembered": 4} if law == "newell" else law
+        system = model(own_law, *chosen, leader=leader)
     elif law in OWN:
         given = dict(OWN[law])
-        more = {"network": given.pop("network")} if "network" in given else {}
-        found = model(given, *chosen, leader=leader, **more)
+        network = {"network": given.pop("network")} if "network" in given else {}
+        system = model(given, *chosen, leader=leader, **network)
     else:
         built = build_model({"name": law, "leader": leader, "effects": chosen, **PAPER[law]})
         assert isinstance(built, Traffic)
-        found = built
+        system = built
     with torch.no_grad():  # nothing stays at a kink, or at the neutral value of a network
-        for i, p in enumerate(found.parameters()):
+        for i, p in enumerate(system.parameters()):
             if p.ndim:
                 p.add_(0.05 * torch.cos(torch.arange(p.numel()) + i).reshape(p.shape))
-    return found
-
-
-def moving(batch: Batch) -> tuple[Batch, Tensor, Tensor]:
-    """The same batch with places and speeds of the start of which a gradient can be taken."""
-    x, v = (t[0].clone().requires_grad_() for t in (batch.x, batch.v))
-    both = [torch.cat([start[None], t[1:]]) for start, t in ((x, batch.x), (v, batch.v))]
-    return Batch(**{**vars(batch), "x": both[0], "v": both[1]}), x, v
+    return system
 
 
 def weights(batch: Batch, states: int) -> Tensor:
     """``(K, B, N, M)`` different weights of all valid states."""
     shape = (*batch.x.shape[:3], states)
-    found = torch.cos(torch.arange(batch.x[..., 0].numel() * states).double()).reshape(shape)
-    return torch.where(batch.valid[..., None], found, 0.0)
+    values = torch.cos(torch.arange(batch.x[..., 0].numel() * states).double()).reshape(shape)
+    return torch.where(batch.valid[..., None], values, 0.0)
 
 
-def exact(system: System, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
-    """States at the samples, and the gradient of their weighted sum, by autograd."""
-    scene, x, v = moving(batch)
-    dt = batch.dt / SUBSTEPS
-    solver = RungeKutta(SUBSTEPS) if method == "rk4" else TorchdiffeqSolver(method, "discrete", dt)
-    states = _states(solver(system, scene))
-    return states, _slopes(system, batch, states, x, v)
-
-
-def _states(path: Trajectory) -> Tensor:
+def states_of(path: Trajectory) -> Tensor:
+    """``(K, B, N, M)`` positions, and speeds of laws of second order."""
     return path.x if path.v is None else torch.cat([path.x, path.v], -1)
 
 
-def _slopes(
-    system: System, batch: Batch, states: Tensor, x: Tensor, v: Tensor
-) -> dict[str, Tensor]:
-    own = {name: p for name, p in system.named_parameters() if p.requires_grad}
-    total = (weights(batch, states.shape[-1]) * states).sum()
-    found = torch.autograd.grad(total, [*own.values(), x, v], allow_unused=True)
-    named = {
-        name: torch.zeros_like(p) if slope is None else slope
-        for (name, p), slope in zip({**own, "x": x, "v": v}.items(), found, strict=True)
-    }
-    if getattr(system, "leader", "") == "measured":  # the leader's places and speeds are data
-        follower = system.scene(batch).follower[..., None]
-        named |= {name: torch.where(follower, named[name], 0.0) for name in ("x", "v")}
-    return named
+def exact(system: System, batch: Batch, method: str) -> Tensor:
+    """States at the samples by automatic differentiation of PyTorch."""
+    dt = batch.dt / SUBSTEPS
+    solver = RungeKutta(SUBSTEPS) if method == "rk4" else TorchdiffeqSolver(method, "discrete", dt)
+    return states_of(solver(system, batch))
 
 
-def compiled(
-    system: System, batch: Batch, method: str, threads: int = 1
-) -> tuple[Tensor, dict[str, Tensor]]:
+def compiled(system: System, batch: Batch, method: str, threads: int = 1) -> Tensor:
     """The same by the generated code."""
-    scene, x, v = moving(batch)
-    if isinstance(system, Traffic):  # the solver refuses gradients by a leader's measured path
-        lane = lanes.supports(system, batch)
-        assert lane is not None
-        y = lanes.simulate(system, lane, scene, SUBSTEPS, method=method)[:, 0]
-        found = torch.cat([part for part in system.observe(y, scene) if part is not None], -1)
-    else:
-        solver = FusedSolver(batch.dt / SUBSTEPS, threads, method=method)
-        found = _states(solver(system, scene))
-        assert not solver.uncompiled
-    return found, _slopes(system, batch, found, x, v)
+    if isinstance(system, Traffic):
+        return by_lanes(system, batch, method)
+    solver = FusedSolver(batch.dt / SUBSTEPS, threads, method=method)
+    path = solver(system, batch)
+    assert not solver.uncompiled
+    return states_of(path)
 
 
-def threaded(system: System, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
+def threaded(system: System, batch: Batch, method: str) -> Tensor:
     """The same by two threads."""
     return compiled(system, batch, method, 2)
 
 
-def ensemble(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
-    """The same with two runs at once, whose parameters are rows of numbers; of the second one,
-    which has other parameters, nothing is returned."""
-    lane = lanes.supports(system, batch)
-    assert lane is not None
-    scene, x, v = moving(batch)
-    own = dict(system.named_parameters())
-    both = {name: torch.stack([p, 1.01 * p]) for name, p in own.items()}
-    y = lanes.simulate(system, lane, scene, SUBSTEPS, parameters=both, method=method)[:, 0]
-    found = torch.cat([part for part in system.observe(y, scene) if part is not None], -1)
-    return found, _slopes(system, batch, found, x, v)
+def by_lanes(system: Traffic, batch: Batch, method: str, **options: Any) -> Tensor:
+    """The first run. The solver itself refuses gradients by a leader's measured path."""
+    assert system.formula is not None
+    y = lanes.simulate(system, system.formula, batch, SUBSTEPS, method=method, **options)[:, 0]
+    return states_of(Trajectory(*system.observe(y, batch)))
+
+
+def ensemble(system: Traffic, batch: Batch, method: str) -> Tensor:
+    """The same with two runs at once, whose parameters are rows of numbers; nothing is returned of
+    the second run, which has other parameters."""
+    pairs = {name: torch.stack([p, 1.01 * p]) for name, p in system.named_parameters()}
+    return by_lanes(system, batch, method, parameters=pairs)
+
+
+def with_slopes(
+    engine: Callable[..., Tensor], system: System, batch: Batch, *args: Any
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """States, and the gradient of their weighted sum by parameters and by the start."""
+    start = {name: getattr(batch, name)[0].clone().requires_grad_() for name in "xv"}
+    moving = {name: torch.cat([t[None], getattr(batch, name)[1:]]) for name, t in start.items()}
+    states = engine(system, replace(batch, **moving), *args)
+    inputs = {name: p for name, p in system.named_parameters() if p.requires_grad} | start
+    total = (weights(batch, states.shape[-1]) * states).sum()
+    slopes = torch.autograd.grad(total, [*inputs.values()], allow_unused=True)
+    named = {
+        name: torch.zeros_like(p) if slope is None else slope
+        for (name, p), slope in zip(inputs.items(), slopes, strict=True)
+    }
+    if getattr(system, "leader", "") == "measured":  # the leader's places and speeds are data
+        follower = system.scene(batch).follower[..., None]
+        named |= {name: torch.where(follower, named[name], 0.0) for name in start}
+    return states, named
 
 
 def by_tangents(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
     """The same by the derivatives of all states, of the parameters alone."""
-    lane = lanes.supports(system, batch)
+    lane = system.formula
     assert lane is not None
     own = {name: torch.zeros_like(p) for name, p in system.named_parameters() if p.requires_grad}
     owned = {symbol: at for symbol, at in lane.owned.items() if at[0] in own}
@@ -282,18 +250,23 @@ def by_tangents(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dic
         weight = torch.where(system.scene(batch).follower[..., None], weight, 0.0)
     for slope, (name, place, _) in zip(slopes, owned.values(), strict=True):
         own[name].view(-1)[place] = (weight * slope[..., : system.order]).sum()
-    found = torch.cat([part for part in system.observe(y, batch) if part is not None], -1)
-    return found, own
+    return states_of(Trajectory(*system.observe(y, batch))), own
 
 
 def check(system: System, batch: Batch, method: str, *engines: Any) -> None:
     """Compare states, and every part of the gradient by itself."""
-    states, wanted = exact(system, batch, method)
+    states, wanted = with_slopes(exact, system, batch, method)
     assert wanted["x"].abs().max() > 0
     for engine in engines:
-        found, own = engine(system, batch, method)
-        torch.testing.assert_close(found[batch.valid], states[batch.valid], rtol=1e-12, atol=1e-11)
-        for name, slope in own.items():
+        simulated, slopes = (
+            engine(system, batch, method)
+            if engine is by_tangents
+            else with_slopes(engine, system, batch, method)
+        )
+        torch.testing.assert_close(
+            simulated[batch.valid], states[batch.valid], rtol=1e-12, atol=1e-11
+        )
+        for name, slope in slopes.items():
             size = float(wanted[name].abs().max())
             away = float((slope - wanted[name]).abs().max())
             # of cancelling sums rounding remains, in units of the largest part of the gradient
@@ -303,14 +276,14 @@ def check(system: System, batch: Batch, method: str, *engines: Any) -> None:
 def cases(laws: Iterable[str]) -> list[Any]:
     """Laws with the methods that they have: a map has no stages in between. Large networks are
     formulas like small ones."""
-    found = []
+    rows = []
     for law in laws:
         for method in METHODS:
             large = law in ("n4", "n10", "a4", "a10") and method != "rk4"
             if not (method == "rk4" and _is_map(law)):
                 marks = [pytest.mark.thorough] if large else []
-                found.append(pytest.param(law, method, marks=marks))
-    return found
+                rows.append(pytest.param(law, method, marks=marks))
+    return rows
 
 
 #: Effects that act on each other, and several memories.
@@ -329,7 +302,7 @@ def _is_map(law: str, *effects: str) -> bool:
 
 def with_effects() -> list[Any]:
     """One effect of each kind on a law of each order."""
-    found = []
+    rows = []
     for law, order in (("lin", 1), ("idm", 2)):
         for effect in CATALOGUE.of("traffic", every=True):
             if order not in effect.rules:
@@ -339,8 +312,8 @@ def with_effects() -> list[Any]:
                     continue
                 often = method in ("rk4", "ballistic" if effect.name == "pure_delay" else "")
                 marks = [] if often else [pytest.mark.thorough]
-                found.append(pytest.param(law, effect.name, method, marks=marks))
-    return found + [(law, effects, "euler") for law, effects in TOGETHER]
+                rows.append(pytest.param(law, effect.name, method, marks=marks))
+    return rows + [(law, effects, "euler") for law, effects in TOGETHER]
 
 
 @pytest.fixture
@@ -381,28 +354,28 @@ def test_compiled_runs_and_tangents(law: str, method: str) -> None:
 
 def room() -> Batch:
     """Crowds of one to nine people, of different duration, with none to three walls."""
-    found = []
+    crowds = []
     for n, walls, samples in ((6, 1, 6), (9, 2, 4), (1, 3, 6), (2, 0, 6)):
         draw = np.random.default_rng(n)
         x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
         wish = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
         group = tuple("ab"[i % 2] for i in range(n))
-        more = {"walls": WALLS[:walls], "preferred": wish, "group": group}
-        found.append(straight(x, v, samples, 0.04, name=f"{n}", **more))
-    return collate(found)
+        fields = {"walls": WALLS[:walls], "preferred": wish, "group": group}
+        crowds.append(straight(x, v, samples, 0.04, name=f"{n}", **fields))
+    return collate(crowds)
 
 
 def crowd_of(law: str, *effects: str) -> System:
     chosen = [{"name": e, **CROWD_EFFECTS[e]} for e in effects]
     if law in FORCES:
         return build_model({**model_options({"name": law, **FORCES[law]}), "effects": chosen}, 3)
-    own = OWN_FORCES.get(law) or PEDESTRIAN_LAWS[law]
-    options = model_options({"term": "formula", "name": law, "law": own})
-    found = build_model({**options, "desired": "direction", "effects": chosen})
+    own_law = OWN_FORCES.get(law) or PEDESTRIAN_LAWS[law]
+    options = model_options({"term": "formula", "name": law, "law": own_law})
+    system = build_model({**options, "desired": "direction", "effects": chosen})
     if law == "ttc":  # milder, so that nobody is thrown out of the room
         with torch.no_grad():
-            found.terms[0].k.fill_(0.2)  # type: ignore[union-attr, operator]
-    return found
+            system.terms[0].k.fill_(0.2)  # type: ignore[union-attr, operator]
+    return system
 
 
 @pytest.mark.parametrize(
@@ -434,16 +407,18 @@ def test_the_adjoint_equation(law: str, method: str, order: int, leader: str) ->
     """torchdiffeq's adjoint approaches the gradient of the solution with the order of the method:
     a finer step by a factor of four divides its distance to that of the next one by 4**order."""
     system, batch = lane_of(law, leader), platoons()
-    found = []
-    for substeps in (1, 4, 16):
-        scene, x, v = moving(batch)
-        path = TorchdiffeqSolver(method, "adjoint", batch.dt / substeps)(system, scene)
-        slopes = _slopes(system, batch, _states(path), x, v)
-        found.append(torch.cat([slopes[name].flatten() for name in slopes]))
-    coarse, fine = (float((one - found[2]).norm()) for one in found[:2])
+
+    def adjoint(system: System, batch: Batch, substeps: int) -> Tensor:
+        return states_of(TorchdiffeqSolver(method, "adjoint", batch.dt / substeps)(system, batch))
+
+    def gradient(*args: Any) -> Tensor:
+        slopes = with_slopes(args[0], system, batch, *args[1:])[1]
+        return torch.cat([slope.flatten() for slope in slopes.values()])
+
+    *gradients, finest = (gradient(adjoint, substeps) for substeps in (1, 4, 16))
+    coarse, fine = (float((each - finest).norm()) for each in gradients)
     assert fine > 0
     # of errors c, c/r and c/r² with r = 4**order the distances to the last one have the ratio r + 1
     assert coarse / fine > 0.7 * (4**order + 1), (coarse, fine)
-    wanted = exact(system, batch, "rk4")[1]
-    away = torch.cat([wanted[name].flatten() for name in slopes]) - found[2]
-    assert away.norm() < 2 * coarse / 4**order + 1e-7 * found[2].norm()
+    away = gradient(exact, "rk4") - finest
+    assert away.norm() < 2 * coarse / 4**order + 1e-7 * finest.norm()

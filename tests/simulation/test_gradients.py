@@ -1,4 +1,4 @@
-"""Gradients of the cost against complex differentiation of plain numpy loops.
+"""The cost against plain NumPy loops, and its gradient against their complex differentiation.
 
 For a function f that is real on the real axis, Im f(u + i h) / h is its derivative without
 cancellation: h = 1e-30 gives every digit.
@@ -20,16 +20,21 @@ from nnode.simulation import TorchdiffeqSolver
 from tests.simulation.scenes import crowd, platoon
 
 HIDDEN, R, B, TAU = 4, 0.25, 0.1, 0.5
-KINDS = ("discrete", "adjoint")
 
 
-def traffic_loop(speed: Callable, item: Sequence, u: np.ndarray, steps: int) -> np.ndarray:
-    """Cost by Euler; u[0] is v0."""
+def traffic_loop(
+    speed: Callable, item: Sequence, u: np.ndarray, steps: int, measured: bool
+) -> np.ndarray:
+    """Cost by Euler; u[0] is v0, the speed of a leader that does not follow its measured path."""
     x, total = item.x[0, :, 0].astype(complex), 0.0
-    for k in range(1, item.n_samples):
-        for _ in range(steps):
-            x = x + item.dt / steps * np.append(speed(np.diff(x), u), u[0])
-        total += 0.5 * item.dt * ((x - item.x[k, :, 0]) ** 2).sum()
+    for step in range(steps * (item.n_samples - 1)):
+        if measured:  # on straight lines between its samples
+            x[-1] = np.interp(step / steps, np.arange(item.n_samples), item.x[:, -1, 0])
+        x = x + item.dt / steps * np.append(speed(np.diff(x), u), u[0])
+        k, part = divmod(step + 1, steps)
+        if part == 0:
+            error = (x - item.x[k, :, 0])[: item.n_agents - measured]
+            total += 0.5 * item.dt * (error**2).sum()
     return total
 
 
@@ -103,34 +108,42 @@ def flat(model: System, gradient: bool = False) -> np.ndarray:
     return torch.cat([value.flatten() for value in values]).numpy()
 
 
-def gradient(model: System, batch: Batch, kind: str, dt: float) -> np.ndarray:
+def gradient(model: System, batch: Batch, kind: str, dt: float) -> tuple[float, np.ndarray]:
+    """The cost and its gradient."""
     model.zero_grad()
-    solver = TorchdiffeqSolver("euler", kind, dt)
-    sequence_costs(solver(model, batch), batch).sum().backward()
-    return flat(model, gradient=True)
+    cost = sequence_costs(TorchdiffeqSolver("euler", kind, dt)(model, batch), batch).sum()
+    cost.backward()
+    return float(cost.detach()), flat(model, gradient=True)
 
 
+@pytest.mark.parametrize("leader", ["constant", "measured"])
 @pytest.mark.parametrize("name", TRAFFIC)
-def test_discrete_gradient_in_traffic(name: str) -> None:
+def test_cost_and_discrete_gradient_in_traffic(name: str, leader: str) -> None:
     make, speed = TRAFFIC[name]
     # softplus of an argument above 20 is replaced by it in torch: 2e-9 away, so gaps stay small
     item = platoon([6.0, 8.0, 5.5], samples=4, noise=1.0)
-    model = Traffic([make()])
-    expected = complex_gradient(lambda u: traffic_loop(speed, item, u, 10), flat(model))
-    found = gradient(model, collate([item]), "discrete", 0.02)
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10 * abs(expected).max())
+    model = Traffic([make()], leader=leader)
+
+    def cost(u: np.ndarray) -> np.ndarray:
+        return traffic_loop(speed, item, u, 10, leader == "measured")
+
+    simulated_cost, slope = gradient(model, collate([item]), "discrete", 0.02)
+    assert simulated_cost == pytest.approx(cost(flat(model)).real, rel=1e-10)
+    expected = complex_gradient(cost, flat(model))
+    np.testing.assert_allclose(slope, expected, rtol=1e-10, atol=1e-10 * abs(expected).max())
 
 
-def test_discrete_gradient_in_crowds() -> None:
+def test_cost_and_discrete_gradient_in_crowds() -> None:
     item = crowd(4, samples=4)
     shaken = item.x + 0.05 * np.cos(9 * np.arange(4))[:, None, None]
     item = replace(item, walls=None, x=shaken)
     model = people()
     expected = complex_gradient(lambda u: social_force_loop(item, u, 5), flat(model))
-    found = gradient(model, collate([item]), "discrete", 0.04)
+    simulated_cost, slope = gradient(model, collate([item]), "discrete", 0.04)
+    assert simulated_cost == pytest.approx(social_force_loop(item, flat(model), 5).real, rel=1e-9)
     assert abs(expected).min() > 0
     # the package smooths distances at 1e-6 m, which changes them by 1e-12 of a square metre
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    np.testing.assert_allclose(slope, expected, rtol=1e-9)
 
 
 @pytest.mark.thorough
@@ -140,17 +153,10 @@ def test_adjoint_gradient_in_crowds_deviates_at_first_order() -> None:
     batch, number = collate([crowd(3, samples=3, apart=0.35)]), np.array([32, 64, 128])
     deviation = []
     for n in number:
-        discrete, adjoint = (gradient(model, batch, kind, 0.2 / n) for kind in KINDS)
+        discrete, adjoint = (
+            gradient(model, batch, kind, 0.2 / n)[1] for kind in ("discrete", "adjoint")
+        )
         deviation.append(np.linalg.norm(adjoint - discrete) / np.linalg.norm(discrete))
     slope = np.polyfit(np.log(0.2 / number), np.log(deviation), 1)[0]
     assert 0.9 < slope < 1.1
     assert deviation[-1] < 0.05
-
-
-def test_gradient_in_single_precision() -> None:
-    batch = collate([platoon([9.0, 16.0, 7.0], noise=1.0)])
-    for kind in KINDS:
-        model = Traffic([make_law("lin", v0=21.0, L=4.5)])
-        double = gradient(model, batch, kind, 0.02)
-        single = gradient(model.to(torch.float32), batch.to(dtype=torch.float32), kind, 0.02)
-        np.testing.assert_allclose(single, double, rtol=1e-3)

@@ -62,9 +62,9 @@ def test_short_steps_follow_states_that_are_faster_than_samples() -> None:
     dt, rng = 0.2, np.random.default_rng(6)
     matrix = np.array([[0.0, 1.0, 0.0], [-3.0, -2.0, 0.5], [12.0, 0.0, -20.0]])
     push = rng.normal(size=3)
-    both = np.zeros((4, 4))
-    both[:3, :3], both[:3, 3] = matrix, push
-    exact = expm(dt * both)
+    augmented = np.zeros((4, 4))
+    augmented[:3, :3], augmented[:3, 3] = matrix, push
+    exact = expm(dt * augmented)
     errors = []
     for doublings in (0, 4):
         step, after = subdivided(np.stack([matrix, matrix])[:, None], dt, doublings)

@@ -71,9 +71,9 @@ def single(batch: Batch) -> Batch:
 
 
 def gradient(model: System, solver: object, batch: Batch) -> tuple[Tensor, Tensor]:
-    found = solver(model, batch)  # type: ignore[operator]
-    own = torch.autograd.grad(sequence_costs(found, batch).sum(), list(model.parameters()))
-    return found.x.detach(), torch.cat([part.flatten() for part in own])
+    path = solver(model, batch)  # type: ignore[operator]
+    parts = torch.autograd.grad(sequence_costs(path, batch).sum(), list(model.parameters()))
+    return path.x.detach(), torch.cat([part.flatten() for part in parts])
 
 
 @pytest.mark.thorough
@@ -86,10 +86,10 @@ def test_float32_does_not_depend_on_the_origin(case: str, kind: str) -> None:
     real = make(0.0).valid[..., None].expand_as(exact)
     assert (here - exact)[real].abs().max() < 0.01
     for shift in AWAY:
-        there, other = gradient(build(torch.float32), SOLVERS[kind], single(make(shift)))
+        shifted, other = gradient(build(torch.float32), SOLVERS[kind], single(make(shift)))
         # what is left is the rounding of the measured positions in float64, 1e-9 m at 7,000 km,
         # which can move a float32 by its last place
-        assert (there - shift - here)[real].abs().max() < 1e-3
+        assert (shifted - shift - here)[real].abs().max() < 1e-3
         torch.testing.assert_close(other, slope, rtol=1e-3, atol=1e-3)
 
 
@@ -151,15 +151,15 @@ PLACES = {"speed_zone", "slope", "obstacle", "attraction"}
 )
 def test_effects_of_places_name_places(kind: str, leader: str | None) -> None:
     domain = "crowd" if kind == "sf" else "traffic"
-    known = CATALOGUE.of(domain, every=True)  # type: ignore[arg-type]
-    offered, found = set(), set()
-    for effect in (e for e in known if e.__module__.startswith("nnode.")):
+    catalogue = CATALOGUE.of(domain, every=True)  # type: ignore[arg-type]
+    offered, dependent = set(), set()
+    for effect in (e for e in catalogue if e.__module__.startswith("nnode.")):
         with suppress(ConfigError):  # some are for laws of the other order
             model = build_model(model_options(kind, leader, [effect.name]))
             offered.add(effect.name)
             if model.depends_on_position:
-                found.add(effect.name)
-    assert found == PLACES & offered
+                dependent.add(effect.name)
+    assert dependent == PLACES & offered
 
 
 def test_a_term_that_is_code_may_name_places() -> None:
@@ -185,5 +185,5 @@ def test_a_zone_stays_where_it_is() -> None:
     assert (exact - bare).abs()[:, 0].max() > 1
     for shift, limit in ((0.0, 0.02), (4096.0, 0.2)):
         batch = single(plain(shift))
-        found = solver(zoned(shift, torch.float32), batch).x.detach() - shift
-        assert (found - exact)[:, 0].abs().max() < limit
+        near = solver(zoned(shift, torch.float32), batch).x.detach() - shift
+        assert (near - exact)[:, 0].abs().max() < limit

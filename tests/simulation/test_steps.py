@@ -12,10 +12,10 @@ from nnode.model import System, Traffic, make_law
 from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
 from nnode.model.system import Crowd
 from nnode.simulation import TorchdiffeqSolver, substeps
-from tests.simulation.scenes import crowd, platoon
+from tests.simulation.scenes import platoon
 
 #: Speeds in a lane, accelerations in a lane, accelerations of people.
-LANE, PEDESTRIAN_LAWS = Traffic([make_law("lin")]), Crowd([make_law("relaxation")])
+LANE, PEOPLE = Traffic([make_law("lin")]), Crowd([make_law("relaxation")])
 FOLLOWING = Traffic([law_from("idm", CAR_FOLLOWING_LAWS["idm"])])
 
 
@@ -28,78 +28,52 @@ def count_evaluations(system: System) -> list[int]:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(
-    ("samples", "sampling", "dt", "steps"),
+    ("method", "samples", "sampling", "dt", "evaluations"),
     [
-        (13, 0.2, 0.01, 240),  # T = 2.4 s
-        (13, 0.2, 0.002, 1200),
-        (14, 0.2, 0.2, 13),
-        (4, 0.2, 0.2 / 3, 9),
-        (11, 0.1, 0.02, 50),
-        (8, 0.3, 0.1, 21),
-        (3, 0.2, None, 200),
+        ("euler", 13, 0.2, 0.01, 240),  # T = 2.4 s
+        ("euler", 13, 0.2, 0.002, 1200),
+        ("euler", 14, 0.2, 0.2, 13),
+        ("euler", 4, 0.2, 0.2 / 3, 9),
+        ("euler", 11, 0.1, 0.02, 50),
+        ("euler", 8, 0.3, 0.1, 21),
+        ("euler", 3, 0.2, None, 200),
+        ("midpoint", 13, 0.2, 0.02, 2 * 120),
+        ("rk4", 13, 0.2, 0.02, 4 * 120),
     ],
 )
-def test_number_of_steps(dtype, samples, sampling, dt, steps) -> None:  # type: ignore[no-untyped-def]
+def test_number_of_steps(dtype, method, samples, sampling, dt, evaluations) -> None:  # type: ignore[no-untyped-def]
     model = Traffic([make_law("lin", v0=15.0)]).to(dtype)
     calls = count_evaluations(model)
     batch = collate([platoon([20.0], samples=samples, dt=sampling)]).to(dtype=dtype)
-    with torch.no_grad():
-        TorchdiffeqSolver("euler", dt=dt)(model, batch)
-    assert len(calls) == steps
-
-
-@pytest.mark.parametrize(("sampling", "steps"), [(0.04, 25), (0.0625, 25), (0.1, 50)])
-def test_default_step_of_crowds(sampling: float, steps: int) -> None:
-    model = Crowd([make_law("relaxation")])
-    calls = count_evaluations(model)
-    TorchdiffeqSolver("euler")(model, collate([crowd(2, samples=26, dt=sampling)]))
-    assert len(calls) == steps
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("method", "stages"), [("euler", 1), ("midpoint", 2), ("rk4", 4)])
-def test_the_adjoint_takes_as_many_steps_back(dtype, method, stages) -> None:  # type: ignore[no-untyped-def]
-    model = Traffic([make_law("lin", v0=15.0)]).to(dtype)
-    calls = count_evaluations(model)
-    batch = collate([platoon([20.0], samples=13)]).to(dtype=dtype)
-    trajectory = TorchdiffeqSolver(method, "adjoint", dt=0.02)(model, batch)
-    assert len(calls) == 120 * stages
+    trajectory = TorchdiffeqSolver(method, "adjoint", dt=dt)(model, batch)
+    assert len(calls) == evaluations
     sequence_costs(trajectory, batch).sum().backward()
-    assert len(calls) == 2 * 120 * stages
+    assert len(calls) == 2 * evaluations  # the adjoint takes as many steps back
 
 
 @pytest.mark.parametrize(
-    ("sampling", "dt", "number"),
+    ("system", "sampling", "dt", "number"),
     [
-        (0.2, 0.002, 100),
-        (0.2, 0.2, 1),
-        (0.2 + 3e-9, 0.02, 10),  # recorded times carry rounding errors
-        (0.30000000000000004, 0.1, 3),
-        (1 / 25, 0.01, 4),
+        (LANE, 0.2, 0.002, 100),
+        (LANE, 0.2, 0.2, 1),
+        (LANE, 0.2 + 3e-9, 0.02, 10),  # recorded times carry rounding errors
+        (LANE, 0.30000000000000004, 0.1, 3),
+        (LANE, 1 / 25, 0.01, 4),
+        # without a step, the fewest below the default
+        (LANE, 0.2, None, 100),
+        (LANE, 0.1, None, 50),
+        (LANE, 0.001, None, 1),
+        (LANE, 0.0033, None, 2),
+        (FOLLOWING, 0.1, None, 1),
+        (FOLLOWING, 0.2, None, 2),
+        (PEOPLE, 0.04, None, 1),
+        (PEOPLE, 0.0625, None, 1),
+        (PEOPLE, 0.1, None, 2),
+        (PEOPLE, 0.2, None, 4),
     ],
 )
-def test_substeps(sampling: float, dt: float, number: int) -> None:
-    assert substeps(sampling, dt, LANE) == number
-
-
-@pytest.mark.parametrize(
-    ("sampling", "system", "number"),
-    [
-        (0.2, LANE, 100),
-        (0.1, LANE, 50),
-        (0.001, LANE, 1),
-        (0.0033, LANE, 2),
-        (0.1, FOLLOWING, 1),
-        (0.2, FOLLOWING, 2),
-        (0.04, PEDESTRIAN_LAWS, 1),
-        (0.0625, PEDESTRIAN_LAWS, 1),
-        (0.2, PEDESTRIAN_LAWS, 4),
-    ],
-)
-def test_chosen_substeps_are_the_fewest_below_the_default(
-    sampling: float, system: System, number: int
-) -> None:
-    assert substeps(sampling, None, system) == number
+def test_substeps(system: System, sampling: float, dt: float | None, number: int) -> None:
+    assert substeps(sampling, dt, system) == number
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, float("nan"), float("inf")])

@@ -35,7 +35,6 @@ from nnode.model.expression import (
     topological,
 )
 from nnode.model.laws import InteractionForce
-from nnode.model.names import check_symbols
 from nnode.model.operations import FUNCTIONS
 from nnode.model.system import Crowd, System
 from nnode.model.terms import (
@@ -48,17 +47,8 @@ from nnode.model.terms import (
     CrowdDynamics,
     parameter_values,
 )
-from nnode.model.text import plain
 from nnode.simulation.kernels.loops import Loop
-from nnode.simulation.kernels.runs import (
-    Plan,
-    Simulate,
-    compiled,
-    fill,
-    head,
-    seeds,
-    shared_out,
-)
+from nnode.simulation.kernels.runs import Plan, Simulate, Source, compiled, shared_out
 
 #: Smallest number of people for which social forces use cell lists. The lists are faster from 50
 #: people on, but smaller crowds, and so most recordings, are computed exactly up to rounding.
@@ -72,40 +62,27 @@ _FIELDS = ("goal_x", "goal_y", "pace", "people", "points", "start")
 #: Kind of neighbours to the relative quantities in sums, in the order of the neighbours' rows.
 _APART = ("dx", "dy", "dvx", "dvy")
 _RELATIVE = {OTHERS: _APART, POINTS: ("dx", "dy"), WALLS: ("dx", "dy"), SMALLEST: _APART}
-_COUNT = {POINTS: "points", WALLS: "walls"}
-#: Arguments that define the interactions in a driver: without cell lists, and with them.
-_PARTNERS = {
-    False: {
-        OTHERS: "length, own_mask, y, own_mask, width, first, shifts",
-        POINTS: "length, own_mask, rows_points, mask_points, width, 0, points",
-        WALLS: "length, own_mask, rows_walls, mask_walls, width, 0, walls",
-    },
-    True: {
-        OTHERS: "own, pairs, meetings",
-        POINTS: "barriers, touched, touches",
-        WALLS: "solid, every, every.shape[1]",
-    },
-}
-#: Indices of receivers and sources: contiguous without cell lists, or from lists of pairs.
-_AT = {False: ("at + j", "to + j"), True: ("at[j]", "to[j]")}
 #: Sign, array, row and index of a number.
 _Part = tuple[str, str, int, str]
-#: A difference to the receiver's quantity and the source's quantity, of which one may be missing.
-_PARTS = {
-    OTHERS: {"dx": ("x", "x"), "dy": ("y", "y"), "dvx": ("vx", "vx"), "dvy": ("vy", "vy")},
+
+
+def _differences(names: Iterable[str]) -> dict[str, tuple[Expr, Expr]]:
+    return {f"d{name}": (symbol(name), symbol(name)) for name in names}
+
+
+#: A quantity to the receiver's and the source's terms, of which it is the difference.
+_PARTS: dict[str, dict[str, tuple[Expr, Expr]]] = {
+    OTHERS: _differences(_STATE),
     POINTS: {
-        "dx": ("x", "x"),
-        "dy": ("y", "y"),
-        "vx": ("vx", ""),
-        "vy": ("vy", ""),
-        "normal_x": ("", "normal_x"),
-        "normal_y": ("", "normal_y"),
+        **_differences("xy"),
+        **{name: (symbol(name), const(0)) for name in ("vx", "vy")},
+        **{name: (const(0), -symbol(name)) for name in ("normal_x", "normal_y")},
     },
 }
 
 
 @dataclass(frozen=True)
-class CrowdSource:
+class CrowdSource(Source):
     """Source code of a model.
 
     Attributes:
@@ -115,6 +92,9 @@ class CrowdSource:
     """
 
     kind: ClassVar[str] = "crowd"
+    chunk: ClassVar[int] = CHUNK
+    size: ClassVar[int] = SIZE
+    nobody: ClassVar[float] = NOBODY
     law: CrowdDynamics
     near: bool = False
 
@@ -173,26 +153,25 @@ class CrowdSource:
         return _opposite(pair, [self.law.swapped(s) for s in pair])
 
     @cached_property
-    def kept(self) -> list[str]:
-        """Sums that the gradient needs, and that are therefore stored."""
+    def kept(self) -> list[int]:
+        """Rows of sums that the gradient needs, and that are therefore stored."""
         needed: list[Expr] = []
         for over in {"own", SMALLEST} & {*self.formulas}:
-            stored, ends = self.loop.adjoints(
-                seeds(self.formulas[over], _weight), self._slopes(over)
-            )
+            rows = {f"D_{name}": name for name in self.slopes(over)}
+            stored, ends = self.loop.adjoints(_weighted(self.formulas[over]), rows)
             needed += [*stored.values(), *ends.values()]
         inner = {*symbols(needed), *self.rows_of_sums[len(self.sums) :]}
-        return [name for name in self.rows_of_sums if name in inner]
+        return [i for i, name in enumerate(self.rows_of_sums) if name in inner]
 
     @cached_property
     def loop(self) -> Loop:
         return Loop(self.uniform, options="LOOP", fixed=tuple(self.law.settings))
 
-    def _slopes(self, over: str) -> dict[str, str]:
-        """Row of an adjoint to its quantity."""
+    def slopes(self, over: str) -> list[str]:
+        """Quantities of formulas with an adjoint."""
         names = [*_RELATIVE.get(over, ()), *_STATE, *self.sums]
         used = set(symbols(self.formulas[over].values()))
-        return {f"D_{name}": name for name in names if name in used}
+        return [name for name in names if name in used]
 
     @cached_property
     def rows(self) -> list[str]:
@@ -205,55 +184,25 @@ class CrowdSource:
         slopes = [f"D_{name}" for name in (*_STATE, *relative, *self.sums)]
         return [*state, *outputs, *weights, *slopes]
 
-    # -- text ------------------------------------------------------------------------------------
+    @property
+    def names(self) -> list[str]:
+        return [*self.rows, *self.uniform, *self.law.symbols]
 
-    def text(self) -> str:
-        """The module's source.
-
-        Raises:
-            ConfigError: a name in the formulas is not a valid symbol.
-        """
-        law = self.law
-        check_symbols([*self.rows, *self.uniform, *law.symbols])
-        state = "v" if law.order == 2 else ""
-        formula = [f"d{state}{a}/dt = {plain(r)}" for a, r in zip("xy", law.rate, strict=True)]
-        for over, sums in self.over.items():
-            what = "smallest over others of" if over == SMALLEST else f"sum over {over} of"
-            formula += [f"{plain(symbol(n))} = {what} {plain(s)}" for n, s in sums.items()]
-        whom = "near" if self.near else "everybody"
-        text = head(
-            "crowd",
-            formula,
-            CHUNK,
-            [f"_{r} = np.uint64({i * SIZE})" for i, r in enumerate(self.rows)],
-            size=SIZE,
-            rows=len(self.rows),
-            kept=[self.rows_of_sums.index(name) for name in self.kept],
-        )
-        text += fill("crowd", "rows") + fill("crowd", whom)
-        for over in self.formulas:
-            if over in self.features:
-                text += self._neurons(over)
-                continue
-            text += self._functions(f"law_{over}", self.formulas[over], self._slopes(over))
-            match over:
-                case "own":
-                    text += self._rates()
-                case _ if over == SMALLEST:
-                    text += self._smallest()
-                case _:
-                    text += self._pairs(over, whom)
-        return text + fill("crowd", "simulate", **self._drivers(whom))
-
-    def _functions(self, name: str, formulas: dict[str, Expr], slopes: dict[str, str]) -> str:
-        """Functions that compute formulas for rows, and their gradients."""
-        vjp = self.loop.vjp(f"{name}_vjp", seeds(formulas, _weight), slopes, [])
+    def functions(self, name: str, formulas: dict[str, Expr], slopes: list[str]) -> str:
+        """Source of the functions that compute formulas for rows, and their gradients."""
+        rows = {f"D_{n}": n for n in slopes}
+        vjp = self.loop.vjp(f"{name}_vjp", _weighted(formulas), rows, [])
         return self.loop.function(name, formulas) + vjp
 
-    def _taken(self, over: str, near: bool) -> dict[str, list[_Part]]:
-        """Row of the buffer to the numbers whose sum it is."""
+    def taken(self, over: str, by_index: bool) -> dict[str, list[_Part]]:
+        """Row of the buffer to the numbers whose sum it is.
+
+        Args:
+            by_index: whether receivers and sources have lists of indices, instead of being
+                contiguous.
+        """
+        at, to = ("at[j]", "to[j]") if by_index else ("at + j", "to + j")
         relative, neighbour_rows = _RELATIVE.get(over, ()), [*SEEN.get(over, ())]
-        at, to = _AT[near]
         taken: dict[str, list[_Part]] = {}
         for n in symbols(self.formulas[over].values()):
             if n in relative:
@@ -269,223 +218,38 @@ class CrowdSource:
                 taken[n] = [("", "sums", self.sums.index(n), at)]
         return taken
 
-    def _scattered(self, over: str, near: bool, *arrays: str) -> list[str]:
-        """Lines that add adjoints in the buffer to the adjoints of the source arrays."""
-        taken = self._taken(over, near)
-        return _scatter({n: taken[n] for n in self._slopes(over).values()}, *arrays)
+    def weighted(self, over: str) -> dict[str, int]:
+        """Sums whose summands have a gradient, and their indices."""
+        return {n: self.sums.index(n) for n, s in self.over[over].items() if not s.is_number()}
 
-    def _pairs(self, over: str, whom: str) -> str:
-        """Functions for the sums over pairs and their gradients, for a block and for all pairs."""
-        at, to = _AT[self.near]
-        antisymmetric = self.antisymmetric and over == OTHERS
-        other_weight, own_weight = (
-            ("", "") if self.near else (f"other_mask[{to}] * ", f"own_mask[{at}] * ")
-        )
-        add, weights = [], {}
-        for n, summand in self.over[over].items():
-            c = self.sums.index(n)
-            add.append(_increase("sums", c, at, f"+ {other_weight}buffer[_{n} + j]"))
-            weight = f"{other_weight}weight[{c}, {at}]"
-            if antisymmetric:
-                add.append(_increase("reaction", c, to, f"- {own_weight}buffer[_{n} + j]"))
-                weight += f" - {own_weight}weight[{c}, {to}]"
-            if not summand.is_number():
-                weights[n] = weight
-        moving = ["other"] if over == OTHERS else []  # walls are constants
-        text = fill(
-            "crowd",
-            "pairs",
-            over=over,
-            gather=_gather(self._taken(over, self.near)),
-            add=_each(add),
-            weights=_weighted(weights),
-            scatter=self._scattered(over, self.near, "own", *moving),
-        )
-        for end, arrays in (("", "sums, reaction"), ("_vjp", "weight, to_own, to_other")):
-            text += fill(
-                "crowd", f"meet {whom}", name=over + end, rest=arrays, antisymmetric=antisymmetric
-            )
-        return text
-
-    def _smallest(self) -> str:
-        """Functions for minima over the others, and their gradients."""
-        names, first, who = [*self.over[SMALLEST]], self.sums.index, len(self.sums)
-        return fill(
-            "crowd",
-            "smallest",
-            number=len(names),
-            first=first(names[0]),
-            who=who,
-            nobody=NOBODY,
-            gather=_gather(self._taken(SMALLEST, False)),
-            smaller=[
-                f"neighbour_min(sums[{first(n)}], sums[{who + r}], low, own_mask, start, length, "
-                f"buffer[_{n}:], n)"
-                for r, n in enumerate(names)
-            ],
-            gather_pairs=_gather(self._taken(SMALLEST, True)),
-            weights=_weighted(
-                {
-                    n: f"to_sums[{first(n)}, at[j]] if which == {r} else real(0, dt)"
-                    for r, n in enumerate(names)
-                }
-            ),
-            scatter=self._scattered(SMALLEST, True, "own", "sums", "other"),
-        )
-
-    def _neurons(self, over: str) -> str:
-        """Functions for features of receivers and sources, for sums of functions of their
-        differences, and for the gradients."""
-        text, features = "", self.features[over]
-        for side, whose in enumerate(("own", "other")):
-            formulas = {z: feature[side] for z, feature in features.items()}
-            moves = over == OTHERS or whose == "own"  # walls are constants
-            columns = _STATE if moves else ("x", "y", "normal_x", "normal_y")
-            used = set(symbols(formulas.values()))
-            taken: dict[str, list[_Part]] = {
-                # relative to a person's position, because large numbers lose digits
-                n: [("", "own", c, "at + j"), *([("-", "y", c, "0")] if c < 2 else [])]
-                for c, n in enumerate(columns)
-                if n in used
-            }
-            name = f"features_{whose}_{over}"
-            slopes = {f"D_{n}": n for n in taken if moves}
-            text += self._functions(name, formulas, slopes)
-            text += fill(
-                "crowd",
-                "features",
-                name=f"{whose}_{over}",
-                gather=_gather(taken),
-                store=_each(
-                    f"features[{i}, at + j] = buffer[_{z} + j]" for i, z in enumerate(features)
-                ),
-                weights=_weighted({z: f"weight[{i}, at + j]" for i, z in enumerate(features)}),
-                scatter=_scatter(taken if moves else {}, "own"),
-            )
-        value = apply(self.over[over][f"{over}_s0"].op, symbol("z"))
-        return text + fill(
-            "crowd",
-            "neurons",
-            over=over,
-            first=self.sums.index(f"{over}_one"),
-            value=self.loop.of_numbers("value", value),
-            slope=self.loop.of_numbers("slope", derivatives(value, ["z"])["z"]),
-        )
-
-    def _rates(self) -> str:
-        """Functions for accelerations from sums, and their gradient."""
-        return fill(
-            "crowd",
-            "rates",
-            gather=_gather(self._taken("own", False)),
-            store=_each(f"rate[{i}, at + j] = buffer[_O_{a} + j]" for i, a in enumerate("xy")),
-            weights=_weighted({f"O_{a}": f"weight[{i}, at + j]" for i, a in enumerate("xy")}),
-            scatter=self._scattered("own", False, "own", "sums"),
-        )
-
-    def _drivers(self, whom: str) -> dict[str, Any]:
-        """Values of the template of the time loops."""
-        near, number, second = self.near, len(self.rows_of_sums), self.law.order == 2
-        barriers, meet, back = [], [], []
-        for over in self.over:
-            if over == SMALLEST:
-                continue
-            if near and over == POINTS:
-                lists = (
-                    "touched, touches = points_near(own[0], own[1], barriers[0], barriers[1], "
-                    "cells, start, cutoff_wall, touched)"
-                )
-                meet.append(lists)
-                back.append(lists)
-            elif not near and over != OTHERS:
-                table = f"barrier(members, people, {_COUNT[over]}, table_{over})"
-                barriers.append(f"rows_{over}, mask_{over} = {table}")
-            if over in self.features:
-                others = over == OTHERS
-                pieces = {
-                    "over": over,
-                    "number": len(self.features[over]),
-                    "size": "2 * length" if others else f"rows_{over}.shape[1]",
-                    "rows": "y" if others else f"rows_{over}",
-                    "partners": "own_mask, width, first, shifts"
-                    if others
-                    else f"mask_{over}, width, 0, {_COUNT[over]}",
-                }
-                barriers += fill("crowd", "neurons begin", **pieces).splitlines()
-                meet += fill("crowd", "neurons meet", **pieces).splitlines()
-                back += fill("crowd", "neurons back", **pieces).splitlines()
-                end = "others" if others else "barriers"
-                back += fill("crowd", f"neurons back to {end}", **pieces).splitlines()
-                continue
-            call = f"buffer, own, {_PARTNERS[near][over]}, q, time, dt, total"
-            meet.append(f"meet_{over}({call}, sums, reaction)")
-            back.append(f"meet_{over}_vjp({call}, to_sums, to_own, to_other)")
-        if not near:
-            meet += ["accumulate(sums, reaction, length)"] if self.antisymmetric else []
-            back = [f"repeat(to_sums, {number}, length)", *back]
-            back.append("accumulate(to_own, to_other, length)")
-        if SMALLEST in self.over:
-            call = "buffer, y, length, own_mask, width, q, time, dt, total, sums"
-            meet.append(f"least({call})")
-            back.insert(0, f"least_vjp({call}, to_sums, to_own, to_other)")
-        inner = {"width": len(self.person_rows), "antisymmetric": self.antisymmetric}
-        return {
-            "scene": fill("crowd", f"scene {whom}", **inner).splitlines(),
-            "arrange": fill("crowd", f"arrange {whom}", **inner).splitlines(),
-            "barriers": barriers,
-            "rows_of": "scattered" if near else "zeros",
-            "twice": 1 if near else 2,
-            "reaction": "sums" if near else f"zeros({number}, 2 * length, y0)",
-            "to_other": "to_own" if near else "zeros(4, 2 * length, grad_y0)",
-            "sums": number,
-            "kept_width": 4 + len(self.kept),
-            "meet": meet,
-            "meet_vjp": back,
-            "moved": "2 + c" if second else "c",
-            "place": "y[c, t] += move[t] * y[2 + c, t]" if second else "pass",
-            "place_vjp": "adjoint[2 + c, t] += move[t] * adjoint[c, t]" if second else "pass",
+    def side_features(
+        self, over: str, side: str
+    ) -> tuple[dict[str, Expr], dict[str, list[_Part]], list[str]]:
+        """Features of receivers (``own``) or of sources: formulas, and as :meth:`taken` and
+        :meth:`slopes`."""
+        moves = over == OTHERS or side == "own"  # walls are constants
+        formulas = {
+            z: of_receiver if side == "own" else of_source
+            for z, (of_receiver, of_source) in self.features[over].items()
         }
+        used = symbols(formulas.values())
+        taken: dict[str, list[_Part]] = {
+            # relative to a person's position, because large numbers lose digits
+            n: [("", "own", c, "at + j"), *([("-", "y", c, "0")] if c < 2 else [])]
+            for c, n in enumerate(_STATE if moves else ("x", "y", "normal_x", "normal_y"))
+            if n in used
+        }
+        return formulas, taken, [*taken] if moves else []
+
+    def neuron(self, over: str) -> tuple[Expr, Expr]:
+        """The function of a feature z that is summed, and its derivative."""
+        value = apply(self.over[over][f"{over}_s0"].op, symbol("z"))
+        return value, derivatives(value, ["z"])["z"]
 
 
-def _weight(row: str) -> str:
-    return f"W_{row}"
-
-
-def _increase(array: str, row: int, at: str, value: str) -> str:
-    return f"{array}[{row}, {at}] = {array}[{row}, {at}] {value}"
-
-
-def _each(body: Iterable[str], numbers: str = "np.uint64(n)") -> list[str]:
-    """One loop over pairs per line. In a loop over several rows, the compiler cannot prove that
-    they do not overlap."""
-    return [line for row in body for line in (f"for j in range({numbers}):", f"    {row}")]
-
-
-def _gather(taken: Mapping[str, Sequence[_Part]]) -> list[str]:
-    """Lines that fill rows of the buffer."""
-    sums = {
-        row: " ".join(f"{sign} {array}[{c}, {at}]" for sign, array, c, at in parts)
-        for row, parts in taken.items()
-    }
-    return _each(f"buffer[_{row} + j] = {parts.strip()}" for row, parts in sums.items())
-
-
-def _scatter(taken: Mapping[str, Sequence[_Part]], *arrays: str) -> list[str]:
-    """Lines that add adjoints in the buffer to the adjoints of the source arrays."""
-    return _each(
-        _increase(f"to_{array}", c, at, f"{sign or '+'} buffer[_D_{row} + j]")
-        for array in arrays
-        for row, parts in taken.items()
-        for sign, source, c, at in parts
-        if source == array
-    )
-
-
-def _weighted(weights: Mapping[str, str]) -> list[str]:
-    """Lines that fill rows of weights, with zeros for padding."""
-    body = [f"buffer[_W_{row} + j] = {weight}" for row, weight in weights.items()]
-    ends = [f"buffer[_W_{row} + j] = 0" for row in weights]
-    return _each(body) + _each(ends, "np.uint64(n), np.uint64(padded(n))")
+def _weighted(formulas: Mapping[str, Expr]) -> dict[str, Expr]:
+    """Row of a formula's weight to the formula."""
+    return {f"W_{row}": formula for row, formula in formulas.items()}
 
 
 def _opposite(pair: list[Expr], swapped: list[Expr]) -> bool:
@@ -504,9 +268,6 @@ def _opposite(pair: list[Expr], swapped: list[Expr]) -> bool:
         torch.allclose(a, -b, rtol=1e-9, atol=1e-12)
         for a, b in zip(Formulas(pair)(values), Formulas(swapped)(values), strict=True)
     )
-
-
-# -- runs ------------------------------------------------------------------------------------------
 
 
 def supports(system: System, batch: Batch | None = None) -> CrowdDynamics | None:
@@ -709,9 +470,6 @@ def cutoff_distance(reach: float, decay: float, cutoff_error: float) -> float:
     return reach + decay * math.log(1 / cutoff_error)
 
 
-# -- networks --------------------------------------------------------------------------------------
-
-
 def split(
     law: CrowdDynamics, uniform: Sequence[str]
 ) -> tuple[CrowdDynamics, dict[str, dict[str, tuple[Expr, Expr]]]]:
@@ -746,7 +504,11 @@ def split(
             continue
         features[over], sums = {}, {f"{over}_one": const(1)}
         for k, (g, (start, weights)) in enumerate(zip(inner, numbers, strict=True)):
-            features[over][f"{over}_z{k}"] = _feature(parts, start, weights)
+            receiver, source = start, const(0)
+            for part, weight in weights.items():
+                of_receiver, of_source = parts[part.value]
+                receiver, source = receiver + weight * of_receiver, source + weight * of_source
+            features[over][f"{over}_z{k}"] = receiver, source
             sums[f"{over}_s{k}"] = apply(g.op, symbol(f"{over}_z{k}"))
         total = {}
         for name, (start, weights) in outer.items():
@@ -758,23 +520,6 @@ def split(
     return law, features
 
 
-def _feature(
-    parts: Mapping[str, tuple[str, str]], start: Expr, weights: Mapping[Expr, Expr]
-) -> tuple[Expr, Expr]:
-    """The receiver's and the source's part of a feature."""
-    receiver, source = start, const(0)
-    for part, weight in weights.items():
-        receiver_symbol, source_symbol = parts[part.value]
-        receiver = receiver + weight * symbol(receiver_symbol) if receiver_symbol else receiver
-        if source_symbol:
-            source = (
-                source + weight * symbol(source_symbol)
-                if receiver_symbol
-                else source - weight * symbol(source_symbol)
-            )
-    return receiver, source
-
-
 def _weights(node: Expr, is_uniform: Callable[[Expr], bool]) -> tuple[Expr, dict[Expr, Expr]]:
     """A node as a uniform constant and a weighted sum of other nodes, with uniform weights."""
     if is_uniform(node):
@@ -784,8 +529,7 @@ def _weights(node: Expr, is_uniform: Callable[[Expr], bool]) -> tuple[Expr, dict
         second_start, others = _weights(node.args[1], is_uniform)
         sign = 1.0 if node.op == "add" else -1.0
         for part, weight in others.items():
-            weight = sign * weight
-            weights[part] = weights[part] + weight if part in weights else weight
+            weights[part] = weights.get(part, const(0)) + sign * weight
         return start + sign * second_start, weights
     if node.op == "neg":
         start, weights = _weights(node.args[0], is_uniform)

@@ -198,12 +198,12 @@ def _half_power(kind: Any, width: int) -> Callable[[Any], Any]:
 def _mantissa_exponent(kind: Any, width: int) -> Callable[[Any], Any]:
     """(m, k) of a positive normal number m 2^k with sqrt(1/2) <= m < sqrt(2)."""
     digits, shift = _DIGITS[width], _DIGITS[width](MANTISSA[width])
-    least, large = kind(0.5**0.5).view(digits), kind(_whole(width))
+    smallest_bits, large = kind(0.5**0.5).view(digits), kind(_whole(width))
     base = large.view(digits)
 
     def body(x: Any) -> Any:
         bits = kind(x).view(digits)
-        k = digits(digits(bits - least) >> shift)
+        k = digits(digits(bits - smallest_bits) >> shift)
         m = digits(bits - digits(k << shift)).view(kind)
         # conversion of 64-bit integers is scalar on many processors, an addition is not
         return m, digits(k + base).view(kind) - large

@@ -29,22 +29,12 @@ from nnode.data.sequence import Batch
 from nnode.model.expression import Expr, apply, const, symbol, symbols
 from nnode.model.formula import inputs_of, starts_of
 from nnode.model.lane_rates import SAFE
-from nnode.model.names import check_symbols
 from nnode.model.steps import STAGES, stepped
 from nnode.model.system import System, Traffic, with_parameters
 from nnode.model.tangent import with_tangents
 from nnode.model.terms import LaneDynamics
-from nnode.model.text import plain
 from nnode.simulation.kernels.loops import Loop
-from nnode.simulation.kernels.runs import (
-    Plan,
-    Simulate,
-    compiled,
-    fill,
-    head,
-    seeds,
-    shared_out,
-)
+from nnode.simulation.kernels.runs import Plan, Simulate, Source, compiled, shared_out
 
 #: Weights and times of the stages of a method.
 TABLEAUS = {
@@ -66,7 +56,7 @@ _STRIDES = (1424, 5200, 20800, 83200)
 
 
 @dataclass(frozen=True)
-class LaneSource:
+class LaneSource(Source):
     """Source code of a model.
 
     Attributes:
@@ -78,6 +68,9 @@ class LaneSource:
     """
 
     kind: ClassVar[str] = "lane"
+    chunk: ClassVar[int] = CHUNK
+    safe: ClassVar[float] = SAFE
+    tableaus: ClassVar = TABLEAUS
     lane: LaneDynamics
     stages: str = "euler"
     per_simulation: bool = False
@@ -93,7 +86,8 @@ class LaneSource:
         return list(self.lane.owned)
 
     @property
-    def _simulation_parameters(self) -> list[str]:
+    def simulation_parameters(self) -> list[str]:
+        """Parameters that are rows of the buffer."""
         return self.parameters if self.per_simulation else []
 
     @cached_property
@@ -169,177 +163,42 @@ class LaneSource:
             every += ["RBAR", *(f"D_{i}" for i in self.inputs if i not in self.states)]
         return [
             *every,
-            *self._simulation_parameters,
-            *(f"G_{p}" for p in self._simulation_parameters),
+            *self.simulation_parameters,
+            *(f"G_{p}" for p in self.simulation_parameters),
         ]
 
-    def text(self) -> str:
-        """The module's source.
+    @property
+    def names(self) -> list[str]:
+        return [*self.rows, *self.parameters, *self.lane.symbols]
 
-        Raises:
-            ConfigError: a name in the formulas is not a valid symbol.
-        """
-        check_symbols([*self.rows, *self.parameters, *self.lane.symbols])
-        weights, times = TABLEAUS[self.stages]
-        formula = [f"d{s}/dt = {plain(rate)}" for s, rate in self.lane.rates.items()]
-        text = head(
-            "lane",
-            [*formula, f"leader: {plain(self.lane.leader)}"],
-            CHUNK,
-            [f"_{row} = np.uint64({i * self.stride})" for i, row in enumerate(self.rows)],
-            stride=self.stride,
-            states=len(self.states),
-            rows=len(self.rows),
-            weights=weights,
-            times=times,
-        )
-        load, spread, collect = (
-            [line.format(row, i) for i, row in enumerate(rows)]
-            for line, rows in (
-                ("load(buffer[_{}:], fields[{}], low, width, w)", self.fields),
-                (
-                    "spread(buffer[_{}:], every_q[:, {}], low, width, w, agents)",
-                    self._simulation_parameters,
-                ),
-                (
-                    "    collect(buffer[_G_{}:], grad_q[:, {}], low, width, w, agents)",
-                    self._simulation_parameters,
-                ),
-            )
-        )
-        text += fill("lane", "rows") + self._gather() + self._rates()
-        text += fill(
-            "lane",
-            "simulate",
-            measured=self.measured,
-            speeds=self.lane.order > 1,
-            fields=[*load, *spread],
-        )
-        if self.forward_only:
-            return text
-        short = ["if step % per == 0:  # sums of single precision are kept short", *collect]
-        return (
-            text
-            + self._vjp()
-            + fill("lane", "gradient", scatter=self._scatter(), collect=short if collect else [])
-        )
+    @property
+    def overwritten(self) -> list[str]:
+        """States whose adjoints the gradient replaces; it adds to those of one stage."""
+        return self.states if self.stages == "rk4" else []
 
-    def _gather(self) -> str:
-        """The function that gathers values of the vehicles ahead; finite values without one."""
-        body = [f"zero, safe = real(0, buffer[0]), real({SAFE!r}, buffer[0])"]
-        for s, j in self.lane.ahead:
-            base, mask = (s, "behind") if j == 1 else (f"{s}_1", "second")
-            body += [
-                f"source = buffer[_{s} + np.uint64(lo + {j} * w):]",
-                f"target = buffer[_{s}_{j} + np.uint64(lo):]",
-            ]
-            if s in self.lane.linear:
-                # conditions do not depend on tangents, so unused values do no harm
-                body.append("copy(target, source, n)")
-                continue
-            away = "own[k] + safe" if s == "x" else "own[k]"
-            body += [
-                f"own, mask = buffer[_{base} + np.uint64(lo):], buffer[_{mask} + np.uint64(lo):]",
-                "for k in range(n):",
-                f"    target[k] = source[k] if mask[k] > zero else {away}",
-            ]
-        for s, ahead in self.lane.chained.items():
-            body.append(
-                f"copy(buffer[_{ahead} + np.uint64(lo):], buffer[_R_{s} + np.uint64(lo + w):], n)"
-            )
-        return _function("gather(buffer, lo, n, w)", *body, "return")
-
-    def _rates(self) -> str:
-        text = self.loop.function("follow", self.follower) + self.loop.function("first", self.first)
-        arguments = "q, t, dt, drives, total)"
-        last = f"first(buffer, (agents - 1) * w, {{}}, {arguments}"
-        body = [
-            "n = padded((agents - 1) * w)",
-            "gather(buffer, 0, n, w)",
-            f"follow(buffer, 0, n, {arguments}",
-            last.format("padded(w)"),
-        ]
-        if self.recursive:
-            body = [
-                last.format("w"),
-                "for i in range(agents - 2, -1, -1):",
-                "    gather(buffer, i * w, w, w)",
-                f"    follow(buffer, i * w, w, {arguments}",
-            ]
-        return text + _function("rates(buffer, q, t, dt, drives, w, agents, total)", *body)
-
-    def _vjp(self) -> str:
-        """The functions from adjoints A of increments to D, the adjoints of their inputs."""
+    def vjps(self) -> str:
+        """Source of the functions from adjoints A of increments to D, the adjoints of inputs."""
         # a state's adjoint is read once, so its row can be overwritten
-        rows = {f"A_{s}": s for s in self.states}
-        rows |= {f"D_{i}": i for i in self.inputs if i not in self.states}
-        grads = {f"G_{p}": p for p in self._simulation_parameters}
-        kept = [f"A_{s}" for s in self.states] if self.stages != "rk4" else []
-
-        def weight(row: str) -> str:
-            return "RBAR" if row == "R_x" else f"A_{row[2:]}"
-
-        text = self.loop.vjp(
-            "follow_vjp", seeds(self.follower, weight), {**rows, **grads}, [*kept, *grads]
-        )
+        states = {f"A_{s}": s for s in self.states}
+        inputs = {f"D_{i}": i for i in self.inputs if i not in self.states}
+        gradients = {f"G_{p}": p for p in self.simulation_parameters}
         # the first row depends only on a leader's speed
-        first_rows = [
-            f"A_{s}" for s in self.states if not kept or s in symbols(self.first.values())
-        ]
-        text += self.loop.vjp(
-            "first_vjp",
-            seeds(self.first, weight),
-            {**{row: row[2:] for row in first_rows}, **grads},
-            [*(row for row in first_rows if row in kept), *grads],
-        )
-        arguments = "q, t, dt, drives, total)"
-        if self.recursive:
-            body = [
-                "rates(buffer, q, t, dt, drives, w, agents, total)",
-                "buffer[_RBAR:_RBAR + S] = 0",
-                "for i in range(agents - 1):",
-                f"    follow_vjp(buffer, i * w, w, {arguments}",
-                "    copy(buffer[_RBAR + np.uint64((i + 1) * w):], "
-                "buffer[_D_dx_1 + np.uint64(i * w):], w)",
-                f"first_vjp(buffer, (agents - 1) * w, w, {arguments}",
-            ]
-        else:
-            # followers' rows are computed in whole chunks, which reach into the first row; if they
-            # overwrite adjoints, rows I store those of the first row in the meantime
-            move = "copy(buffer[_{} + at:], buffer[_{} + at:], w)"
-            waiting = [(row, f"I_{row[2:]}") for row in first_rows if row not in kept]
-            body = [
-                "n, at = padded((agents - 1) * w), np.uint64((agents - 1) * w)",
-                "gather(buffer, 0, n, w)",
-                *(move.format(place, row) for row, place in waiting),
-                f"follow_vjp(buffer, 0, n, {arguments}",
-                *(move.format(row, place) for row, place in waiting),
-                f"first_vjp(buffer, (agents - 1) * w, padded(w), {arguments}",
-            ]
-        return text + _function("vjp(buffer, q, t, dt, drives, w, agents, total)", *body)
-
-    def _scatter(self) -> list[str]:
-        """Lines that add adjoints of gathered states to the adjoints of the vehicles ahead."""
-        body = []
-        for s, j in reversed(self.lane.ahead):
-            if j == 2:
-                body += [
-                    f"share, other = buffer[_D_{s}_2:], buffer[_D_{s}_1:]",
-                    "mask = buffer[_second:]",
-                    "for k in range((agents - 1) * w):",
-                    "    other[k] = other[k] + (zero if mask[k] > zero else share[k])",
-                    "    share[k] = share[k] if mask[k] > zero else zero",
-                ]
-            body += [
-                f"target, share = buffer[_A_{s} + np.uint64({j} * w):], buffer[_D_{s}_{j}:]",
-                f"for k in range(max(agents - {j}, 0) * w):",
-                "    target[k] = target[k] + share[k]",
-            ]
-        return body
-
-
-def _function(signature: str, *body: str) -> str:
-    return fill("lane", "function", signature=signature, body=list(body))
+        used = {*symbols(self.first.values()), *self.overwritten}
+        first = {row: s for row, s in states.items() if s in used}
+        text = ""
+        for name, increments, of_states, others in (
+            ("follow", self.follower, states, inputs),
+            ("first", self.first, first, {}),
+        ):
+            outputs = {
+                "RBAR" if row == "R_x" else f"A_{row[2:]}": formula
+                for row, formula in increments.items()
+            }
+            onto = [*([] if self.overwritten else of_states), *gradients]
+            text += self.loop.vjp(
+                f"{name}_vjp", outputs, {**of_states, **others, **gradients}, onto
+            )
+        return text
 
 
 def supports(system: System, batch: Batch) -> LaneDynamics | None:
@@ -487,9 +346,13 @@ def _planned(
     steps = substeps * (samples - 1)
     blocks = _blocks(groups, agents, x.element_size(), threads, bool(lane.chained))
     size = agents * max(w for *_, w, _ in blocks)
-    source = LaneSource(lane, stages, per_simulation, _stride(size), forward_only=bool(tangents))
-    numbers = [len(source.states) * steps * agents * w for *_, w, _ in blocks]
-    places = np.cumsum([0, *numbers])
+    length = size + _BEHIND
+    stride = next((s for s in _STRIDES if length <= s), length + 80 - size % 64)
+    source = LaneSource(lane, stages, per_simulation, stride, forward_only=bool(tangents))
+    jobs, stored = [], 0
+    for slot, (low, width, w, run) in enumerate(blocks):
+        jobs.append((low, width, w, stored, slot, run))
+        stored += len(source.states) * steps * agents * w
 
     def tiled(values: Tensor) -> np.ndarray:
         return np.tile(values.numpy(), (runs,) + (1,) * (values.ndim - 1))
@@ -506,15 +369,7 @@ def _planned(
         path = path[..., 0].repeat(1, 1, runs)
     return Plan(
         module=compiled(source),
-        jobs=shared_out(
-            [
-                (low, width, w, place, slot, run)
-                for slot, ((low, width, w, run), place) in enumerate(
-                    zip(blocks, places[:-1], strict=True)
-                )
-            ],
-            threads,
-        ),
+        jobs=shared_out(jobs, threads),
         constants=(
             substeps,
             x.new_tensor(batch.dt / substeps).numpy()[()],
@@ -524,7 +379,7 @@ def _planned(
             tiled(substeps * (batch.valid.any(-1).sum(0) - 1)),
             np.ascontiguousarray(path.numpy()),
         ),
-        stored=int(places[-1]),
+        stored=stored,
         samples=samples,
         owner=np.arange(number) if per_simulation else np.array([run for *_, run in blocks]),
     )
@@ -553,11 +408,3 @@ def _blocks(
         ]
         first += simulations
     return blocks
-
-
-def _stride(size: int) -> int:
-    """The distance of rows for ``size`` numbers and their padding."""
-    for stride in _STRIDES:
-        if size + _BEHIND <= stride:
-            return stride
-    return size + _BEHIND + 80 - size % 64

@@ -55,19 +55,22 @@ class Loop:
         """
         sums = sums or {}
         outputs = [*rows.values(), *sums.values()]
-        varies, names = self.varies(outputs), self.names(outputs)
-        lines = self.lines(names)
-        read = [n.value for n in names if n.op == "symbol" and varies[n]]
+        varies, names = self.varies(outputs), self._names(outputs)
+        lines = self._lines(names)
         inside = [
             "k = np.uint64(lo) + j",
-            *(f"{row} = buffer[k + _{row}]" for row in read),
+            *(
+                f"{n.value} = buffer[k + _{n.value}]"
+                for n in names
+                if n.op == "symbol" and varies[n]
+            ),
             *(line for n, line in lines.items() if varies[n]),
             *(f"buffer[k + _{row}] = {names[n]}" for row, n in rows.items()),
             *(f"sum_{s} = add(sum_{s}, {names[n]})" for s, n in sums.items()),
         ]
         body = [
             "zero = real(0, dt)",
-            *self.given(outputs),
+            *self._given(outputs),
             *(line for n, line in lines.items() if not varies[n]),
             *(f"sum_{label} = zero" for label in sums),
             "for j in range(np.uint64(n)):",
@@ -77,23 +80,24 @@ class Loop:
         head = f"\n\n@njit(**{self.options})\ndef {name}(buffer, lo, n, q, t, dt, drives, total):\n"
         return head + "".join(f"    {line}\n" for line in body)
 
-    def given(self, outputs: Iterable[Expr]) -> list[str]:
-        """Lines that assign the uniform quantities in formulas."""
-        needed = set(symbols(outputs))
-        return [f"{p} = q[{j}]" for j, p in enumerate(self.uniform) if p in needed]
+    def statements(self, outputs: Sequence[Expr], prefix: str = "n") -> tuple[list[str], list[str]]:
+        """Lines that evaluate formulas of scalars, and the names of their values."""
+        names = self._names(outputs, prefix)
+        lines = [*self._given(outputs), *self._lines(names).values()]
+        return lines, [names[node] for node in outputs]
 
     def vjp(
-        self, name: str, seeds: Mapping[Expr, Expr], rows: Mapping[str, str], onto: Sequence[str]
+        self, name: str, outputs: Mapping[str, Expr], rows: Mapping[str, str], onto: Iterable[str]
     ) -> str:
         """Source of a function that adds the gradient by uniform quantities to ``total``, and
         stores adjoints of others in rows.
 
         Args:
-            seeds: output to its weight.
+            outputs: row of an output's weight to the output.
             rows: row to the symbol whose adjoint is stored there.
             onto: rows to whose content the adjoint is added.
         """
-        stored, ends = self.adjoints(seeds, rows)
+        stored, ends = self.adjoints(outputs, rows)
         stored.update({row: symbol(row) + stored[row] for row in onto})
         sums = {str(i): total for i, total in enumerate(ends.values())}
         adjoints = vjp(
@@ -105,16 +109,22 @@ class Loop:
             if n.value in self.uniform and n.value not in self.fixed
         }
         # expressions of the gradient by uniform quantities are computed after the loop
-        names = self.names(gradient.values(), "u")
-        after = [*self.given(gradient.values()), *self.lines(names).values()]
-        after += [f"total[{self.uniform.index(p)}] += {names[b]}" for p, b in gradient.items()]
-        return self.function(name, stored, sums, after)
+        lines, results = self.statements([*gradient.values()], "u")
+        totals = [
+            f"total[{self.uniform.index(p)}] += {result}"
+            for p, result in zip(gradient, results, strict=True)
+        ]
+        return self.function(name, stored, sums, [*lines, *totals])
 
     def adjoints(
-        self, seeds: Mapping[Expr, Expr], rows: Mapping[str, str]
+        self, outputs: Mapping[str, Expr], rows: Mapping[str, str]
     ) -> tuple[dict[str, Expr], dict[Expr, Expr]]:
         """Row to the stored adjoint, and uniform node to the adjoint that is summed over the
-        loop."""
+        loop; see :meth:`vjp`."""
+        seeds: dict[Expr, Expr] = {}
+        for weight, node in outputs.items():
+            if not node.is_number():  # numbers have no gradient
+                seeds[node] = seeds.get(node, const(0)) + symbol(weight)
         varies = self.varies([*seeds, *seeds.values()])
         bar = vjp(seeds, lambda node: not varies[node])
         stored = {row: bar.get(symbol(quantity), const(0)) for row, quantity in rows.items()}
@@ -122,17 +132,17 @@ class Loop:
         ends = {n: b for n, b in bar.items() if not varies[n] and not set(symbols([n])) <= still}
         return stored, ends
 
-    def of_numbers(self, name: str, formula: Expr) -> list[str]:
-        """Lines that assign a formula of scalars to a variable."""
-        names = self.names([formula])
-        return [*self.lines(names).values(), f"{name} = {names[formula]}"]
+    def _given(self, outputs: Iterable[Expr]) -> list[str]:
+        """Lines that assign the uniform quantities in formulas."""
+        needed = set(symbols(outputs))
+        return [f"{p} = q[{j}]" for j, p in enumerate(self.uniform) if p in needed]
 
-    def names(self, outputs: Iterable[Expr], prefix: str = "n") -> dict[Expr, str]:
+    def _names(self, outputs: Iterable[Expr], prefix: str = "n") -> dict[Expr, str]:
         """Node to its name in code, each after its arguments."""
         nodes = enumerate(topological(outputs))
         return {n: n.value if n.op == "symbol" else f"{prefix}{i}" for i, n in nodes}
 
-    def lines(self, names: Mapping[Expr, str]) -> dict[Expr, str]:
+    def _lines(self, names: Mapping[Expr, str]) -> dict[Expr, str]:
         """Node to the line that computes it."""
         lines = {}
         for node, name in names.items():

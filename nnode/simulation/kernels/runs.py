@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
-from string import Template
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nnode.model.expression import Expr, symbol
+from nnode.model.expression import symbol
+from nnode.model.names import check_symbols
+from nnode.model.text import plain
 from nnode.simulation.kernels import functions
 from nnode.simulation.kernels.cache import digest, keep
 
@@ -25,15 +25,35 @@ from nnode.simulation.kernels.cache import digest, keep
 COMPILED_IN = (functions,)
 
 
-class Source(Protocol):
-    """The generator of a module; equal sources give one module."""
+_TEMPLATES = Environment(
+    loader=PackageLoader("nnode.simulation.kernels"),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_TEMPLATES.filters["plain"] = plain
+_TEMPLATES.globals |= {"symbol": symbol, "zip": zip}
+
+
+class Source:
+    """The data of a generated module, whose template is named after its kind. Equal sources give
+    one module."""
+
+    kind: ClassVar[str]
 
     @property
-    def kind(self) -> str:
-        """The first part of the module's name."""
+    def names(self) -> Iterable[str]:
+        """All names of formulas in the module."""
+        raise NotImplementedError
 
     def text(self) -> str:
-        """The module's source."""
+        """The module's source.
+
+        Raises:
+            ConfigError: a name in the formulas is not a valid symbol.
+        """
+        check_symbols(self.names)
+        return _TEMPLATES.get_template(f"{self.kind}.py.j2").render(source=self) + "\n"
 
 
 @cache
@@ -46,51 +66,6 @@ def compiled(source: Source) -> ModuleType:
     """
     text = source.text().encode()
     return keep(f"nnode_{source.kind}_{digest(text, COMPILED_IN)}", text)
-
-
-# -- text ------------------------------------------------------------------------------------------
-
-
-@cache
-def _sections(name: str) -> Mapping[str, str]:
-    """The sections of a template file, each after a line ``# == title``."""
-    folder = files("nnode.simulation.kernels") / "templates"
-    text = (folder / f"{name}.py.txt").read_text("utf-8")
-    parts = re.split(r"^# == (.*)\n", text, flags=re.MULTILINE)
-    return dict(zip(parts[1::2], parts[2::2], strict=True))
-
-
-def fill(name: str, section: str, /, **values: Any) -> str:
-    """A section of a template file with values in place of ``$names``. Lists of lines are indented
-    as the name that they replace."""
-
-    def inserted(match: re.Match[str]) -> str:
-        rows = values[match[2]]
-        return "".join(f"{match[1]}{row}\n" for row in rows) if type(rows) is list else match[0]
-
-    text = re.sub(r"^( *)\$(\w+)\n", inserted, _sections(name)[section], flags=re.MULTILINE)
-    return Template(text).substitute(values)
-
-
-def head(
-    name: str, formula: Sequence[str], chunk: int, places: list[str], /, **constants: Any
-) -> str:
-    """The beginning of a module: a docstring with its formula, imports and constants."""
-    section = fill(name, "constants", places=places, **constants)
-    return fill("shared", "head", formula="\n".join(formula), chunk=chunk, constants=section)
-
-
-def seeds(formulas: Mapping[str, Expr], weight: Callable[[str], str]) -> dict[Expr, Expr]:
-    """Formula to the sum of the weights' symbols of its rows; numbers have no gradient."""
-    weights: dict[Expr, Expr] = {}
-    for row, node in formulas.items():
-        if not node.is_number():
-            seed = symbol(weight(row))
-            weights[node] = weights[node] + seed if node in weights else seed
-    return weights
-
-
-# -- runs ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from nnode.calibrate.cost import sequence_costs
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import System
-from nnode.simulation import Solver, Trajectory
+from nnode.simulation import Solver, TorchdiffeqSolver, Trajectory
 from nnode.simulation.ode import Rates
 
 
 class RungeKutta:
-    """Runge and Kutta's classic method, written out; torchdiffeq's ``rk4`` is its 3/8 rule.
+    """The classic Runge-Kutta method, written out; torchdiffeq's ``rk4`` is the 3/8 rule.
 
     Args:
         substeps: in a sampling interval.
@@ -25,7 +27,7 @@ class RungeKutta:
     def __call__(self, system: System, batch: Batch) -> Trajectory:
         rates = Rates(system, batch, self.substeps, "rk4")
         y = system.initial(batch, batch.dt / self.substeps)
-        found = [y]
+        states = [y]
         for step in range(self.substeps * (batch.n_samples - 1)):
             t = torch.tensor(float(step), dtype=y.dtype)
             k1 = rates(t, y)
@@ -34,8 +36,8 @@ class RungeKutta:
             k4 = rates(t + 1, y + k3)
             y = y + (k1 + 2 * k2 + 2 * k3 + k4) / 6
             if (step + 1) % self.substeps == 0:
-                found.append(y)
-        return Trajectory(*system.observe(torch.stack(found), batch))
+                states.append(y)
+        return Trajectory(*system.observe(torch.stack(states), batch))
 
 
 def single(items: list[Sequence]) -> Batch:
@@ -44,18 +46,50 @@ def single(items: list[Sequence]) -> Batch:
 
 
 def gradient(model: System, solver: Solver, batch: Batch) -> tuple[Trajectory, Tensor]:
-    """A trajectory, and the gradient of the summed costs by all parameters and the start."""
+    """A trajectory, and the gradient of a function of all its numbers by parameters and start."""
     model.zero_grad()
-    x = batch.x.clone().requires_grad_(getattr(model, "leader", "") != "measured")
-    moving = Batch(**{**vars(batch), "x": x})
-    found = solver(model, moving)
+    free = getattr(model, "leader", "") != "measured"  # compiled code refuses this gradient
+    start = {name: getattr(batch, name).clone().requires_grad_(free) for name in "xv"}
+    path = solver(model, replace(batch, **start))
     # the measured positions of the cost carry no gradient, the first ones of the start do
-    sequence_costs(found, batch).sum().backward()
+    cost = sequence_costs(path, batch).sum()
+    if path.v is not None:
+        cost = cost + 0.02 * path.v.masked_fill(~batch.valid[..., None], 0.0).square().sum()
+    cost.backward()
     parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()]
-    parts += [] if x.grad is None else [x.grad[0]]
-    return found, torch.cat([part.flatten() for part in parts]).detach()
+    parts += [t.grad[0] for t in start.values() if t.grad is not None]
+    return path, torch.cat([part.flatten() for part in parts]).detach()
 
 
-def difference(found: Tensor, exact: Tensor) -> float:
+def difference(gradient: Tensor, exact: Tensor) -> float:
     """Norm of the difference relative to the norm."""
-    return float((found.double() - exact.double()).norm() / exact.double().norm())
+    return float((gradient.double() - exact.double()).norm() / exact.double().norm())
+
+
+def compare(
+    model: System,
+    batch: Batch,
+    dt: float,
+    *solvers: Solver,
+    limit: float = 1e-10,
+    single_precision: bool = False,
+    **close: float,
+) -> None:
+    """Compare states and gradients with those of torchdiffeq in float64.
+
+    Args:
+        limit: of the gradient's relative difference.
+        close: tolerances of states.
+    """
+    exact, expected = gradient(model, TorchdiffeqSolver("euler", "discrete", dt), batch)
+    assert expected.abs().max() > 0
+    if single_precision:
+        model, batch = model.to(torch.float32), batch.to(dtype=torch.float32)
+    for solver in solvers:
+        path, own = gradient(model, solver, batch)
+        assert {p.grad.dtype for p in model.parameters() if p.grad is not None} == {batch.dtype}
+        for states, wanted in zip((path.x, path.v), (exact.x, exact.v), strict=True):
+            if wanted is not None and states is not None:
+                pair = states[batch.valid].double(), wanted[batch.valid]
+                torch.testing.assert_close(*pair, **({"rtol": 1e-12, "atol": 1e-12} | close))
+        assert difference(own, expected) < limit

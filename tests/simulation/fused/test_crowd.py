@@ -10,17 +10,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from nnode.calibrate.cost import sequence_costs
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, SimulationError
-from nnode.model import Crowd, InteractionForce, Law, System, Traffic, make_law
+from nnode.model import Crowd, InteractionForce, Law, Traffic, make_law
 from nnode.model.effects import CATALOGUE
 from nnode.model.network import FeedForward
-from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver, Trajectory, fused
+from nnode.simulation import FusedSolver, fused
 from nnode.simulation.kernels import crowds as compiled
 from nnode.simulation.kernels.crowds import SIZE, CrowdSource
+from tests import builders
 from tests.builders import social_forces
-from tests.simulation.fused.compare import difference, single
+from tests.simulation.fused.compare import compare, gradient, single
 from tests.simulation.fused.test_fallback import Sway
 from tests.simulation.scenes import crowd
 
@@ -41,13 +41,9 @@ MODELS = {
 
 
 @pytest.fixture(autouse=True)
-def compiled_only(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def compiled_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """No test here may pass because the fallback is right."""
-
-    def refuse(*args: object) -> None:
-        raise AssertionError("the fallback was called")
-
-    monkeypatch.setattr(fused, "TorchdiffeqSolver", refuse)
+    monkeypatch.delattr(fused, "TorchdiffeqSolver")
 
 
 @pytest.fixture
@@ -62,88 +58,42 @@ def people() -> list[Sequence]:
     ]
 
 
-def gradient(model: System, solver: Solver, batch: Batch) -> tuple[Trajectory, Tensor]:
-    """A trajectory; gradient of a function of x and v by all parameters and the initial state."""
-    model.zero_grad()
-    x, v = batch.x.clone().requires_grad_(), batch.v.clone().requires_grad_()
-    found = solver(model, Batch(**{**vars(batch), "x": x, "v": v}))
-    assert found.v is not None
-    speeds = found.v.masked_fill(~batch.valid[..., None], 0.0)
-    (sequence_costs(found, batch).sum() + 0.02 * speeds.square().sum()).backward()
-    parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()]
-    assert x.grad is not None
-    assert v.grad is not None
-    return found, torch.cat([part.flatten() for part in (*parts, x.grad[0], v.grad[0])]).detach()
-
-
-def check(model: System, batch: Batch, solver: Solver, limit: float = 1e-10) -> None:
-    """Compare states and gradients in float64."""
-    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
-    assert wanted.abs().max() > 0
-    found, own = gradient(model, solver, batch)
-    mask = batch.valid[..., None].expand_as(exact.x)
-    assert exact.v is not None
-    assert found.v is not None
-    torch.testing.assert_close(found.x[mask], exact.x[mask], rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(found.v[mask], exact.v[mask], rtol=1e-12, atol=1e-12)
-    assert difference(own, wanted) < limit
-
-
 @pytest.mark.thorough  # each precision is compiled for
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_single_precision(name: str, people: list[Sequence]) -> None:
-    batch, model = single(people), Crowd(MODELS[name]()).to(torch.float32).to(torch.float64)
-    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", DT), batch)
-    found, own = gradient(model.to(torch.float32), FusedSolver(DT), batch.to(dtype=torch.float32))
-    assert {p.grad.dtype for p in model.parameters()} == {torch.float32}
-    mask = batch.valid[..., None].expand_as(exact.x)
-    torch.testing.assert_close(found.x[mask].double(), exact.x[mask], rtol=1e-6, atol=1e-6)
-    assert difference(own, wanted) < 1e-4
+    model = Crowd(MODELS[name]()).to(torch.float32).to(torch.float64)
+    close = {"limit": 1e-4, "rtol": 1e-6, "atol": 1e-6}
+    compare(model, single(people), DT, FusedSolver(DT), single_precision=True, **close)
 
 
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_many_blocks_and_threads(name: str) -> None:
     # more than fit into one block, and rows that are cut into pieces
     items = [crowd(3 + i % 5, samples=3, name=f"m{i}") for i in range(150)]
-    batch, model = single(items), Crowd(MODELS[name]())
-    check(model, batch, FusedSolver(DT))
-    one, share = gradient(model, FusedSolver(DT), batch)
-    for threads in (2, 3):
-        many, same = gradient(model, FusedSolver(DT, threads), batch)
-        torch.testing.assert_close(many.x, one.x, rtol=1e-13, atol=1e-13)
-        assert difference(same, share) < 1e-12
+    solvers = [FusedSolver(DT, threads) for threads in (1, 2, 3)]
+    compare(Crowd(MODELS[name]()), single(items), DT, *solvers)
 
 
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_rows_longer_than_a_piece(name: str) -> None:
-    draw = np.random.default_rng(5)
-    x = np.tile(draw.uniform(0, 25, (SIZE + 21, 2)), (2, 1, 1))
+    x = np.tile(np.random.default_rng(5).uniform(0, 25, (SIZE + 21, 2)), (2, 1, 1))
     x[1] += 0.1
-    wall = np.array([[-1.0, 0.0, 0.0, 0.0]])
-    item = Sequence(name="l", recording="r", time=np.array([0, 0.1]), x=x, walls=wall)
-    check(Crowd(MODELS[name]()), single([item]), FusedSolver(DT, cutoff_error=0))
+    item = builders.people(x, 0.1, walls=np.array([[-1.0, 0.0, 0.0, 0.0]]))
+    compare(Crowd(MODELS[name]()), single([item]), DT, FusedSolver(DT, cutoff_error=0))
 
 
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_far_from_the_origin(name: str) -> None:
-    item = crowd(6, samples=4)
-    far = np.array([3000.0, -800.0])
-    moved = Sequence(
-        name="far",
-        recording="r",
-        time=item.time,
-        x=item.x + far,
-        v=item.v,
-        destination=item.destination + far,
-        walls=item.walls + np.tile(far, 2),
-    )
-    check(Crowd(MODELS[name]()), collate([moved]), FusedSolver(DT), limit=1e-9)
+    item, far = crowd(6, samples=4), np.array([3000.0, -800.0])
+    goals, walls = item.destination + far, item.walls + np.tile(far, 2)
+    moved = replace(item, x=item.x + far, destination=goals, walls=walls)
+    compare(Crowd(MODELS[name]()), collate([moved]), DT, FusedSolver(DT), limit=1e-9)
 
 
 def test_people_in_one_place() -> None:
     item = crowd(3, samples=3)
     item.x[:, 1] = item.x[:, 0]
-    check(Crowd(MODELS["sf"]()), collate([item]), FusedSolver(DT))
+    compare(Crowd(MODELS["sf"]()), collate([item]), DT, FusedSolver(DT))
 
 
 def test_saturated_neurons(people: list[Sequence]) -> None:
@@ -154,7 +104,7 @@ def test_saturated_neurons(people: list[Sequence]) -> None:
             if isinstance(term, Law) and term.entry == "network_force":
                 term.pair.layers[0].bias[:2] = torch.tensor([25.0, -40.0])
                 term.wall.layers[0].weight.mul_(30.0)
-    check(model, single(people), FusedSolver(DT))
+    compare(model, single(people), DT, FusedSolver(DT))
 
 
 @pytest.mark.parametrize(
@@ -162,8 +112,8 @@ def test_saturated_neurons(people: list[Sequence]) -> None:
 )
 def test_padding_stands_still(name: str, options: dict[str, float], people: list[Sequence]) -> None:
     batch = single(people)
-    x0, v0 = batch.x.clone().requires_grad_(), batch.v.clone().requires_grad_()
-    moving = Batch(**{**vars(batch), "x": x0, "v": v0})
+    x0 = batch.x.clone().requires_grad_()
+    moving = replace(batch, x=x0)
     model = Crowd(MODELS[name]())
     law = compiled.supports(model, moving)
     assert law is not None
@@ -181,10 +131,9 @@ def test_without_gradient_nothing_changes(people: list[Sequence]) -> None:
     for name in ("sf", "nn"):
         batch, model = collate(people), Crowd(MODELS[name]())
         with torch.no_grad():
-            found = FusedSolver(DT)(model, batch).x
-        assert not found.requires_grad
-        same = FusedSolver(DT)(model, batch).x.detach()
-        torch.testing.assert_close(found, same, rtol=1e-14, atol=1e-14)
+            x = FusedSolver(DT)(model, batch).x
+        assert not x.requires_grad
+        torch.testing.assert_close(x, FusedSolver(DT)(model, batch).x, rtol=1e-14, atol=1e-14)
 
 
 def test_a_blow_up_is_reported() -> None:
@@ -224,8 +173,8 @@ def test_what_is_covered(people: list[Sequence]) -> None:
     alone.neighbours = "measured"
     assert not compiled.supports(alone)
     # what sums run over is one for all of them, and only networks' may be over oneself
-    both = [*MODELS["nn_self"](), CATALOGUE.effects["alignment"](c=0.2)]
-    assert not compiled.supports(Crowd(both))
+    terms = [*MODELS["nn_self"](), CATALOGUE.effects["alignment"](c=0.2)]
+    assert not compiled.supports(Crowd(terms))
     batch.destination.requires_grad_()
     assert not compiled.supports(Crowd(MODELS["sf"]()), batch)
 
@@ -249,15 +198,15 @@ def test_loops_are_vector_code(name: str) -> None:
     source = CrowdSource(law)
     module = compiled.compiled(source)
     for kind in (np.float64, np.float32):
-        room, q = np.ones(module.ROWS * SIZE, kind), np.ones(len(source.uniform), kind)
+        buffer, q = np.ones(module.ROWS * SIZE, kind), np.ones(len(source.uniform), kind)
         loops = ("law_others_vjp", "law_points_vjp", "slopes_others", "slopes_points")
-        divide = [getattr(module, one) for one in loops if hasattr(module, one)]
+        divide = [getattr(module, name) for name in loops if hasattr(module, name)]
         assert len(divide) == 2
         for function in divide:
             if function.__name__.startswith("law"):
-                function(room, 0, 32, q, kind(0), kind(1), 0, np.zeros(len(q)))
+                function(buffer, 0, 32, q, kind(0), kind(1), 0, np.zeros(len(q)))
             else:
-                function(room, *(np.ones(32, kind) for _ in range(3)), 32, kind(1))
+                function(buffer, *(np.ones(32, kind) for _ in range(3)), 32, kind(1))
             text = function.inspect_asm(function.signatures[-1])
             assert re.findall(PACKED[platform.machine()], text), function.__name__
 
@@ -295,13 +244,13 @@ def in_groups(people: list[Sequence]) -> list[Sequence]:
     ("base", "chosen"), [("sf", ("sums", "force", "walls")), ("nn", ("force",))], ids=str
 )
 def test_effects(base: str, chosen: tuple[str, ...], people: list[Sequence]) -> None:
-    check(with_effects(base, *chosen), single(in_groups(people)), FusedSolver(DT, 2))
+    compare(with_effects(base, *chosen), single(in_groups(people)), DT, FusedSolver(DT, 2))
 
 
 @pytest.mark.thorough
 def test_effects_among_neighbours(people: list[Sequence]) -> None:
     model, batch = with_effects("sf", "walls"), single(in_groups(people))
-    check(model, batch, FusedSolver(DT, cutoff=50.0))
+    compare(model, batch, DT, FusedSolver(DT, cutoff=50.0))
     # one that leaves people out is another model
     with torch.no_grad():
         whole, near = (FusedSolver(DT, cutoff=c)(model, batch).x[-1] for c in (50.0, 0.6))

@@ -74,9 +74,9 @@ def test_every_run_is_its_own(name, threads, ragged) -> None:  # type: ignore[no
 def test_missing_parameters_are_the_own_ones(ragged) -> None:  # type: ignore[no-untyped-def]
     batch, model = single(ragged), Traffic([make_law("lin", v0=18.0, L=4.0)])
     lengths = torch.tensor([3.0, 4.0], dtype=torch.float64)
-    found = FusedSolver(DT).ensemble(model, {"terms.0.L": lengths}, batch).x
-    torch.testing.assert_close(found[:, 1], FusedSolver(DT)(model, batch).x, rtol=0, atol=0)
-    assert (found[:, 0] - found[:, 1]).abs().max() > 0.01
+    results = FusedSolver(DT).ensemble(model, {"terms.0.L": lengths}, batch).x
+    torch.testing.assert_close(results[:, 1], FusedSolver(DT)(model, batch).x, rtol=0, atol=0)
+    assert (results[:, 0] - results[:, 1]).abs().max() > 0.01
 
 
 def test_a_run_that_blows_up_stays_alone() -> None:
@@ -110,14 +110,14 @@ def test_refusals(ragged) -> None:  # type: ignore[no-untyped-def]
 )
 def test_both_arrangements_agree(name, dtype, equal, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     batch, model = single(equal).to(dtype=dtype), MODELS[name]().to(dtype)
-    found = []
+    results = []
     for enough in (0, 10_000):
         monkeypatch.setattr(lanes, "_ENOUGH", enough)
         parameters = spread(model, 5)
         x = FusedSolver(DT).ensemble(model, parameters, batch).x
         (x - batch.x[:, None]).square().sum().backward()
         grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters.values()]
-        found.append((x.detach(), torch.cat([g.flatten() for g in grads])))
+        results.append((x.detach(), torch.cat([g.flatten() for g in grads])))
     small = torch.finfo(dtype).eps
-    torch.testing.assert_close(found[0][0], found[1][0], rtol=10 * small, atol=100 * small)
-    assert difference(found[0][1], found[1][1]) < 1e3 * small
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=10 * small, atol=100 * small)
+    assert difference(results[0][1], results[1][1]) < 1e3 * small

@@ -76,9 +76,9 @@ def test_it_is_said_once_in_a_run_and_why(name, ragged, caplog) -> None:  # type
     batch = single([crowd(3, samples=4)] if system.domain == "crowd" else ragged)
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
-            found = solver(system, batch).x
-    assert torch.equal(found, TorchdiffeqSolver(gradient="discrete")(system, batch).x)
-    assert found.requires_grad
+            simulated = solver(system, batch).x
+    assert torch.equal(simulated, TorchdiffeqSolver(gradient="discrete")(system, batch).x)
+    assert simulated.requires_grad
     (record,) = caplog.records
     assert record.levelname == "WARNING"
     for words in ("in PyTorch", SAID[name], "docs/performance.md"):

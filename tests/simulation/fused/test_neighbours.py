@@ -20,8 +20,9 @@ from nnode.model.formula import crowd_of
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.kernels import crowds
 from tests.builders import social_forces, straight
-from tests.simulation.fused.compare import difference
-from tests.simulation.fused.test_crowd import gradient
+from tests.simulation.fused.compare import compare, difference, gradient
+
+DT = 0.02
 
 
 @cache
@@ -60,23 +61,30 @@ def near(a: np.ndarray, b: np.ndarray, cutoff: float) -> set[tuple[int, int]]:
     return {(int(i), int(j)) for i, j in np.argwhere(away < cutoff**2)}
 
 
+def pairs_of(x: np.ndarray, cutoff: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """The order of people in the cells, pairs of places in it, and the number of those that
+    count."""
+    cells = neighbours().grid(x[:, 0], x[:, 1], cutoff)
+    assert cells[4] * cells[5] <= 4 * len(x) + 16
+    order, cell, start = neighbours().sort(x[:, 0], x[:, 1], cells)
+    y, small = x[order].T, np.empty((2, 1), np.int32)
+    return order, *neighbours().people_near(y[0], y[1], cells, cell, start, cutoff, small)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("cutoff", [0.7, 1.0, 1.65, 100.0])
 @pytest.mark.parametrize("name", PLACES)
 def test_all_pairs_once(name: str, cutoff: float) -> None:
     x = arrangement(name)
-    cells = neighbours().grid(x[:, 0], x[:, 1], cutoff)
-    assert cells[4] * cells[5] <= 4 * len(x) + 16
-    order, cell, start = neighbours().sort(x[:, 0], x[:, 1], cells)
+    order, pairs, number = pairs_of(x, cutoff)
     assert sorted(order) == list(range(len(x)))
-    y, room = x[order], np.empty((2, 1), np.int32)
-    pairs, number = neighbours().people_near(y[:, 0], y[:, 1], cells, cell, start, cutoff, room)
-    found = [tuple(sorted((order[i], order[j]))) for i, j in pairs[:, :number].T]
-    assert len(set(found)) == len(found)
-    assert set(found) == {pair for pair in near(x, x, cutoff) if pair[0] < pair[1]}
-    both, twice = neighbours().both_ways(pairs, number)
+    indices = [tuple(sorted((order[i], order[j]))) for i, j in pairs[:, :number].T]
+    assert len(set(indices)) == len(indices)
+    assert set(indices) == {pair for pair in near(x, x, cutoff) if pair[0] < pair[1]}
+    directed, twice = neighbours().both_ways(pairs, number)
     assert twice == 2 * number
-    assert {(j, i) for i, j in both[:, :twice].T} == {(i, j) for i, j in both[:, :twice].T}
+    directed = {(int(i), int(j)) for i, j in directed[:, :twice].T}
+    assert {(j, i) for i, j in directed} == directed
 
 
 @pytest.mark.thorough
@@ -86,27 +94,20 @@ def test_people_and_wall_points(name: str, points: str) -> None:
     x, wall, cutoff = arrangement(name), arrangement(points, 80) + np.array([1.0, 0.5]), 1.4
     cells = neighbours().grid(wall[:, 0], wall[:, 1], cutoff)
     order, _, start = neighbours().sort(wall[:, 0], wall[:, 1], cells)
-    there, room = wall[order], np.empty((2, 1), np.int32)
+    placed, pairs_buffer = wall[order], np.empty((2, 1), np.int32)
     pairs, number = neighbours().points_near(
-        x[:, 0], x[:, 1], there[:, 0], there[:, 1], cells, start, cutoff, room
+        x[:, 0], x[:, 1], placed[:, 0], placed[:, 1], cells, start, cutoff, pairs_buffer
     )
-    found = [(i, int(order[p])) for i, p in pairs[:, :number].T]
-    assert len(set(found)) == len(found)
-    assert set(found) == near(x, wall, cutoff)
+    indices = [(i, int(order[p])) for i, p in pairs[:, :number].T]
+    assert len(set(indices)) == len(indices)
+    assert set(indices) == near(x, wall, cutoff)
 
 
 def test_pairs_grow_with_people() -> None:
     # at one person per square metre, half of pi cutoff^2 partners each
-    shares = []
-    for n in (500, 10_000):
-        x = arrangement("square", n)
-        cells = neighbours().grid(x[:, 0], x[:, 1], 1.65)
-        order, cell, start = neighbours().sort(x[:, 0], x[:, 1], cells)
-        y, room = x[order], np.empty((2, 1), np.int32)
-        _, number = neighbours().people_near(y[:, 0], y[:, 1], cells, cell, start, 1.65, room)
-        shares.append(number / n)
-    assert shares[1] == pytest.approx(math.pi * 1.65**2 / 2, rel=0.05)
-    assert shares[1] / shares[0] < 1.3
+    few, many = (pairs_of(arrangement("square", n), 1.65)[2] / n for n in (500, 10_000))
+    assert many == pytest.approx(math.pi * 1.65**2 / 2, rel=0.05)
+    assert many / few < 1.3
 
 
 def hall(n: int, samples: int = 3, dt: float = 0.04, walls: int = 2) -> Batch:
@@ -123,49 +124,41 @@ def hall(n: int, samples: int = 3, dt: float = 0.04, walls: int = 2) -> Batch:
     return collate(items)
 
 
+A, MASS = 3.0, 2.0
+
+
+def omitted(batch: Batch, decay: float = 0.05, **options: float) -> float:
+    """The largest error of a person's acceleration, m/s², by partners beyond a cutoff."""
+    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0, B=decay, mass=MASS))
+    with torch.no_grad():
+        v = FusedSolver(batch.dt, **options)(model, batch).v
+        exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
+    assert v is not None
+    assert exact is not None
+    return float((v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt)
+
+
 @pytest.mark.parametrize("cutoff_error", [1e-3, 1e-6, 1e-10])
 def test_the_bound_holds(cutoff_error: float) -> None:
-    A, mass, n = 3.0, 2.0, 300
-    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0, mass=mass))
     # wall points would be averaged over their own number: one bound at a time
     for walls in (False, True):
-        batch = hall(n, walls=2 * walls)
-        with torch.no_grad():
-            v = FusedSolver(batch.dt, cutoff_error=cutoff_error)(model, batch).v
-            exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
-        assert v is not None
-        assert exact is not None
-        away = (v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt
+        error = omitted(hall(300, walls=2 * walls), cutoff_error=cutoff_error)
         # pairs and walls are two means, each within the bound
-        assert away <= (1 + walls) * cutoff_error * A / mass + 1e-12
+        assert error <= (1 + walls) * cutoff_error * A / MASS + 1e-12
         if cutoff_error == 1e-3:
-            assert away > 0  # something was left out
+            assert error > 0  # something was left out
 
 
 @pytest.mark.parametrize("cutoff", [0.8, 1.5])
 def test_the_bound_of_a_given_distance(cutoff: float) -> None:
-    A, decay, mass = 3.0, 0.1, 2.0
-    batch = hall(40, walls=0)  # small crowds have a cutoff where one is given
-    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0, B=decay, mass=mass))
-    with torch.no_grad():
-        v = FusedSolver(batch.dt, cutoff=cutoff, cutoff_error=0)(model, batch).v
-        exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
-    assert v is not None
-    assert exact is not None
-    away = (v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt
-    assert 0 < away < math.exp((0.5 - cutoff) / decay) * A / mass
+    # small crowds have a cutoff where one is given
+    error = omitted(hall(40, walls=0), decay=0.1, cutoff=cutoff, cutoff_error=0)
+    assert 0 < error < math.exp((0.5 - cutoff) / 0.1) * A / MASS
 
 
-@pytest.mark.thorough  # compiled for
-def test_no_error_is_everybody() -> None:
-    batch = hall(crowds.LISTS_FROM + 20)
-    model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0))
-    with torch.no_grad():
-        exact = TorchdiffeqSolver("euler", "discrete")(model, batch).x
-        for error, same in ((0.0, True), (1e-3, False)):
-            found = FusedSolver(batch.dt, cutoff_error=error)(model, batch).x
-            away = float((found - exact)[batch.valid].abs().max())
-            assert (away < 1e-13) is same
+def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
+    # the force on one person, not divided by the number of people
+    assert omitted(hall(2000, walls=0)) * MASS * 2000 < 1e-6 * A
 
 
 @pytest.mark.parametrize(
@@ -206,20 +199,6 @@ def test_models_that_cannot_have_a_cutoff() -> None:
         assert torch.equal(solver(alone, batch).x, FusedSolver()(alone, batch).x)
 
 
-def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
-    # the force on one person, not divided by the number of people
-    A, n = 3.0, 2000
-    batch = hall(n, walls=0)
-    model = Crowd(social_forces(A=A, k=40.0, kappa=5.0))
-    with torch.no_grad():
-        law = crowds.supports(model, batch)
-        assert law is not None
-        v = crowds.simulate(model, law, batch, 1)[..., 2:]
-        exact = crowds.simulate(model, law, batch, 1, cutoff_error=0)[..., 2:]
-    away = (v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt
-    assert away * n < 1e-6 * A
-
-
 def test_the_formula_of_the_bound() -> None:
     for reach, decay, error in ((0.5, 0.05, 1e-10), (0.25, 0.1, 1e-3)):
         c = crowds.cutoff_distance(reach, decay, error)
@@ -231,26 +210,21 @@ def test_the_formula_of_the_bound() -> None:
 def test_lists_give_the_gradient(walls: bool) -> None:
     batch = hall(crowds.LISTS_FROM + 20)
     model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0, walls=walls))
-    exact, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
-    for threads in (1, 2):
-        found, own = gradient(model, FusedSolver(0.02, threads), batch)
-        mask = batch.valid[..., None].expand_as(exact.x)
-        torch.testing.assert_close(found.x[mask], exact.x[mask], rtol=0, atol=1e-9)
-        assert difference(own, wanted) < 1e-8
-        # the lists were used, and a cutoff that reaches everybody leaves nothing out
-        assert (found.x[mask] != exact.x[mask]).any()
-    _, own = gradient(model, FusedSolver(0.02, cutoff=100.0), batch)
-    assert difference(own, wanted) < 1e-10
+    compare(model, batch, DT, FusedSolver(DT), FusedSolver(DT, 2), limit=1e-8, rtol=0, atol=1e-9)
+    # a cutoff that reaches everybody leaves nothing out
+    compare(model, batch, DT, FusedSolver(DT, cutoff=100.0))
+    with torch.no_grad():  # the lists were used
+        assert not torch.equal(
+            FusedSolver(DT)(model, batch).x, FusedSolver(DT, cutoff=100.0)(model, batch).x
+        )
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("walls", [False, True])
 def test_lists_in_single_precision(walls: bool) -> None:
-    batch = hall(crowds.LISTS_FROM + 20)
     model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0, walls=walls))
-    _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
-    single = gradient(model.to(torch.float32), FusedSolver(0.02), batch.to(dtype=torch.float32))
-    assert difference(single[1], wanted) < 1e-4
+    batch, close = hall(crowds.LISTS_FROM + 20), {"limit": 1e-4, "rtol": 1e-4, "atol": 1e-4}
+    compare(model, batch, DT, FusedSolver(DT), single_precision=True, **close)
 
 
 def networks(oneself: bool) -> Crowd:
@@ -263,24 +237,20 @@ def networks(oneself: bool) -> Crowd:
     )
 
 
+# the gradient is compiled for as long as everything above
+@pytest.mark.parametrize("grad", [False, pytest.param(True, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("oneself", [False, True])
-def test_networks_with_a_cutoff(oneself: bool) -> None:
+def test_networks_with_a_cutoff(oneself: bool, grad: bool) -> None:
     batch, model = hall(40), networks(oneself)
-    with torch.no_grad():
-        exact = TorchdiffeqSolver("euler", "discrete", 0.02)(model, batch).x[batch.valid]
-        for cutoff, same in ((100.0, True), (2.0, False)):
-            found = FusedSolver(0.02, cutoff=cutoff)(model, batch).x[batch.valid]
-            assert (float((found - exact).abs().max()) < 1e-12) is same
-
-
-@pytest.mark.thorough  # compiled for as long as everything above
-@pytest.mark.parametrize("oneself", [False, True])
-def test_the_gradient_of_networks_with_a_cutoff(oneself: bool) -> None:
-    batch, model = hall(40), networks(oneself)
-    _, wanted = gradient(model, TorchdiffeqSolver("euler", "discrete", 0.02), batch)
-    for cutoff, same in ((100.0, True), (2.0, False)):
-        _, own = gradient(model, FusedSolver(0.02, cutoff=cutoff), batch)
-        assert (difference(own, wanted) < 1e-10) is same
+    solvers = [TorchdiffeqSolver("euler", "discrete", DT)]
+    solvers += [FusedSolver(DT, cutoff=cutoff) for cutoff in (100.0, 2.0)]
+    if grad:
+        exact, same, near = (gradient(model, solver, batch)[1] for solver in solvers)
+    else:
+        with torch.no_grad():
+            exact, same, near = (solver(model, batch).x[batch.valid] for solver in solvers)
+    assert difference(same, exact) < 1e-10 if grad else 1e-13
+    assert difference(near, exact) > 1e-10
 
 
 SCALE = """

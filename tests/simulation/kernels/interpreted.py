@@ -33,13 +33,13 @@ def _float(operation: Any, otherwise: float) -> Any:
     """A function of the mathematical library that gives what compiled code gives outside its
     domain."""
 
-    def found(x: float) -> float:
+    def checked(x: float) -> float:
         try:
             return float(operation(x))
         except (ValueError, OverflowError):
             return otherwise
 
-    return found
+    return checked
 
 
 #: What the generated source imports, for numbers in float64.

@@ -104,9 +104,9 @@ def test_damaged_compiled_code_is_made_again(folder: Path, ending: str, size: in
     assert cache.keep("nnode_damaged", TEXT).plus(1) == 2
     (path,) = folder.rglob(f"*{ending}")
     path.write_bytes(path.read_bytes()[:size])
-    again = cache.keep("nnode_damaged", TEXT)
-    assert again.plus(1) == 2
-    assert sum(again.plus.stats.cache_misses.values()) == 1
+    second = cache.keep("nnode_damaged", TEXT)
+    assert second.plus(1) == 2
+    assert sum(second.plus.stats.cache_misses.values()) == 1
     once_more = cache.keep("nnode_damaged", TEXT)
     assert once_more.plus(1) == 2
     assert sum(once_more.plus.stats.cache_hits.values()) == 1

@@ -21,10 +21,12 @@ def many() -> System:
 
 
 def test_a_smallest_value_by_loops() -> None:
-    model, one = many(), room().select([0])
-    found = model(torch.zeros(()), model.initial(one), model.scene(one))[0, :, 2].detach().numpy()
-    x, v = one.x[0, 0].numpy(), one.v[0, 0].numpy()
-    goal = one.destination[0].numpy()
+    model, batch = many(), room().select([0])
+    rates = (
+        model(torch.zeros(()), model.initial(batch), model.scene(batch))[0, :, 2].detach().numpy()
+    )
+    x, v = batch.x[0, 0].numpy(), batch.v[0, 0].numpy()
+    goal = batch.destination[0].numpy()
     for i in range(6):
         d = np.array([np.hypot(*(x[i] - x[j])) for j in range(6) if j != i])
         dx = np.array([x[i, 0] - x[j, 0] for j in range(6) if j != i])
@@ -33,7 +35,7 @@ def test_a_smallest_value_by_loops() -> None:
         way = (goal[i] - x[i]) / np.hypot(*(goal[i] - x[i]))
         drive = (np.hypot(*v[i]) * way[0] - v[i, 0]) / 0.7
         push = 0.6 * max(1.0 - closest, 0) / 0.7
-        np.testing.assert_allclose(found[i], drive + push + 0.3 * max(right, -0.5), rtol=1e-4)
+        np.testing.assert_allclose(rates[i], drive + push + 0.3 * max(right, -0.5), rtol=1e-4)
 
 
 def test_the_first_of_several_has_the_slope() -> None:
@@ -49,18 +51,18 @@ def test_the_first_of_several_has_the_slope() -> None:
     still = Sequence(
         name="a", recording="a", time=0.04 * np.arange(2.0), x=place.repeat(2, 1, 1).numpy()
     )
-    one = collate([still])
+    batch = collate([still])
     y = place.clone().requires_grad_()
-    model(torch.zeros(()), y, model.scene(one))[0, 0, 0].backward()
+    model(torch.zeros(()), y, model.scene(batch))[0, 0, 0].backward()
     assert y.grad is not None
     np.testing.assert_allclose(y.grad[0], [[-1, 0], [1, 0], [0, 0]], atol=1e-5)
 
 
 def test_derivatives_of_a_law_with_a_smallest_value() -> None:
     options = model_options("cfsm")
-    model, one = build_model({**options, "desired": "direction"}), room().select([1])
-    scene, zero = model.scene(one), torch.zeros((), dtype=torch.float64)
-    y = model.initial(one).requires_grad_()
+    model, batch = build_model({**options, "desired": "direction"}), room().select([1])
+    scene, zero = model.scene(batch), torch.zeros((), dtype=torch.float64)
+    y = model.initial(batch).requires_grad_()
     assert torch.autograd.gradcheck(lambda y: model(zero, y, scene), (y,), eps=1e-7, atol=1e-5)
 
 

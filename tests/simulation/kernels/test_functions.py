@@ -62,10 +62,10 @@ def arguments(name: str, kind: Any) -> np.ndarray:
 @pytest.mark.parametrize("name", EXACT)
 def test_a_few_units_in_the_last_place(name: str, kind: Any) -> None:
     x = arguments(name, kind)
-    found = np.empty_like(x)
-    LOOPS[name](x, found)
+    computed = np.empty_like(x)
+    LOOPS[name](x, computed)
     with mpmath.workdps(40):
-        for value, result in zip(x, found, strict=True):
+        for value, result in zip(x, computed, strict=True):
             exact = EXACT[name](mpmath.mpf(float(value)))
             error = abs(mpmath.mpf(float(result)) - exact)
             assert error <= 4 * float(np.finfo(kind).eps) * abs(exact), value
@@ -78,27 +78,27 @@ def test_a_few_units_in_the_last_place(name: str, kind: Any) -> None:
 )
 def test_saturates_without_nan(name: str, below: float, above: float | None, kind: Any) -> None:
     large = np.array([1e3, 1e20, np.finfo(kind).max, np.inf], kind)
-    found = np.empty_like(large)
-    LOOPS[name](-large, found)
-    np.testing.assert_array_equal(found, below)
-    LOOPS[name](large, found)
-    np.testing.assert_array_equal(found, large if above is None else above)
+    computed = np.empty_like(large)
+    LOOPS[name](-large, computed)
+    np.testing.assert_array_equal(computed, below)
+    LOOPS[name](large, computed)
+    np.testing.assert_array_equal(computed, large if above is None else above)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_logarithm_at_its_ends(kind: Any) -> None:
     x = np.array([0.0, -1.0, -np.inf, np.inf], kind)
-    found = np.empty_like(x)
-    LOOPS["log"](x, found)
-    np.testing.assert_array_equal(found, np.array([-np.inf, np.nan, np.nan, np.inf], kind))
+    computed = np.empty_like(x)
+    LOOPS["log"](x, computed)
+    np.testing.assert_array_equal(computed, np.array([-np.inf, np.nan, np.nan, np.inf], kind))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", EXACT)
 def test_nan_stays_nan(name: str, kind: Any) -> None:
-    found = np.zeros(40, kind)
-    LOOPS[name](np.full(40, np.nan, kind), found)
-    assert np.isnan(found).all()
+    computed = np.zeros(40, kind)
+    LOOPS[name](np.full(40, np.nan, kind), computed)
+    assert np.isnan(computed).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)

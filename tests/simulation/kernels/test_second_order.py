@@ -10,7 +10,7 @@ import torch
 
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError
-from nnode.model import Traffic, build_model, make_law
+from nnode.model import build_model
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.kernels import lanes
 from tests.builders import lane
@@ -36,24 +36,19 @@ def idm(v: float, gap: float, dv: float, row: list[float]) -> float:
 
 def loop(batch: Any, b: int, row: list[float], per: int, ballistic: bool) -> np.ndarray:
     """Places of a platoon behind its measured leader, one vehicle and step after the other."""
-    n = int(batch.agent[b].sum())
-    k = int(batch.valid[:, b].any(-1).sum())
-    place, speed = (batch.x[:k, b, :n, 0].numpy(), batch.v[:k, b, :n, 0].numpy())
+    n, k = int(batch.agent[b].sum()), int(batch.valid[:, b].any(-1).sum())
+    place, speed = (values[:k, b, :n, 0].numpy() for values in (batch.x, batch.v))
     x, v, h = place[0].copy(), speed[0].copy(), batch.dt / per
-    found = [x.copy()]
+    states = [x.copy()]
     for step in range(per * (k - 1)):
-        i, part = divmod(step, per)
-        part /= per
-        x[-1] = place[i, -1] + part * (place[i + 1, -1] - place[i, -1])
-        v[-1] = speed[i, -1] + part * (speed[i + 1, -1] - speed[i, -1])
+        x[-1], v[-1] = (np.interp(step / per, np.arange(k), path[:, -1]) for path in (place, speed))
         a = [idm(v[j], x[j + 1] - x[j], v[j] - v[j + 1], row) for j in range(n - 1)]
         for j in range(n - 1):
             x[j] += h * (v[j] + (h * a[j] / 2 if ballistic else 0))
             v[j] += h * a[j]
         if (step + 1) % per == 0:
-            x[-1] = place[i + 1, -1]
-            found.append(x.copy())
-    return np.array(found)
+            states.append(np.append(x[:-1], place[(step + 1) // per, -1]))
+    return np.array(states)
 
 
 @pytest.mark.parametrize("method", ["euler", "ballistic"])
@@ -68,8 +63,8 @@ def test_the_intelligent_driver_is_what_its_formula_says(method: str, ragged: An
     assert v is not None
     for b in range(len(batch.names)):
         wanted = loop(batch, b, row, 10, method == "ballistic")
-        found = x[: len(wanted), b, : wanted.shape[1], 0].detach().numpy()
-        np.testing.assert_allclose(found, wanted, rtol=1e-12)
+        simulated = x[: len(wanted), b, : wanted.shape[1], 0].detach().numpy()
+        np.testing.assert_allclose(simulated, wanted, rtol=1e-12)
 
 
 def test_a_platoon_keeps_the_gap_of_equilibrium() -> None:
@@ -81,29 +76,19 @@ def test_a_platoon_keeps_the_gap_of_equilibrium() -> None:
     x = np.array([0.0, gap, 2 * gap]) + v * 0.1 * np.arange(50)[:, None]
     batch = collate([lane(x, 0.1)])
     with torch.no_grad():
-        found = FusedSolver(0.01)(system, batch).x
-    np.testing.assert_allclose(found.numpy(), batch.x.numpy(), rtol=0, atol=1e-9)
+        simulated_x = FusedSolver(0.01)(system, batch).x
+    np.testing.assert_allclose(simulated_x.numpy(), batch.x.numpy(), rtol=0, atol=1e-9)
 
 
-def test_one_line_is_the_law_that_the_package_has(ragged: Any) -> None:
-    batch, own, known = single(ragged), build_model(OWN), Traffic([make_law("lin", v0=18.0, L=4.0)])
-    found, slope = gradient(own, FusedSolver(DT), batch)
-    exact, wanted = gradient(known, FusedSolver(DT), batch)
-    torch.testing.assert_close(found.x, exact.x, rtol=1e-14, atol=1e-12)
-    assert difference(slope, wanted) < 1e-12
-    assert (TorchdiffeqSolver("euler", "discrete", DT)(own, batch).x - exact.x).abs().max() < 1e-9
-
-
-def test_effects_act_on_a_law_of_one_s_own(ragged: Any) -> None:
-    effects = [{"name": "relative_speed", "kappa": 0.3}]
+@pytest.mark.parametrize("effects", [[], [{"name": "relative_speed", "kappa": 0.3}]])
+def test_one_line_is_the_law_that_the_package_has(effects: list[Any], ragged: Any) -> None:
     batch, own = single(ragged), build_model({**OWN, "effects": effects})
-    known = build_model(
-        {**OWN, "term": "lin", "v0": 18.0, "L": 4.0, "L_min": 2, "effects": effects}
-    )
-    with torch.no_grad():
-        found = FusedSolver(DT)(own, batch).x
-        exact = TorchdiffeqSolver("euler", "discrete", DT)(known, batch).x
-    torch.testing.assert_close(found, exact, rtol=1e-13, atol=1e-12)
+    lin = {"name": "lin", "term": "lin", "leader": "constant", "v0": 18.0, "L": 4.0, "L_min": 2}
+    path, slope = gradient(own, FusedSolver(DT), batch)
+    solver = TorchdiffeqSolver("euler", "discrete", DT)
+    exact, wanted = gradient(build_model({**lin, "effects": effects}), solver, batch)
+    torch.testing.assert_close(path.x, exact.x, rtol=1e-13, atol=1e-9)
+    assert difference(slope, wanted) < 1e-10
 
 
 @pytest.mark.parametrize(

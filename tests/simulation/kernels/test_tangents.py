@@ -6,30 +6,19 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from nnode.data.sequence import Batch, collate
+from nnode.data.sequence import Batch
 from nnode.model import Traffic, build_model
 from nnode.model.arrays import Formulas
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.tangent import with_tangents
 from nnode.simulation.kernels import lanes
-from tests.builders import lane
 from tests.model.following import DT, model, set_
 from tests.simulation.kernels.interpreted import interpreted
-
-
-def platoons(numbers: tuple[int, ...] = (4, 2, 3)) -> Batch:
-    """Platoons of different lengths in vehicles and time, in a wave."""
-    found = []
-    for i, n in enumerate(numbers):
-        t = DT * np.arange(9 - 2 * i)[:, None] - 0.3 * np.arange(n)[::-1]
-        x = 12 * t + 2 * np.sin(t + i) + (22.3 + i) * np.arange(n)
-        found.append(lane(x, DT, v=12 + 2 * np.cos(t + i), length=4.0, name=f"p{i}"))
-    return collate(found)
+from tests.simulation.test_engines import platoons
 
 
 @pytest.fixture
@@ -48,19 +37,10 @@ def tangents(
 
 
 def linear(*effects: dict[str, Any], leader: str = "measured") -> Traffic:
-    found = build_model(
-        {
-            "term": "lin",
-            "name": "lin",
-            "leader": leader,
-            "v0": 25.0,
-            "L": 6.0,
-            "L_min": 2.0,
-            "effects": list(effects),
-        }
-    )
-    assert isinstance(found, Traffic)
-    return found
+    law = {"term": "lin", "name": "lin", "v0": 25.0, "L": 6.0, "L_min": 2.0}
+    system = build_model({**law, "leader": leader, "effects": list(effects)})
+    assert isinstance(system, Traffic)
+    return system
 
 
 @pytest.mark.usefixtures("without_compiler")
@@ -68,7 +48,7 @@ def test_of_a_leader_that_drives_by_the_law() -> None:
     """The first one of a platoon drives at v0: x = x_0 + v0 t."""
     system = linear({"name": "relative_speed", "kappa": 0.4}, leader="constant")
     _, slopes = tangents(system, platoons(), ["lin__v0"])
-    time = DT * torch.arange(9, dtype=torch.float64)
+    time = DT * torch.arange(6, dtype=torch.float64)
     torch.testing.assert_close(slopes[0, :, 0, 3], time, rtol=1e-13, atol=1e-14)
 
 
