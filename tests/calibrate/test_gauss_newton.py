@@ -119,15 +119,6 @@ def test_pooled_parameters_are_found_and_lie_in_their_intervals(pairs: Batch) ->
     assert (each.cost <= cost.costs(fit.row) + 1e-12).all()
 
 
-def test_shrinkage_pulls_towards_the_pool(pairs: Batch) -> None:
-    cost = ResidualProblem(model(**TRUE), pairs, FusedSolver(), Convention.gap)
-    centre = np.array([TRUE[name.split(".")[1]] for name in cost.names])
-    free = alone(cost, centre)
-    tied = alone(cost, centre, penalty=(centre, np.full(5, 1e6)))
-    assert np.abs(tied.row - centre).max() < 1e-3
-    assert np.abs(free.row - centre).max() > np.abs(tied.row - centre).max()
-
-
 def test_parameters_at_a_bound_are_flagged(pairs: Batch) -> None:
     cost = ResidualProblem(model(**{**TRUE, "b": 0.05}), pairs, FusedSolver(), Convention.gap)
     own = intervals(cost, cost.start, np.arange(6))["parameters"]["idm.b"]

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
-from nnode.data.sequence import Sequence, collate
+from nnode.data.sequence import collate
 from nnode.model import Scene, State, Term, make_law
+from tests.builders import lane, straight
 
 #: Distances of two people: overlapping, barely touching, barely apart, out of reach (2 r = 0.5 m).
 DISTANCES = [0.2, 0.499, 0.501, 2.0]
@@ -41,11 +42,8 @@ def seed(number: int) -> torch.Generator:
     ids=lambda t: t.name,
 )
 def test_traffic(term: Term) -> None:
-    items = [
-        Sequence(name=name, recording="r", time=np.arange(2.0), x=np.tile(x, (2, 1))[..., None])
-        for name, x in (("a", [0.0, 6.5, 18.0]), ("b", [3.0, 43.0]))
-    ]
-    batch = collate(items)
+    platoons = {"a": [0.0, 6.5, 18.0], "b": [3.0, 43.0]}
+    batch = collate([lane([x, x], name=name) for name, x in platoons.items()])
     check(term, batch.x[0], None, Scene.of(batch))
 
 
@@ -64,16 +62,8 @@ def test_crowd(term: Term, distance: float) -> None:
     # the third person's distance to the wall's nearest point is distance / 2: the same cases
     x = np.array([[0.0, 1.2], [0.6 * distance, 1.2 + 0.8 * distance], [1.0, distance / 2]])
     v = np.array([[1.1, 0.2], [-0.7, 0.4], [0.9, -0.3]])
-    item = Sequence(
-        name="a",
-        recording="r",
-        time=np.arange(2.0),
-        x=np.tile(x, (2, 1, 1)),
-        v=np.tile(v, (2, 1, 1)),
-        destination=x + np.array([3.0, 0.5]),
-        walls=np.array([[0.0, 0.0, 2.0, 0.0]]),
-    )
-    batch = collate([item])
+    walls = np.array([[0.0, 0.0, 2.0, 0.0]])
+    batch = collate([straight(x, v, 2, 1.0, destination=x + np.array([3.0, 0.5]), walls=walls)])
     check(term, batch.x[0], batch.v[0], Scene.of(batch, 1.0))
 
 
@@ -83,9 +73,8 @@ def test_crowd(term: Term, distance: float) -> None:
     ids=lambda t: t.name,
 )
 def test_people_at_one_place_and_at_rest_have_a_finite_gradient(term: Term) -> None:
-    x = np.zeros((2, 2, 2))
-    item = Sequence(name="a", recording="r", time=np.arange(2.0), x=x, destination=x[0])
-    batch = collate([item])
+    x = np.zeros((2, 2))
+    batch = collate([straight(x, x, 2, 1.0, destination=x)])
     place, speed = batch.x[0].clone().requires_grad_(), batch.v[0].clone().requires_grad_()
     force = term(State(torch.zeros(()), place, speed, Scene.of(batch)))
     gradients = torch.autograd.grad(force.sum(), [place, speed, *term.parameters()])

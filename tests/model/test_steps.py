@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, SimulationError
-from nnode.model import Traffic, build_model, make_law
+from nnode.model import Traffic, make_law
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.steps import METHODS, STAGES, stepped
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
@@ -214,15 +214,7 @@ def test_maps_from_step_to_step_have_no_stages(law: str) -> None:
 
 def test_unknown_methods_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"model\.law\.step=leapfrog is unknown, expected euler"):
-        build_model(
-            {
-                "term": "formula",
-                "name": "a",
-                "leader": "measured",
-                "effects": [],
-                "law": {**BRAKE, "step": "leapfrog"},
-            }
-        )
+        model({**BRAKE, "step": "leapfrog"})
     with pytest.raises(ConfigError, match=r"solver\.method=leapfrog.*ballistic"):
         FusedSolver(method="leapfrog")
     with pytest.raises(ConfigError, match=r"solver\.method=leapfrog.*ballistic"):

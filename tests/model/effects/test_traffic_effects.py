@@ -52,6 +52,12 @@ def law(gap: float) -> float:
 
 
 W = np.array([law(20), law(30), law(40)])
+LAST = W[2] + 0.1 * (12 - W[2])
+SECOND = W[1] + (0.6 if W[1] < LAST else 0.1) * (LAST - W[1])
+TIME_GAPS = [12.0]
+for _gap in (40, 30, 20):
+    TIME_GAPS.insert(0, V0 * (1 - (LENGTH + 0.2 * TIME_GAPS[0]) / _gap))
+del TIME_GAPS[3]
 
 
 @pytest.mark.parametrize(
@@ -81,26 +87,17 @@ W = np.array([law(20), law(30), law(40)])
             {"name": "leader_length", "beta": 1.0},
             [law(20 - 4.5), law(30 + 1.5), law(40 + 1.5)],
         ),
+        # the last one closes in on the leader, the second one on the last one
+        (
+            {"name": "asymmetric_response", "kappa_open": 0.6, "kappa_close": 0.1},
+            [W[0] + 0.6 * (SECOND - W[0]), SECOND, LAST],
+        ),
+        # L + h v of the vehicle ahead in place of L
+        ({"name": "time_gap", "h": 0.2}, TIME_GAPS),
     ],
 )
 def test_rates_are_those_of_the_formula(effect: dict[str, Any], expected: Any) -> None:
     assert rates(model(effect), batch()) == pytest.approx(np.array(expected), rel=1e-9)
-
-
-def test_response_is_asymmetric() -> None:
-    effect = {"name": "asymmetric_response", "kappa_open": 0.6, "kappa_close": 0.1}
-    found = rates(model(effect), batch())
-    assert found[2] == pytest.approx(W[2] + 0.1 * (12 - W[2]))  # closing in on the leader
-    ahead = found[2]
-    factor = 0.6 if ahead > W[1] else 0.1
-    assert found[1] == pytest.approx(W[1] + factor * (ahead - W[1]))
-
-
-def test_time_gap_lengthens_with_the_speed_ahead() -> None:
-    found = rates(model({"name": "time_gap", "h": 0.2}), batch())
-    last = V0 * (1 - (LENGTH + 0.2 * 12) / 40)
-    assert found[2] == pytest.approx(last)
-    assert found[1] == pytest.approx(V0 * (1 - (LENGTH + 0.2 * last) / 30))
 
 
 def ramp(opening: float) -> Batch:
