@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nnode.data.sequence import Batch
-from nnode.model.crowd import norm
+from nnode.model.crowd_formula import norm
 from nnode.model.effects.base import Effect, IndividualEffect, Probe, declare_effects
 from nnode.model.scene import Scene
 from nnode.model.system import System
