@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.io import loadmat
 
 from nnode.calibrate.cost import Convention, sequence_costs, squared_error
 from nnode.calibrate.evaluate import evaluate
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.model import Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver, Trajectory
 from tests.builders import lane
@@ -75,8 +76,7 @@ def test_cost_of_a_recording(real_data: Path, recording: str) -> None:
     for number, cell in enumerate(cells):
         z = np.asarray(cell["Xarr"][0, 0], dtype=float)
         time = np.asarray(cell["Tarr"][0, 0], dtype=float).ravel()
-        name = f"{recording}/{number}"
-        items.append(Sequence(name=name, recording=recording, time=time, x=z.T[:, :, None]))
+        items.append(replace(lane(z.T, name=f"{recording}/{number}"), time=time))
         x, cost = z[:, 0].copy(), 0.0
         for k in range(1, z.shape[1]):
             for _ in range(10):

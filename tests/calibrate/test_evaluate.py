@@ -73,8 +73,7 @@ def test_collisions_by_hand() -> None:
 
 
 def test_crowds_have_no_collisions_and_distances_in_the_plane() -> None:
-    x = np.zeros((2, 2, 2))
-    batch = collate([Sequence(name="p", recording="r", time=np.array([0.0, 0.04]), x=x)])
+    batch = collate([straight(np.zeros((2, 2)), np.zeros((2, 2)), 2, 0.04)])
 
     def away(batch: Batch) -> Trajectory:
         moved = batch.x.clone()
