@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from nnode.simulation import FusedSolver
 from studies.following.candidates import EVERY
 from tests.app.following import pairs
 from tests.builders import lane
+from tests.model.following import idm
 from tests.studies.following.test_fit import HELLY, driven
 
 
@@ -144,9 +146,12 @@ def test_no_fit_of_first_speeds_is_worse_than_the_data_s_own() -> None:
     assert (fitted.costs(row) <= given.costs(row) + 1e-9).all()
 
 
+IDM = SimpleNamespace(v0=30.0, T=1.4, s0=2.0, a=1.2, b=1.5)
+
+
 def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
-    """Platoons of four by idm (v0 = 30, T = 1.4, s0 = 2, a = 1.2, b = 1.5), Heun's method at
-    0.02 s, behind leaders of many speeds, with noise that is new at every 0.1 s."""
+    """Platoons of four by idm with the parameters :data:`IDM`, Heun's method at 0.02 s, behind
+    leaders of many speeds, with noise that is new at every 0.1 s."""
     rng, h, found = np.random.default_rng(seed), 0.02, []
     for number in range(8):
         t = h * np.arange(2001)
@@ -157,8 +162,7 @@ def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
 
         def rate(x: np.ndarray, v: np.ndarray, ahead: float, pace: float) -> np.ndarray:
             before, speed = np.append(x[1:], ahead), np.append(v[1:], pace)
-            wish = 2 + np.maximum(0, 1.4 * v + v * (v - speed) / (2 * np.sqrt(1.2 * 1.5)))
-            return 1.2 * (1 - (v / 30) ** 4 - (wish / (before - x - 4.5)) ** 2)
+            return np.asarray(idm(before - x - 4.5, v, speed, IDM))
 
         v = np.full(3, lead[0]) + rng.normal(size=3)
         x = -np.cumsum(4.5 + (2 + 1.4 * v[::-1]) * rng.uniform(0.8, 1.6, 3))[::-1]
@@ -192,7 +196,7 @@ def test_costs_do_not_rise_from_one_step_of_the_training_loop_to_the_next() -> N
 @pytest.mark.thorough
 def test_noise_of_0_3_m_does_not_bias_what_is_fitted_by_default() -> None:
     table = noisy(0.3)
-    wanted = {"v0": 30.0, "T": 1.4, "s0": 2.0, "a": 1.2, "b": 1.5}
+    wanted = vars(IDM)
     for drivers, kind in ((None, "fitted to each driver"), ("none", "fitted")):
         own = nnode.Calibrator("idm", leader="measured", method="rk4", drivers=drivers).fit(table)
         estimate = own.parameters_["estimate"]

@@ -18,6 +18,7 @@ from nnode.model import Crowd, build_model
 from nnode.model.laws import PEDESTRIAN_LAWS
 from studies.walking.laws import without_walls
 from tests.builders import straight
+from tests.model import following
 
 R = 0.25
 
@@ -42,10 +43,7 @@ def scene(x: Any, v: Any, preferred: Any = None) -> Sequence:
 
 def rates(found: Crowd, item: Sequence) -> np.ndarray:
     """(N, 2): velocities of a law of first order, accelerations of one of second."""
-    batch = collate([item])
-    zero = torch.zeros((), dtype=torch.float64)
-    rate = found(zero, found.initial(batch), found.scene(batch))[0, :, -2:]
-    return np.asarray(rate.detach().numpy())
+    return np.asarray(following.rates(found, collate([item]))[0, :, -2:])
 
 
 def force(found: Crowd, item: Sequence) -> np.ndarray:

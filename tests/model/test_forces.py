@@ -13,6 +13,7 @@ from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, InteractionForce, Law, Scene, State, Term, make_law
 from nnode.model.effects.crowd import FieldOfView
 from tests import builders
+from tests.model.following import rates
 
 A, K, KAPPA, R, B, MASS = 3.0, 40.0, 9.0, 0.25, 0.1, 70.0
 #: the walkable corridor lies between y = 0 and y = 2
@@ -188,8 +189,7 @@ def test_a_crowd_is_relaxation_plus_interaction_of_second_order() -> None:
     batch = collate(CROWDS[:1])
     terms = [make_law("relaxation", tau=0.5), make_law("social_force", A=A, k=K, kappa=KAPPA)]
     model = Crowd(terms, SPACING)
-    y = model.initial(batch)
-    rate = model(torch.zeros(()), y, model.scene(batch)).detach()
+    rate = rates(model, batch)
     torch.testing.assert_close(rate[..., :2], batch.v[0])
     expected = accelerations(terms[0], batch) + accelerations(terms[1], batch)
     np.testing.assert_allclose(rate[..., 2:], expected, rtol=1e-12)

@@ -12,6 +12,7 @@ import torch
 from nnode.data.sequence import Batch, collate
 from nnode.model import Scene, State, Traffic, make_law
 from tests.builders import lane
+from tests.model.following import rates
 
 GAPS = [2.5, 5.0, 7.3, 18.0, 60.0]
 
@@ -19,12 +20,6 @@ GAPS = [2.5, 5.0, 7.3, 18.0, 60.0]
 def at_rest(*platoons: list[float]) -> Batch:
     """Vehicles at rest at positions (m), the last of each platoon leading."""
     return collate([lane([p, p], name=str(i)) for i, p in enumerate(platoons)])
-
-
-def rates(model: Traffic, *platoons: list[float]) -> np.ndarray:
-    batch = at_rest(*platoons)
-    rate = model(torch.zeros(()), batch.x[0], model.scene(batch))
-    return np.asarray(rate[..., 0].detach())
 
 
 @pytest.mark.parametrize("gap", GAPS)
@@ -76,12 +71,12 @@ def test_each_vehicle_looks_at_the_next_and_the_last_drives_at_v0() -> None:
 
 def test_a_measured_leader_is_not_driven_by_the_law() -> None:
     model = Traffic([make_law("lin", v0=20.0, L=4.0)], leader="measured")
-    np.testing.assert_allclose(rates(model, [0.0, 8.0])[0], [10.0, 0.0])
+    np.testing.assert_allclose(rates(model, at_rest([0.0, 8.0]))[0, :, 0], [10.0, 0.0])
 
 
 def test_terms_add_up() -> None:
     model = Traffic([make_law("lin", v0=20.0, L=4.0), make_law("lin", v0=3.0, L=2.0)])
-    np.testing.assert_allclose(rates(model, [0.0, 8.0])[0], [10.0 + 2.25, 23.0])
+    np.testing.assert_allclose(rates(model, at_rest([0.0, 8.0]))[0, :, 0], [10.0 + 2.25, 23.0])
 
 
 @pytest.mark.parametrize("law", ["lin", "log"])

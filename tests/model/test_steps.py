@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.steps import METHODS, STAGES, stepped
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from tests.builders import lane
-from tests.model.following import DT, behind, model, numbers
+from tests.model.following import DT, behind, idm, model, numbers
 
 #: A car that brakes with b m/s², whatever is ahead, and one that accelerates.
 BRAKE = {"parameters": {"b": "3 m/s²"}, "rate": {"v": "0*dv*b/gap - b"}}
@@ -114,8 +113,7 @@ def test_orders_of_accuracy_against_dop853() -> None:
 
     def rates(t: float, y: np.ndarray) -> np.ndarray:
         x, v = np.append(y[:2], start[2] + 14 * t), np.append(y[2:], 14.0)
-        wish = p.s0 + np.maximum(v[:2] * p.T - v[:2] * np.diff(v) / (2 * sqrt(p.a * p.b)), 0)
-        return np.append(v[:2], p.a * (1 - (v[:2] / p.v0) ** 4 - (wish / np.diff(x)) ** 2))
+        return np.append(v[:2], idm(np.diff(x), v[:2], v[1:], p))
 
     exact = solve_ivp(
         rates, (0, seconds), [*start[:2], *speed[:2]], "DOP853", rtol=1e-12, atol=1e-12
@@ -185,9 +183,7 @@ def test_the_default_follows_the_solution_for_half_a_minute() -> None:
             part = np.array([1 - t / DT, t / DT])
             x, v = np.append(y[: n - 1], part @ lead[k : k + 2]), y[n - 1 :]
             ahead = np.append(v[1:], part @ fast[k : k + 2])
-            wish = p.s0 + np.maximum(v * p.T + v * (v - ahead) / (2 * sqrt(p.a * p.b)), 0)
-            rate = p.a * (1 - (v / p.v0) ** 4 - (wish / (np.diff(x) - 4.0)) ** 2)
-            return np.append(v, rate)
+            return np.append(v, idm(np.diff(x) - 4.0, v, ahead, p))
 
         known = solve_ivp(rates, (0, DT), known, "DOP853", rtol=1e-9, atol=1e-9).y[:, -1]
         found.append(known[: n - 1])
