@@ -56,7 +56,7 @@ def _are_formulas(terms: Sequence[Term], order: int) -> bool:
     return all(term.rule_for(order) is not None for term in terms)
 
 
-def _composed(model: D, terms: Sequence[Term], called: bool = False, increment: bool = False) -> D:
+def _composed(empty: D, terms: Sequence[Term], called: bool = False, increment: bool = False) -> D:
     """The flat formulas of terms, added to an empty model.
 
     Args:
@@ -65,6 +65,7 @@ def _composed(model: D, terms: Sequence[Term], called: bool = False, increment: 
     """
     key = (called, increment, *(term.shape for term in terms))
     if key not in _FORMULAS:
+        model: Any = empty
         named = list(zip(range(len(terms)), terms, owners(terms), strict=True))
         # laws come first, so that effects can use them whatever the order of the terms
         for of_laws in (True, False):

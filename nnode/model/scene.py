@@ -224,7 +224,7 @@ def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
         if key not in points_of:
             points_of[key] = _points(segments, spacing)
         rows.append(points_of[key])
-    points, normals = zip(*rows, strict=True)
+    points, normals = map(list, zip(*rows, strict=True))
     point = pad_sequence(points, batch_first=True, padding_value=1e4).to(walls)
     real = torch.arange(point.shape[1]) < torch.tensor([[len(part)] for part in points])
     return point, pad_sequence(normals, batch_first=True).to(walls), real.to(walls.device)

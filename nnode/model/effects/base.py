@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch
@@ -336,7 +336,8 @@ def declare_effects(domain: Domain, file: str, module: dict[str, Any]) -> None:
             "strengths": _parameters(Strength, entry.get("strengths", {})),
             "settings": _parameters(Setting, entry.get("settings", {})),
         }
-        module[title] = CATALOGUE.add(type(title, (module.get(title, Effect),), attributes))
+        effect = type(title, (module.get(title, Effect),), attributes)
+        module[title] = CATALOGUE.add(cast(type[Effect], effect))
 
 
 def _parameters(kind: type[P], entries: Mapping[str, Any]) -> dict[str, P]:

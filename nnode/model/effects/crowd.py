@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -120,8 +120,3 @@ class Attraction(Obstacle):
 
 
 declare_effects("crowd", "crowd.yaml", globals())
-
-if TYPE_CHECKING:
-
-    def __getattr__(name: str) -> Any:
-        """An effect that has no code."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -143,8 +143,3 @@ class TimeGap(Effect):
 
 
 declare_effects("traffic", "lane.yaml", globals())
-
-if TYPE_CHECKING:
-
-    def __getattr__(name: str) -> Any:
-        """An effect that has no code."""

@@ -324,7 +324,8 @@ class Law(Term):
         """Whether it is a speed that depends only on the gap."""
         if self.domain != "traffic" or self.order != 1 or self.formulas.memory:
             return False
-        return _names_gap_alone(self.dynamics(called=True))
+        lane = self.dynamics(called=True)
+        return {"gap", *lane.owned}.issuperset(symbols([_law_alone(lane)]))
 
     def names(self, parameter: str) -> bool:
         """Whether the rate of a vehicle contains a parameter."""
@@ -460,11 +461,6 @@ def _law_alone(lane: LaneDynamics) -> Expr:
     """A law's rate, with fixed quantities as numbers."""
     assert lane.law is not None
     return substitute(lane.law, lane.fixed)
-
-
-@cache
-def _names_gap_alone(lane: LaneDynamics) -> bool:
-    return {"gap", *lane.owned}.issuperset(symbols([_law_alone(lane)]))
 
 
 def _network_output(network: FeedForward, *inputs: Tensor) -> Tensor:
