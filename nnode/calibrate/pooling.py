@@ -41,12 +41,12 @@ LEAST = 5
 
 def random_starts(cost: ResidualProblem, rows: Iterable[np.ndarray], seed: int) -> np.ndarray:
     """``(R, P)`` starts: the first row, then rows with random factors on bounded parameters."""
-    rng = np.random.default_rng(seed)
+    rng, (shrink, stretch) = np.random.default_rng(seed), np.log(FACTORS)
     limited = np.isfinite(cost.low) & np.isfinite(cost.high)
     starts = []
     for i, row in enumerate(rows):
         if i:
-            factor = np.exp(rng.uniform(*np.log(FACTORS), len(row)))
+            factor = np.exp(rng.uniform(shrink, stretch, len(row)))
             row = np.where(limited, row * factor, row)
         starts.append(np.clip(row, cost.low, cost.high))
     return np.stack(starts)
