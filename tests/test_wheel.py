@@ -153,9 +153,9 @@ def test_an_index_can_show_what_the_wheel_says_of_itself(wheel: Path) -> None:
     shipped = {n for n in names if n.startswith("nnode/conf/")}
     ours = {f"nnode/conf/{p.relative_to(ROOT / 'conf')}" for p in (ROOT / "conf").rglob("*.yaml")}
     assert {n for n in ours if "benchmark" not in n and "fault_injection" not in n} == shipped
-    laws = {f"nnode/model/laws/{p.name}" for p in (ROOT / "nnode/model/laws").glob("*.yaml")}
-    assert laws
-    assert laws <= set(names)
+    model = {str(p.relative_to(ROOT)) for p in (ROOT / "nnode/model").rglob("*.yaml")}
+    assert model
+    assert model <= set(names)
 
 
 def test_pictures_and_links_lead_into_a_repository_where_it_is_known() -> None:

@@ -89,11 +89,10 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     Raises:
         WriteError: the disk is full or the folder is not writable; the old file is kept.
     """
-    content = {f.name: getattr(checkpoint, f.name) for f in fields(checkpoint)}
     with disk_words(path.parent), replacing(path) as temporary, open(temporary, "wb") as file:
         # written to memory first, because torch's error would hide that the disk is full
         buffer = io.BytesIO()
-        torch.save(content, buffer)
+        torch.save(vars(checkpoint), buffer)
         file.write(buffer.getbuffer())
         file.flush()
         os.fsync(file.fileno())

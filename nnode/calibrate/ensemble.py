@@ -55,7 +55,7 @@ class EnsembleCost:
         Args:
             weights: ``(R, B)`` or ``(B,)`` weight of every sequence; None takes the mean.
         """
-        stacked = _leaves(self.vector.runs(rows))
+        stacked = {n: p.clone().requires_grad_() for n, p in self.vector.runs(rows).items()}
         each = self._costs(stacked)
         if weights is None:
             cost = each.mean(1)
@@ -65,12 +65,13 @@ class EnsembleCost:
         parts = torch.autograd.grad(cost.sum(), list(stacked.values()))
         gradient = torch.cat([part.reshape(len(rows), -1) for part in parts], 1).double()
         if weights is not None:
-            usable = torch.isfinite(cost) & ~torch.isfinite(gradient).all(1)
-            for r in usable.nonzero().flatten().tolist():
-                gradient[r] = self._without_the_rest(rows[r], weights.expand(each.shape)[r])
+            weights = weights.expand(each.shape)
+            spoiled = torch.isfinite(cost) & ~torch.isfinite(gradient).all(1)
+            for r in (spoiled & (weights == 0).any(1)).nonzero().flatten().tolist():
+                gradient[r] = self._gradient_of_weighted(rows[r], weights[r])
         return cost.detach().double(), gradient
 
-    def _without_the_rest(self, row: Tensor, weights: Tensor) -> Tensor:
+    def _gradient_of_weighted(self, row: Tensor, weights: Tensor) -> Tensor:
         """``(K,)`` gradient of one run, simulated without the sequences of weight 0.
 
         The derivative of a simulation that blows up is NaN, also if it is multiplied by 0.
@@ -78,14 +79,8 @@ class EnsembleCost:
         places = weights.nonzero().flatten()
         batch = self.batch.select(places.tolist())
         part = EnsembleCost(self.system, batch, self.solver, self.convention)
-        each = part._costs(stacked := _leaves(self.vector.runs(row[None])))
-        total = (each * weights[places].to(each)).sum()
-        return torch.cat([g.flatten() for g in torch.autograd.grad(total, list(stacked.values()))])
+        return part(row[None], weights[places])[1][0]
 
     def _costs(self, stacked: Mapping[str, Tensor]) -> Tensor:
         trajectory = self.solver.ensemble(self.system, stacked, self.batch)
         return sequence_costs(trajectory, self.batch, self.convention)
-
-
-def _leaves(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name: value.detach().clone().requires_grad_() for name, value in parameters.items()}

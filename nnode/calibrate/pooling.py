@@ -8,11 +8,10 @@ the unit of deviations from the pooled parameters in the penalty.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListLike
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -42,12 +41,12 @@ LEAST = 5
 
 def random_starts(cost: ResidualProblem, rows: Iterable[np.ndarray], seed: int) -> np.ndarray:
     """``(R, P)`` starts: the first row, then rows with random factors on bounded parameters."""
-    rng = np.random.default_rng(seed)
+    rng, (shrink, stretch) = np.random.default_rng(seed), np.log(FACTORS)
     limited = np.isfinite(cost.low) & np.isfinite(cost.high)
     starts = []
     for i, row in enumerate(rows):
         if i:
-            factor = np.exp(rng.uniform(math.log(FACTORS[0]), math.log(FACTORS[1]), len(row)))
+            factor = np.exp(rng.uniform(shrink, stretch, len(row)))
             row = np.where(limited, row * factor, row)
         starts.append(np.clip(row, cost.low, cost.high))
     return np.stack(starts)
@@ -65,9 +64,8 @@ def best_alone(
         ``(B, P)`` parameters and ``(B,)`` costs with the penalty.
     """
     fits = [alone(cost, row, **options) for row in starts]
-    costs = np.array([fit.cost for fit in fits])
-    which = np.argmin(costs, axis=0)
-    return np.stack([fits[k].row[b] for b, k in enumerate(which)]), costs.min(axis=0)
+    costs, rows = np.array([fit.cost for fit in fits]), np.array([fit.row for fit in fits])
+    return rows[costs.argmin(0), np.arange(costs.shape[1])], costs.min(0)
 
 
 @dataclass(frozen=True)
@@ -116,7 +114,7 @@ def halves(
     centre = pooled(first, row).row
     begin = [centre, *others]
     separate = [best_alone(cost, begin)[0] for cost in (first, second)]
-    spread = np.sqrt(_shared_variance(*separate))
+    spread = _shared_deviation(separate)
     scale = np.maximum(spread, LEAST_SPREAD * np.where(centre == 0, 1.0, np.abs(centre)))
     candidates = [
         alone(first, centre, penalty=(centre, s / scale**2)).row if s else separate[0]
@@ -141,21 +139,18 @@ def halves(
     )
 
 
-def _shared_variance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """``(P,)`` covariance between both halves of the sequences; at least 0.
+def _shared_deviation(separate: ListLike[np.ndarray]) -> np.ndarray:
+    """``(P,)`` root of the covariance between both halves of the sequences; at least 0.
 
     Values are clipped to the middle 90 % of each half, because a parameter that a half does not
     determine may have any value.
     """
-    variances = []
-    for first_half, second_half in zip(first.T, second.T, strict=True):
-        clipped = [np.clip(x, *np.quantile(x, [0.05, 0.95])) for x in (first_half, second_half)]
-        variances.append(max(float(np.cov(*clipped)[0, 1]), 0.0))
-    return np.array(variances)
+    clipped = [np.clip(rows, *np.quantile(rows, [0.05, 0.95], axis=0)).T for rows in separate]
+    shared = [np.cov(*halves)[0, 1] for halves in zip(*clipped, strict=True)]
+    return np.sqrt(np.maximum(shared, 0.0))
 
 
-@dataclass(frozen=True)
-class SequenceParameters:
+class SequenceParameters(NamedTuple):
     """Separate parameters of each sequence, and their evaluation.
 
     Attributes:
@@ -230,8 +225,7 @@ def sequence_parameters(
         "cost": float(costs.mean()),
         "second_half": {
             name: float(getattr(judged, name).mean())
-            for name in ("pooled", "alone", "shrunk")
-            if name != "shrunk" or kind is Pooling.shrunk
+            for name in dict.fromkeys(("pooled", "alone", kind.value))
         },
         "spread": dict(zip(names, judged.spread.tolist(), strict=True)),
         "heldout": "with the pool's parameters: those of a sequence say nothing of another",

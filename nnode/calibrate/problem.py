@@ -89,8 +89,13 @@ class ResidualProblem:
         start_speeds: StartSpeeds = StartSpeeds.given,
     ) -> None:
         self.solver, self.convention, self.simulations = solver, convention, 0
-        self.lane = None if system.domain == "crowd" else _lane(system, batch)
+        self.lane = None if isinstance(system, Crowd) else lanes.supports(system, batch)
         formula = system.formula if isinstance(system, Crowd) else self.lane
+        if formula is None and not isinstance(system, Crowd):
+            raise ConfigError(
+                "optimizer=gauss_newton needs a model of a lane whose law and effects are "
+                "formulas; take another optimizer"
+            )
         vector = ParameterVector(system)
         if formula is None:
             candidates = [
@@ -357,16 +362,6 @@ class ResidualProblem:
         run = Trajectory(x.reshape(batch.x.shape), None if v is None else v[..., None])
         cost = sequence_costs(run, batch, self.convention)
         return torch.where(torch.isfinite(cost), cost, math.inf).numpy()
-
-
-def _lane(system: System, batch: Batch) -> Any:
-    lane = lanes.supports(system, batch)
-    if lane is None:
-        raise ConfigError(
-            "optimizer=gauss_newton needs a model of a lane whose law and effects are formulas; "
-            "take another optimizer"
-        )
-    return lane
 
 
 def pooled(

@@ -209,21 +209,15 @@ class Trainer:
         norms: list[float] = []
         costs: list[float] = []
 
-        def evaluate_here() -> Tensor:
+        def closure() -> Tensor:
+            self.optimizer.zero_grad()
             share, error = torch.zeros((), dtype=self.dtype, device=self.device), None
             try:
                 share = self._share(batch, number)
             except SimulationError as caught:
                 error = caught
-            cost = self.world.combine(share, trained, error)
-            norms.append(self._gradient_norm())
-            costs.append(float(cost))
-            return cost
-
-        def closure() -> Tensor:
-            self.optimizer.zero_grad()
             try:
-                return evaluate_here()
+                cost = self.world.combine(share, trained, error)
             except SimulationError:
                 if not torch.is_grad_enabled():
                     return torch.tensor(float("inf"))  # a trial point outside the model's range
@@ -232,6 +226,9 @@ class Trainer:
                 # a line search went too far: a high, flat cost shortens its step
                 self.optimizer.zero_grad()
                 return torch.tensor(1e3 * (1 + abs(costs[0])), dtype=self.dtype)
+            norms.append(self._gradient_norm())
+            costs.append(float(cost))
+            return cost
 
         if isinstance(self.optimizer, GaussNewton):
             if self.world.size > 1 or batch is None:
@@ -305,7 +302,7 @@ class Trainer:
     def _draw(self, logbook: Logbook | None) -> None:
         if self.figure is not None and logbook is not None:
             model = copy.deepcopy(self.model).cpu()  # plots need CPU tensors
-            logbook.figure("force", self.figure(model), self.step)
+            logbook.add_figure("force", self.figure(model), self.step)
 
     # -- the loop --------------------------------------------------------------------------
 
@@ -326,7 +323,6 @@ class Trainer:
         if self.world.first and self.folder is not None:
             logbook = Logbook(self.folder / "tensorboard", self.provenance.config, self.step)
         self._clock = time.monotonic()
-        finished = False
         try:
             self._guard = InterruptGuard()
             with self._guard if self.folder is not None else nullcontext():
@@ -349,10 +345,11 @@ class Trainer:
                         self._end_epoch(logbook, per_epoch)
                         self._save_if_due()
                 self.save()
-            finished = True
+            if logbook is not None:
+                logbook.result({"cost/best": self.best})
         finally:
             if logbook is not None:
-                logbook.close({"cost/best": self.best} if finished else None)
+                logbook.close()
 
     def _start(self, logbook: Logbook | None) -> None:
         self.save()  # allows resuming if the first evaluation is interrupted

@@ -17,6 +17,7 @@ from nnode.model.terms import (
     OTHERS,
     POINTS,
     SMALLEST,
+    SMOOTHING,
     WALLS,
     CrowdDynamics,
     parameter_values,
@@ -173,3 +174,13 @@ def walls_of(scene: Scene) -> tuple[Tensor, Tensor]:
 
 
 _PLACES = {OTHERS: _others, POINTS: _points, WALLS: _walls, SMALLEST: _others}
+
+
+def norm(vector: Tensor) -> Tensor:
+    """``(..., 2)`` to ``(...)``: Euclidean length with a finite gradient everywhere."""
+    return torch.sqrt(dot(vector, vector) + SMOOTHING**2)
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """``(..., 2)`` twice to ``(...)``: scalar product; faster than a sum over an axis of two."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]

@@ -19,7 +19,7 @@ from nnode.model.names import check_names
 from nnode.model.scene import Scene
 from nnode.model.steps import stepped
 from nnode.model.term import State, Term, numbered
-from nnode.model.terms import CrowdDynamics, LaneDynamics, add_term, parameter_values
+from nnode.model.terms import CrowdDynamics, D, LaneDynamics, add_term, parameter_values
 
 #: The terms' shapes to the composed formula.
 _FORMULAS: dict[tuple[Any, ...], Any] = {}
@@ -30,28 +30,53 @@ def lane_of(terms: Sequence[Term]) -> LaneDynamics | None:
     law = terms[0] if terms else None
     if not isinstance(law, Law) or any(isinstance(term, Law) for term in terms[1:]):
         return None
-    lane: LaneDynamics | None = _composed(LaneDynamics(order=law.order), terms)
-    return lane
+    if not _are_formulas(terms, law.order):
+        return None
+    return _composed(LaneDynamics(order=law.order), terms)
 
 
 def crowd_of(terms: Sequence[Term]) -> CrowdDynamics | None:
     """The formula of a crowd with these terms; None where one is code without a formula."""
-    law: CrowdDynamics | None = _composed(CrowdDynamics(), terms)
-    return law if law is not None and law.is_formula else None
-
-
-def _composed(model: Any, terms: Sequence[Term]) -> Any:
-    """The flat formulas of terms, added to an empty model; None where one has no formula."""
-    if any(term.rule_for(model.order) is None for term in terms):
+    if not _are_formulas(terms, 2):
         return None
-    key = tuple(term.shape for term in terms)
+    law = _composed(CrowdDynamics(), terms)
+    return law if law.is_formula else None
+
+
+def added_to(laws: Sequence[Term], effects: Sequence[Term], called: bool = False) -> CrowdDynamics:
+    """The formula of the accelerations that effects add to a crowd's laws.
+
+    Args:
+        called: whether networks of laws stay calls; otherwise they are written out.
+    """
+    return _composed(CrowdDynamics(), [*laws, *effects], called, increment=True)
+
+
+def _are_formulas(terms: Sequence[Term], order: int) -> bool:
+    return all(term.rule_for(order) is not None for term in terms)
+
+
+def _composed(empty: D, terms: Sequence[Term], called: bool = False, increment: bool = False) -> D:
+    """The flat formulas of terms, added to an empty model.
+
+    Args:
+        called: whether networks of laws stay calls; otherwise they are written out.
+        increment: whether the rate is only that of a crowd's effects.
+    """
+    key = (called, increment, *(term.shape for term in terms))
     if key not in _FORMULAS:
-        names = owners(terms)
+        model: Any = empty
+        named = list(zip(range(len(terms)), terms, owners(terms), strict=True))
         # laws come first, so that effects can use them whatever the order of the terms
-        for i, term in sorted(enumerate(terms), key=lambda it: not isinstance(it[1], Law)):
-            model = with_term(model, term, names[i], i)
+        for of_laws in (True, False):
+            for i, term, owner in named:
+                if isinstance(term, Law) is of_laws:
+                    model = with_term(model, term, owner, i, called)
+            if of_laws and increment:
+                model = replace(model, rate=(const(0), const(0)))
         _FORMULAS[key] = model.flat()
-    return _FORMULAS[key]
+    formula: D = _FORMULAS[key]
+    return formula
 
 
 def with_term(model: Any, term: Term, owner: str, place: int, called: bool = False) -> Any:
@@ -179,26 +204,6 @@ def effect_increment(term: Term, state: State) -> Tensor:
     followers = state.scene.follower | state.scene.leader
     change = torch.where(followers, rates[..., 0] - before[..., 0], 0.0)
     return torch.cat([change[..., None], rates[..., 1:]], -1)
-
-
-def added_to(laws: Sequence[Term], effects: Sequence[Term], called: bool = False) -> CrowdDynamics:
-    """The formula of the accelerations that effects add to a crowd's laws.
-
-    Args:
-        called: whether networks of laws stay calls; otherwise they are written out.
-    """
-    terms = [*laws, *effects]
-    key = ("added", len(laws), called, *(t.shape for t in terms))
-    if key not in _FORMULAS:
-        model, names = CrowdDynamics(), owners(terms)
-        for i, law in enumerate(laws):
-            model = with_term(model, law, names[i], i, called)
-        model = replace(model, rate=(const(0), const(0)))
-        for i, effect in enumerate(effects, start=len(laws)):
-            model = with_term(model, effect, names[i], i)
-        _FORMULAS[key] = model.flat()
-    formula: CrowdDynamics = _FORMULAS[key]
-    return formula
 
 
 def contribution(term: Term, state: State) -> Tensor:

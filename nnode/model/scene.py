@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from nnode.data.sequence import Batch
 from nnode.errors import DataError
@@ -74,6 +77,7 @@ class Scene:
         index = torch.arange(agent.shape[1], device=agent.device)
         leader = index == (number - 1)[:, None]
         wall, normal, real = wall_points(batch.walls, wall_spacing)
+        preferred = batch.preferred
         return cls(
             agent=agent,
             count=number.to(batch.x.dtype)[:, None, None],
@@ -90,7 +94,9 @@ class Scene:
             wall_count=real.sum(1).clamp(min=1).to(batch.x.dtype)[:, None, None],
             segment=batch.walls,
             start=batch.start,
-            preferred=_preferred(batch),
+            preferred=batch.v[0]
+            if preferred is None
+            else preferred.where(preferred.isfinite(), batch.v[0]),
             names=batch.names,
             kind=batch.kind,
             group=batch.group,
@@ -133,23 +139,25 @@ class Scene:
     @cached_property
     def kinds(self) -> dict[str, Tensor]:
         """Class name to ``(B, N)`` True for its agents; empty if no class is known."""
-        kind_names = sorted({name for names in self.kind for name in names or () if name})
-        masks = {name: torch.zeros(self.agent.shape, dtype=torch.bool) for name in kind_names}
-        for b, names in enumerate(self.kind):
-            for i, name in enumerate(names or ()):
-                if name:
-                    masks[name][b, i] = True
-        return {name: mask.to(self.agent.device) for name, mask in masks.items()}
+        table = self._table(self.kind)
+        return {
+            name: torch.from_numpy(table == name).to(self.agent.device)
+            for name in sorted(set(table.flat) - {""})
+        }
 
     @cached_property
     def companies(self) -> Tensor:
         """``(B, N)`` number of an agent's social group in its sequence, from 1; 0 for none."""
-        numbers = torch.zeros(self.agent.shape, dtype=torch.float64)
-        for b, names in enumerate(self.group):
-            group_names = sorted({name for name in names or () if name})
-            for i, name in enumerate(names or ()):
-                numbers[b, i] = group_names.index(name) + 1 if name else 0
-        return numbers.to(self.agent.device)
+        rows = self._table(self.group)
+        numbers = [[sorted({"", *row}).index(name) for name in row] for row in rows]
+        return torch.tensor(numbers, dtype=torch.float64, device=self.agent.device)
+
+    def _table(self, names: Sequence[Sequence[str] | None]) -> np.ndarray:
+        """``(B, N)`` the agents' names; empty where there is none."""
+        table = np.full(self.agent.shape, "", dtype=object)
+        for row, row_names in zip(table, names, strict=False):
+            row[: len(row_names or ())] = row_names or ()
+        return table
 
 
 #: Kinds of destinations: the end of the sequence; destinations from the data; along the stream.
@@ -194,12 +202,6 @@ def with_destinations(scene: Scene, batch: Batch, desired: str) -> Scene:
     return replace(scene, destination=torch.where(scene.agent[..., None], ahead, batch.destination))
 
 
-def _preferred(batch: Batch) -> Tensor:
-    if batch.preferred is None:
-        return batch.v[0]
-    return torch.where(batch.preferred.isfinite(), batch.preferred, batch.v[0])
-
-
 def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
     """Cut wall segments into points.
 
@@ -222,17 +224,10 @@ def wall_points(walls: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
         if key not in points_of:
             points_of[key] = _points(segments, spacing)
         rows.append(points_of[key])
-    width = max((len(points) for points, _ in rows), default=0)
-    shape = (len(rows), width, 2)
-    point = torch.full(shape, 1e4, dtype=torch.float64)
-    normal = torch.zeros(shape, dtype=torch.float64)
-    real = torch.zeros(shape[:2], dtype=torch.bool)
-    for b, (place, direction) in enumerate(rows):
-        point[b, : len(place)] = place
-        normal[b, : len(place)] = direction
-        real[b, : len(place)] = True
-    device, dtype = walls.device, walls.dtype
-    return point.to(device, dtype), normal.to(device, dtype), real.to(device)
+    points, normals = map(list, zip(*rows, strict=True))
+    point = pad_sequence(points, batch_first=True, padding_value=1e4).to(walls)
+    real = torch.arange(point.shape[1]) < torch.tensor([[len(part)] for part in points])
+    return point, pad_sequence(normals, batch_first=True).to(walls), real.to(walls.device)
 
 
 def _points(segments: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
@@ -246,6 +241,5 @@ def _points(segments: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
         points.append(start + fraction * (end - start))
         along = (end - start) / max(length, 1e-12)
         normals.append(torch.stack([-along[1], along[0]]).expand(n, 2))
-    if not points:
-        return torch.empty(0, 2), torch.empty(0, 2)
-    return torch.cat(points), torch.cat(normals)
+    none = segments.new_empty(0, 2)
+    return torch.cat([none, *points]), torch.cat([none, *normals])

@@ -218,14 +218,12 @@ class Traffic(System):
         models = [(terms, lane)]
         if lane is None:
             models = [([terms[0], term], effect_alone(terms[0], term)) for term in added]
-        start_values: dict[tuple[int, str], Tensor] = {}
-        for i, (model_terms, formula) in enumerate(models):
+        start_values: list[Tensor] = []
+        for model_terms, formula in models:
             assert formula is not None
             starts = starts_of(model_terms, formula, batch.x[0], batch.v[0], scene)
-            start_values |= {
-                (i, state): starts[state] for state in list(formula.rates)[self.order :]
-            }
-        return [torch.stack(list(start_values.values()), -1)]
+            start_values += [starts[state] for state in list(formula.rates)[self.order :]]
+        return [torch.stack(start_values, -1)]
 
     def forward(self, t: Tensor, y: Tensor, scene: Scene) -> Tensor:
         lead = scene.leader[..., None]

@@ -181,7 +181,7 @@ class Rule:
         order: for a law, 2 if its rate is an acceleration, 1 if it is a velocity.
     """
 
-    rate: str | tuple[str, str] = ""
+    rate: str | Sequence[str] = ""
     leader: str = ""
     states: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
     delayed: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
@@ -224,7 +224,7 @@ class Rule:
     def texts(self) -> list[str]:
         """Its formulas, except those of states and delays."""
         summands = (text for over in REDUCED for _, text in getattr(self, over).values())
-        rate = self.rate if isinstance(self.rate, tuple) else (self.rate,)
+        rate = (self.rate,) if isinstance(self.rate, str) else self.rate
         return [*rate, *self.where.values(), *summands]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,13 @@ import pytest
 import torch
 
 from nnode.calibrate.evaluate import evaluate
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.errors import SimulationError
 from nnode.model import Crowd, build_model
 from nnode.simulation import Solver, TorchdiffeqSolver
 from nnode.simulation.base import Trajectory
 from nnode.simulation.fused import FusedSolver
-from tests.builders import lane, social_forces
+from tests.builders import lane, social_forces, straight
 
 SOLVERS = [
     pytest.param(lambda dt: TorchdiffeqSolver(gradient="discrete", dt=dt), id="torchdiffeq"),
@@ -52,10 +53,8 @@ def test_the_logarithm_of_a_negative_gap_is_a_number(solver: Any) -> None:
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_people_who_stand_in_one_place_give_numbers(solver: Any) -> None:
-    time = 0.1 * np.arange(5)
-    x = np.zeros((5, 3, 2))
-    x[:, 2, 0] = 1.0 + time
-    batch = collate([Sequence(name="hall/1", recording="hall", time=time, x=x)])
+    x = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    batch = collate([replace(straight(x, x, 5, 0.1, name="hall/1"), v=None)])
     model = Crowd(social_forces(A=5.0, k=5.0, kappa=5.0, B=0.3, walls=False))
     solve: Solver = solver(0.05)
     found = evaluate(lambda b: solve(model, b), [batch])

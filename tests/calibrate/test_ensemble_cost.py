@@ -117,9 +117,9 @@ def test_a_sequence_without_weight_cannot_spoil_a_gradient(
     system = build_model(N4, dtype=torch.float32)
     spoiled = EnsembleCost(system, wild, FusedSolver(DT))
     called = []
-    honest = EnsembleCost._without_the_rest
+    honest = EnsembleCost._gradient_of_weighted
     monkeypatch.setattr(
-        EnsembleCost, "_without_the_rest", lambda *args: called.append(1) or honest(*args)
+        EnsembleCost, "_gradient_of_weighted", lambda *args: called.append(1) or honest(*args)
     )
     row = ParameterVector(system).row[None]
     value, gradient = spoiled(row, torch.tensor([[1.0, 0.0]], dtype=torch.float64))

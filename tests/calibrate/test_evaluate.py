@@ -22,21 +22,10 @@ from nnode.model import Crowd, Traffic, make_law
 from nnode.simulation import TorchdiffeqSolver, Trajectory
 from tests.builders import lane, social_forces, straight
 
-
-def traffic(name: str, x: list[list[float]], dt: float = 0.5) -> Sequence:
-    """A sequence from one row of positions (m) per sample."""
-    return lane(x, dt, name=name)
-
-
-BATCHES = [
-    collate(
-        [
-            traffic("a", [[0, 10], [5, 16], [9, 21]]),
-            traffic("b", [[1], [4]]),
-        ]
-    ),
-    collate([traffic("c", [[0, 8, 30], [4, 12, 33]])]),
-]
+A = lane([[0, 10], [5, 16], [9, 21]], 0.5, name="a")
+B = lane([[1], [4]], 0.5, name="b")
+C = lane([[0, 8, 30], [4, 12, 33]], 0.5, name="c")
+BATCHES = [collate([A, B]), collate([C])]
 ERRORS = {"a": [[0, 0], [1, -2], [3, 4]], "b": [[0], [5]], "c": [[0, 0, 0], [0, 0, -2]]}
 
 
@@ -48,11 +37,15 @@ def with_errors(batch: Batch) -> Trajectory:
     return Trajectory(x, None)
 
 
-def test_by_hand() -> None:
-    metrics = evaluate(with_errors, BATCHES)
+@pytest.mark.parametrize(
+    ("convention", "scale"), [(Convention.integral, 0.5), (Convention.sum, 1.0)]
+)
+def test_by_hand(convention: Convention, scale: float) -> None:
+    metrics = evaluate(with_errors, BATCHES, convention)
     # squared errors: a 1, 4 then 9, 16; b 25; c 0, 0, 4
-    assert metrics.costs == pytest.approx({"a": 7.5, "b": 6.25, "c": 1.0})
-    assert pytest.approx((7.5 + 6.25 + 1.0) / 3) == metrics.J
+    costs = {"a": 15 * scale, "b": 12.5 * scale, "c": 2 * scale}
+    assert metrics.costs == pytest.approx(costs)
+    assert pytest.approx(sum(costs.values()) / 3) == metrics.J
     assert metrics.sequences == 3
     assert metrics.rmse == pytest.approx((59 / 8) ** 0.5)
     # distances at the last samples: a 3, 4; b 5; c 0, 0, 2
@@ -62,12 +55,7 @@ def test_by_hand() -> None:
         {"t": 0.5, "rmse": pytest.approx((34 / 6) ** 0.5), "n": 6},
         {"t": 1.0, "rmse": pytest.approx((25 / 2) ** 0.5), "n": 2},
     ]
-
-
-def test_the_sum_convention() -> None:
-    metrics = evaluate(with_errors, BATCHES, Convention.sum)
-    assert pytest.approx((15 + 12.5 + 2) / 3) == metrics.J
-    assert metrics.rmse == pytest.approx((59 / 8) ** 0.5)
+    assert json.loads(json.dumps(metrics.plain())) == metrics.plain()
 
 
 def test_collisions_by_hand() -> None:
@@ -85,8 +73,7 @@ def test_collisions_by_hand() -> None:
 
 
 def test_crowds_have_no_collisions_and_distances_in_the_plane() -> None:
-    x = np.zeros((2, 2, 2))
-    batch = collate([Sequence(name="p", recording="r", time=np.array([0.0, 0.04]), x=x)])
+    batch = collate([straight(np.zeros((2, 2)), np.zeros((2, 2)), 2, 0.04)])
 
     def away(batch: Batch) -> Trajectory:
         moved = batch.x.clone()
@@ -96,16 +83,12 @@ def test_crowds_have_no_collisions_and_distances_in_the_plane() -> None:
     metrics = evaluate(away, [batch])
     assert metrics.final_displacement == pytest.approx(2.5)
     assert metrics.rmse == pytest.approx((25 / 2) ** 0.5)
+    assert pytest.approx(0.5 * 0.04 * 25) == metrics.J
     assert metrics.collisions == 0.0
 
 
 def test_batches_do_not_matter() -> None:
-    items = [
-        traffic("a", [[0, 10], [5, 16], [9, 21]]),
-        traffic("b", [[1], [4]]),
-        traffic("c", [[0, 8, 30], [4, 12, 33]]),
-    ]
-    together, apart = (evaluate(with_errors, b).plain() for b in ([collate(items)], BATCHES))
+    together, apart = (evaluate(with_errors, b).plain() for b in ([collate([A, B, C])], BATCHES))
     for name in ("costs", "horizons"):
         first, second = together.pop(name), apart.pop(name)
         assert json.dumps(first) == json.dumps(second)
@@ -113,15 +96,10 @@ def test_batches_do_not_matter() -> None:
     assert together == pytest.approx(apart)
 
 
-def test_metrics_are_plain_enough_for_json() -> None:
-    plain = evaluate(with_errors, BATCHES).plain()
-    assert json.loads(json.dumps(plain)) == plain
-
-
 def test_best_common_speed_is_the_least_cost() -> None:
     draw = np.random.default_rng(0)
     items = [
-        traffic(str(n), np.cumsum(draw.uniform(1, 9, (k, n)), axis=0) + 20.0 * np.arange(n))
+        lane(np.cumsum(draw.uniform(1, 9, (k, n)), 0) + 20.0 * np.arange(n), 0.5, name=str(n))
         for n, k in ((3, 6), (1, 4), (2, 9))
     ]
 
@@ -151,23 +129,17 @@ def test_constant_velocity_is_exact_on_steady_traffic(leader: str) -> None:
 
 
 @pytest.mark.parametrize("leader", ["constant", "measured"])
-def test_no_interaction_is_exact_where_all_share_a_speed(leader: str) -> None:
-    batch = collate([steady(3, [12.5] * 3, 5), steady(1, [12.5], 3)])
-    solver = TorchdiffeqSolver("euler", dt=0.02)
-    speed = best_common_speed([batch])
-    assert speed == pytest.approx(12.5)
-    simulate = no_interaction(Traffic([make_law("lin")], leader), solver, speed)
-    assert evaluate(simulate, [batch]).rmse < 1e-11
-
-
-def test_no_interaction_lets_everyone_but_a_measured_leader_drive_at_free_speed() -> None:
+def test_no_interaction_lets_everyone_but_a_measured_leader_drive_at_free_speed(
+    leader: str,
+) -> None:
     item = steady(2, [9.0, 14.0], 4)
     simulate = no_interaction(
-        Traffic([make_law("lin")], "measured"), TorchdiffeqSolver("euler", dt=0.02), 12.0
+        Traffic([make_law("lin")], leader), TorchdiffeqSolver("euler", dt=0.02), 12.0
     )
     x = simulate(collate([item])).x[:, 0, :, 0].detach()
     np.testing.assert_allclose(x[:, 0], 7.0 + 12.0 * item.time, rtol=1e-12)
-    np.testing.assert_array_equal(x[:, 1], item.x[:, 1, 0])
+    first = item.x[:, 1, 0] if leader == "measured" else 22.0 + 12.0 * item.time
+    np.testing.assert_allclose(x[:, 1], first, rtol=1e-12)
 
 
 def walkers() -> Sequence:
@@ -214,7 +186,7 @@ def test_baselines_follow_the_model_s_precision() -> None:
 
 
 def test_a_leader_that_follows_its_measured_path_is_left_out() -> None:
-    batch = collate([traffic("a", [[0, 10], [5, 16], [9, 21]]), traffic("c", [[0, 8], [4, 12]])])
+    batch = collate([A, lane([[0, 8], [4, 12]], 0.5, name="c")])
     model = Traffic([make_law("lin", v0=20.0, L=5.0)], leader="measured")
 
     def late(given: bool) -> Trajectory:
@@ -222,7 +194,10 @@ def test_a_leader_that_follows_its_measured_path_is_left_out() -> None:
         x[1:, :, 0] -= 3.0
         return Trajectory(x, None, model.given(batch) if given else None)
 
-    free, every = (evaluate(lambda _, g=g: late(g), [batch]) for g in (True, False))  # type: ignore[misc]
+    free, every = (
+        evaluate(lambda _: late(True), [batch]),
+        evaluate(lambda _: late(False), [batch]),
+    )
     assert free.rmse == pytest.approx(3.0)
     assert every.rmse == pytest.approx(3.0 / 2**0.5)
     assert free.final_displacement == pytest.approx(3.0)
@@ -250,7 +225,7 @@ def test_errors_of_followers_by_hand(leader: str) -> None:
 
 def test_the_common_speed_is_that_of_vehicles_that_are_simulated() -> None:
     time = 0.5 * np.arange(5)[:, None]
-    batch = collate([traffic("a", (time * [8.0, 12.0, 30.0] + [0.0, 50.0, 100.0]).tolist())])
+    batch = collate([lane(time * [8.0, 12.0, 30.0] + [0.0, 50.0, 100.0], 0.5)])
     assert best_common_speed([batch]) == pytest.approx(50 / 3)
     assert best_common_speed([batch], Traffic([make_law("lin")])) == pytest.approx(50 / 3)
     led = Traffic([make_law("lin")], leader="measured")

@@ -10,11 +10,12 @@ from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs
 from nnode.calibrate.intervals import intervals
 from nnode.calibrate.optimizers.gauss_newton import GaussNewton
 from nnode.calibrate.problem import ResidualProblem, alone, pooled
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import System, Traffic, build_model
 from nnode.model.term import State, Term
 from nnode.simulation import FusedSolver, TorchdiffeqSolver, Trajectory
+from tests.builders import lane
 from tests.model import following
 from tests.model.following import set_
 from tests.simulation.fused.compare import RungeKutta
@@ -35,11 +36,11 @@ def pairs() -> Batch:
         time = 0.1 * np.arange(200 + 20 * i)
         speed = np.clip(12 + 10 * np.sin(0.35 * time + i), 0, None)
         lead = np.cumsum(speed) * 0.1
-        x = np.stack([lead - 20 - 2 * i, lead], 1)[..., None]
-        v = np.stack([np.full_like(speed, 10.0), speed], 1)[..., None]
-        found.append(
-            Sequence(name=f"p{i}", recording="r", time=time, x=x, v=v, length=np.array([4.0, 5.0]))
+        x, v = (
+            np.stack(columns, 1)
+            for columns in ((lead - 20 - 2 * i, lead), (np.full_like(speed, 10.0), speed))
         )
+        found.append(lane(x, 0.1, v=v, name=f"r/{i}", length=np.array([4.0, 5.0])))
     batch = collate(found)
     with torch.no_grad():
         run = FusedSolver()(model(**TRUE), batch)
@@ -75,8 +76,7 @@ def test_costs_and_slopes_are_those_of_autograd(
 def test_costs_of_platoons_are_those_that_come_with_slopes(kind: Convention) -> None:
     time = 0.1 * np.arange(30)
     lead = 12 * time + np.sin(time)
-    x = np.stack([lead - 45, lead - 20, lead], 1)[..., None]
-    batch = collate([Sequence(name="a", recording="r", time=time, x=x)])
+    batch = collate([lane(np.stack([lead - 45, lead - 20, lead], 1), 0.1)])
     cost = ResidualProblem(model(), batch, FusedSolver(), kind)
     wanted = sequence_costs(RungeKutta()(model(), batch), batch, kind)
     np.testing.assert_allclose(cost(cost.start).cost, wanted.detach().numpy(), rtol=1e-11)
@@ -117,15 +117,6 @@ def test_pooled_parameters_are_found_and_lie_in_their_intervals(pairs: Batch) ->
     each = alone(cost, fit.row)
     assert one.cost == pytest.approx(each.cost[2], rel=1e-6)
     assert (each.cost <= cost.costs(fit.row) + 1e-12).all()
-
-
-def test_shrinkage_pulls_towards_the_pool(pairs: Batch) -> None:
-    cost = ResidualProblem(model(**TRUE), pairs, FusedSolver(), Convention.gap)
-    centre = np.array([TRUE[name.split(".")[1]] for name in cost.names])
-    free = alone(cost, centre)
-    tied = alone(cost, centre, penalty=(centre, np.full(5, 1e6)))
-    assert np.abs(tied.row - centre).max() < 1e-3
-    assert np.abs(free.row - centre).max() > np.abs(tied.row - centre).max()
 
 
 def test_parameters_at_a_bound_are_flagged(pairs: Batch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from nnode.model import System
 from nnode.simulation import FusedSolver
 from studies.following.tasks import EVERY
 from tests.app.following import pairs
+from tests.builders import lane
+from tests.model.following import idm
 from tests.studies.following.test_fit import HELLY, driven
 
 
@@ -78,9 +81,8 @@ def test_the_gradient_is_that_of_the_least_cost(name: str, kind: Convention) -> 
 def test_every_follower_of_a_platoon_has_its_own() -> None:
     time = 0.1 * np.arange(80)
     lead = 12 * time + np.sin(time)
-    x = np.stack([lead - 45, lead - 20, lead], 1)[..., None]
-    v = np.stack([12 + np.cos(time)] * 3, 1)[..., None]
-    one = Sequence(name="a", recording="a", time=time, x=x, v=v)
+    x = np.stack([lead - 45, lead - 20, lead], 1)
+    one = lane(x, 0.1, v=(12 + np.cos(time))[:, None], name="a")
     with torch.no_grad():
         run = FusedSolver()(known(), collate([one]))
     batch = collate([one])
@@ -114,20 +116,19 @@ def test_it_is_said_and_refused_where_there_is_no_speed() -> None:
 
 def test_parabolas_tell_first_speeds() -> None:
     rng = np.random.default_rng(3)
-    time = 5.0 + 0.1 * np.arange(60)
-    t = time - 5.0
-    x = np.stack([3 + 8 * t - 0.5 * t**2, 30 + 10 * t], 1)[..., None]
-    exact = start_smoothed(Sequence(name="a", recording="a", time=time, x=x))
+    t = 0.1 * np.arange(60)
+    x = np.stack([3 + 8 * t - 0.5 * t**2, 30 + 10 * t], 1)
+    exact = start_smoothed(lane(x, 0.1, start=5.0))
     np.testing.assert_allclose(exact.velocity()[0, :, 0], [8.0, 10.0], rtol=1e-9)
-    np.testing.assert_allclose(exact.velocity()[1:-1], np.diff(x, axis=0)[1:] / 0.1)
-    assert (exact.x == x).all()
+    np.testing.assert_allclose(exact.velocity()[1:-1, :, 0], np.diff(x, axis=0)[1:] / 0.1)
+    assert (exact.x[..., 0] == x).all()
     away = []
     for _ in range(300):
-        noisy = Sequence(name="a", recording="a", time=time, x=x + 0.3 * rng.normal(size=x.shape))
+        noisy = lane(x + 0.3 * rng.normal(size=x.shape), 0.1, start=5.0)
         away.append(start_smoothed(noisy).velocity()[0, :, 0] - [8.0, 10.0])
     # 0.3 m at every 0.1 s over 2 s: 0.43 m/s, where a difference of two samples has 4.2 m/s
     assert np.std(away) == pytest.approx(0.43, rel=0.15)
-    short = Sequence(name="a", recording="a", time=time[:3], x=x[:3])
+    short = lane(x[:3], 0.1, start=5.0)
     assert start_smoothed(short) is short
     found = nnode.sequences(pairs(number=2, seconds=5.0), data="pairs", start_speeds="smoothed")
     assert found.manifest["options"]["start_speeds"] == "smoothed"
@@ -145,9 +146,12 @@ def test_no_fit_of_first_speeds_is_worse_than_the_data_s_own() -> None:
     assert (fitted.costs(row) <= given.costs(row) + 1e-9).all()
 
 
+IDM = SimpleNamespace(v0=30.0, T=1.4, s0=2.0, a=1.2, b=1.5)
+
+
 def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
-    """Platoons of four by idm (v0 = 30, T = 1.4, s0 = 2, a = 1.2, b = 1.5), Heun's method at
-    0.02 s, behind leaders of many speeds, with noise that is new at every 0.1 s."""
+    """Platoons of four by idm with the parameters :data:`IDM`, Heun's method at 0.02 s, behind
+    leaders of many speeds, with noise that is new at every 0.1 s."""
     rng, h, found = np.random.default_rng(seed), 0.02, []
     for number in range(8):
         t = h * np.arange(2001)
@@ -158,8 +162,7 @@ def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
 
         def rate(x: np.ndarray, v: np.ndarray, ahead: float, pace: float) -> np.ndarray:
             before, speed = np.append(x[1:], ahead), np.append(v[1:], pace)
-            wish = 2 + np.maximum(0, 1.4 * v + v * (v - speed) / (2 * np.sqrt(1.2 * 1.5)))
-            return 1.2 * (1 - (v / 30) ** 4 - (wish / (before - x - 4.5)) ** 2)
+            return np.asarray(idm(before - x - 4.5, v, speed, IDM))
 
         v = np.full(3, lead[0]) + rng.normal(size=3)
         x = -np.cumsum(4.5 + (2 + 1.4 * v[::-1]) * rng.uniform(0.8, 1.6, 3))[::-1]
@@ -172,16 +175,7 @@ def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
                 then = rate(x + h * v, v + h * a, place[k + 1], lead[k + 1])
                 x, v = x + h * v + h**2 / 2 * a, v + h / 2 * (a + then)
         path += sigma * rng.normal(size=path.shape)
-        length = np.full(4, 4.5)
-        found.append(
-            Sequence(
-                name=f"s{number}",
-                recording=f"r{number}",
-                time=0.1 * np.arange(401),
-                x=path[..., None],
-                length=length,
-            )
-        )
+        found.append(lane(path, 0.1, name=f"r{number}/0", length=4.5))
     return found
 
 
@@ -202,7 +196,7 @@ def test_costs_do_not_rise_from_one_step_of_the_training_loop_to_the_next() -> N
 @pytest.mark.thorough
 def test_noise_of_0_3_m_does_not_bias_what_is_fitted_by_default() -> None:
     table = noisy(0.3)
-    wanted = {"v0": 30.0, "T": 1.4, "s0": 2.0, "a": 1.2, "b": 1.5}
+    wanted = vars(IDM)
     for drivers, kind in ((None, "fitted to each driver"), ("none", "fitted")):
         own = nnode.Calibrator("idm", leader="measured", method="rk4", drivers=drivers).fit(table)
         estimate = own.parameters_["estimate"]

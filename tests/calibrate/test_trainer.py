@@ -24,7 +24,7 @@ from nnode.calibrate.trainer import Trainer
 from nnode.data.sequence import Batch
 from nnode.errors import SimulationError
 from nnode.model import System
-from nnode.simulation import Trajectory
+from nnode.simulation import FusedSolver, Trajectory
 
 Make = Callable[..., Trainer]
 
@@ -59,7 +59,8 @@ def same_bits(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
 def test_training_lowers_both_costs_and_recovers_the_law(
     make_trainer: Make, tmp_path: Path
 ) -> None:
-    trainer = make_trainer(tmp_path, AdamOptions(lr=0.3), max_epochs=50, dt=0.02, evaluate_every=50)
+    optimizer, solver = AdamOptions(lr=0.3), FusedSolver(0.02)
+    trainer = make_trainer(tmp_path, optimizer, solver=solver, max_epochs=50, evaluate_every=50)
     trainer.fit()
     first, last = trainer.history[0], trainer.history[-1]
     assert last["cost/train"] < 1e-3 * first["cost/train"]
@@ -90,21 +91,21 @@ def test_best_checkpoint_holds_the_least_cost(make_trainer: Make, tmp_path: Path
     assert costs[-1] > min(costs)  # otherwise best and last would be the same thing
 
 
-def test_early_stopping_counts_evaluations_without_progress(
-    make_trainer: Make, tmp_path: Path
+@pytest.mark.parametrize(
+    ("options", "epochs"),
+    [
+        # the first evaluation is progress, the next three are not
+        ({"max_epochs": 50, "patience": 3, "min_delta": 1e6}, [0, 1, 2, 3]),
+        ({"max_epochs": 5, "evaluate_every": 2}, [0, 2, 4, 5]),
+    ],
+    ids=["patience", "evaluate_every"],
+)
+def test_which_epochs_are_evaluated(
+    make_trainer: Make, tmp_path: Path, options: dict[str, float], epochs: list[int]
 ) -> None:
-    trainer = make_trainer(tmp_path, max_epochs=50, patience=3, min_delta=1e6)
+    trainer = make_trainer(tmp_path, **options)
     trainer.fit()
-    # the first evaluation is progress, the next three are not
-    assert trainer.epoch == 3
-
-
-def test_evaluate_every_skips_evaluations_but_not_the_last(
-    make_trainer: Make, tmp_path: Path
-) -> None:
-    trainer = make_trainer(tmp_path, max_epochs=5, evaluate_every=2)
-    trainer.fit()
-    assert [row["epoch"] for row in trainer.history] == [0, 2, 4, 5]
+    assert [row["epoch"] for row in trainer.history] == epochs
 
 
 @pytest.mark.parametrize(("options", "size"), OPTIMIZERS, ids=lambda v: getattr(v, "name", ""))

@@ -27,7 +27,7 @@ from nnode.data.options import LoaderOptions
 from nnode.data.store import Store
 from nnode.errors import SimulationError
 from nnode.model import build_model
-from nnode.simulation import TorchdiffeqSolver
+from nnode.simulation import FusedSolver, Solver, TorchdiffeqSolver
 
 N4 = {
     "term": "network_speed",
@@ -37,39 +37,65 @@ N4 = {
     "v0": 30.0,
     "box": None,
 }
-LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 2.5, "L_min": 2.0}
+LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0, "L_min": 2.0}
 
 #: name: model, optimiser, sequences per mini-batch, epochs. Of five sequences, mini-batches of
 #: two leave an uneven rest, and of one nothing for the second process.
 CASES: dict[str, tuple[dict[str, Any], OptimizerOptions, int, int]] = {
     "adadelta": (N4, AdadeltaOptions(), 2, 3),
     "single": (N4, AdadeltaOptions(eta1=0.1), 1, 2),
-    "projected": (LIN, AdamOptions(lr=1.0), 2, 3),
+    "projected": ({**LIN, "L": 2.5}, AdamOptions(lr=1.0), 2, 3),
     "lbfgs": (N4, LbfgsOptions(max_iter=2), 0, 8),
 }
 
 
-def make_trainer(case: str, store: Store, folder: Path) -> Trainer:
-    """A trainer of this process, with its share of the data."""
-    options, optimizer, size, epochs = CASES[case]
-    world, model = World(), build_model(options, 0)
+def trainer_of(
+    store: Store,
+    folder: Path,
+    optimizer: OptimizerOptions | None = None,
+    seed: int = 0,
+    batch_size: int = 2,
+    *,
+    options: dict[str, Any] = LIN,
+    solver: Solver | None = None,
+    **settings: Any,
+) -> Trainer:
+    """A trainer in a folder, with this process's share of the data; all randomness from its seed.
 
-    def loader(indices: range, batch_size: int) -> Any:
-        chosen = LoaderOptions(batch_size=batch_size)
-        dataset = SequenceDataset(store, indices)
-        return make_loader(dataset, chosen, seed=0, rank=world.rank, size=world.size)
+    Five sequences are trained, two are held out.
+    """
+    world, model = World(), build_model(options, seed)
 
-    settings = TrainerOptions(max_epochs=epochs, figure_every=0, evaluate_every=3, save_every=1e9)
-    config = {"model": options, "seed": 0, "trainer": {"dtype": "float64"}}
+    def loader(indices: range, size: int) -> Any:
+        dataset, chosen = SequenceDataset(store, indices), LoaderOptions(batch_size=size)
+        return make_loader(dataset, chosen, seed=seed, rank=world.rank, size=world.size)
+
+    defaults = {"max_epochs": 6, "figure_every": 0, "save_every": 1e9}
+    config = {"model": options, "seed": seed, "trainer": {"dtype": "float64"}}
     return Trainer(
         model,
-        TorchdiffeqSolver(dt=0.1),
-        build_optimizer(model, optimizer, 0),
-        loader(range(5), size),
+        solver or FusedSolver(0.1),
+        build_optimizer(model, optimizer or AdadeltaOptions(), seed),
+        loader(range(5), batch_size),
         loader(range(5, 7), 1),
-        settings,
+        TrainerOptions(**{**defaults, **settings}),
         folder,
-        Provenance(config=config, manifest=store.manifest, split={}),
+        Provenance(config=config, manifest=store.manifest, split={"train": [], "heldout": []}),
+    )
+
+
+def make_trainer(case: str, store: Store, folder: Path) -> Trainer:
+    """The trainer of a case."""
+    options, optimizer, size, epochs = CASES[case]
+    return trainer_of(
+        store,
+        folder,
+        optimizer,
+        batch_size=size,
+        options=options,
+        solver=TorchdiffeqSolver(dt=0.1),
+        max_epochs=epochs,
+        evaluate_every=3,
     )
 
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from nnode.data.sequence import Batch, collate
-from nnode.model import Traffic, build_model
+from nnode.model import System, Traffic, build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
 from tests.builders import lane
 
@@ -51,6 +52,18 @@ def numbers(system: Traffic) -> SimpleNamespace:
     return SimpleNamespace(**{name: float(getattr(law, name).detach()) for name in law.scalars})
 
 
+def idm(net: Any, v: Any, ahead: Any, p: Any) -> Any:
+    """Accelerations by Treiber, Hennecke & Helbing 2000, equations (2) and (3).
+
+    Args:
+        net: gaps from bumper to bumper, m; there is no wish below the smallest gap of 0.1 m.
+        v, ahead: speeds of the vehicles and of those ahead, m/s.
+        p: the parameters as attributes.
+    """
+    wish = p.s0 + np.maximum(v * p.T + v * (v - ahead) / (2 * np.sqrt(p.a * p.b)), 0)
+    return p.a * (1 - (v / p.v0) ** 4 - (wish / np.maximum(net, 0.1)) ** 2)
+
+
 def behind(
     lead: Any, gaps: Many[float], seconds: float, length: float = 4.0, dt: float = DT
 ) -> Batch:
@@ -78,6 +91,13 @@ def states(seed: int = 3, platoons: int = 40) -> Batch:
         x = x + v * np.array([[0.0], [DT]])
         found.append(lane(x, DT, v=v, length=4.0, name=f"s{number}"))
     return collate(found)
+
+
+def rates(system: System, batch: Batch, t: float = 0.0, y: Tensor | None = None) -> Tensor:
+    """Rates of all states, ``(B, N, M)``, by default at the start."""
+    y = system.initial(batch) if y is None else y
+    found: Tensor = system(torch.tensor(t, dtype=torch.float64), y, system.scene(batch))
+    return found.detach()
 
 
 def accelerations(system: Traffic, batch: Batch, method: str = "euler") -> np.ndarray:

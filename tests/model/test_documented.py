@@ -35,18 +35,8 @@ def test_your_own_law_in_one_line() -> None:
 def test_laws_on_the_command_line() -> None:
     laws = re.findall(r"'model\.law=(\{parameters.*\})'", METHOD)
     assert len(laws) == 2
-    lane, people = (
-        build_model(
-            {
-                "term": "formula",
-                "name": "mine",
-                "leader": "measured",
-                "effects": [],
-                "law": yaml.safe_load(text),
-            }
-        )
-        for text in laws
-    )
+    options = {"term": "formula", "name": "mine", "leader": "measured"}
+    lane, people = (build_model({**options, "law": yaml.safe_load(text)}) for text in laws)
     assert (lane.domain, people.domain) == ("traffic", "crowd")
     assert list(lane.physical()) == ["mine.v0", "mine.L"]
     assert list(people.physical()) == ["mine.A", "mine.B", "mine.tau"]

@@ -16,6 +16,7 @@ from nnode.errors import ConfigError
 from nnode.model import Crowd, FollowTheLeader, InteractionForce, State, Traffic, make_law
 from nnode.model.build import add_effects, build_model
 from nnode.model.terms import REDUCED
+from tests.model.following import rates
 from tests.model.test_forces import people
 
 FILES = sorted(Path(laws.__file__).parent.glob("*.yaml"))
@@ -117,12 +118,9 @@ def test_effects_change_a_force_that_is_code() -> None:
     batch, change = collate([people(5, 1)]), []
     for kind in (InteractionForce, Halved):
         model = Crowd([make_law("relaxation"), kind(entry="social_force", A=2.0, k=3.0, kappa=1.0)])
-        rates = []
-        for effects in ([], [{"name": "anticipation", "T_a": 0.5}]):
-            add_effects(model, effects)
-            y = model.initial(batch)
-            rates.append(model(torch.zeros((), dtype=torch.float64), y, model.scene(batch)))
-        change.append((rates[1] - rates[0]).detach())
+        before = rates(model, batch)
+        add_effects(model, [{"name": "anticipation", "T_a": 0.5}])
+        change.append(rates(model, batch) - before)
     assert change[0].abs().max() > 1e-3
     torch.testing.assert_close(change[1], 0.5 * change[0], rtol=1e-12, atol=1e-14)
 

@@ -19,6 +19,7 @@ from tests.model.following import (
     accelerations,
     behind,
     each_follower,
+    idm,
     model,
     numbers,
     set_,
@@ -27,12 +28,6 @@ from tests.model.following import (
 
 #: Length of every vehicle here, m.
 LONG = 4.0
-
-
-def idm(s: float, v: float, u: float, p: Any) -> float:
-    """Treiber, Hennecke & Helbing 2000, equations (2) and (3); no wish below the least gap."""
-    wish = p.s0 + max(0.0, v * p.T + v * (v - u) / (2 * sqrt(p.a * p.b)))
-    return p.a * (1 - (v / p.v0) ** 4 - (wish / max(s, 0.1)) ** 2)
 
 
 def optimal(s: float, p: Any) -> float:

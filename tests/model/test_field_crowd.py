@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from nnode.model import Crowd, build_model
 from nnode.model.laws import PEDESTRIAN_LAWS
 from studies.walking.tasks import without_walls
 from tests.builders import straight
+from tests.model import following
 
 R = 0.25
 
@@ -41,16 +43,22 @@ def scene(x: Any, v: Any, preferred: Any = None) -> Sequence:
 
 def rates(found: Crowd, item: Sequence) -> np.ndarray:
     """(N, 2): velocities of a law of first order, accelerations of one of second."""
-    batch = collate([item])
-    zero = torch.zeros((), dtype=torch.float64)
-    rate = found(zero, found.initial(batch), found.scene(batch))[0, :, -2:]
-    return np.asarray(rate.detach().numpy())
+    return np.asarray(following.rates(found, collate([item]))[0, :, -2:])
 
 
 def force(found: Crowd, item: Sequence) -> np.ndarray:
     """(N, 2) m/s²: what others add."""
     alone = Crowd([found.terms[0].alone()], desired=found.desired)  # type: ignore[union-attr, operator]
     return rates(found, item) - rates(alone, item)
+
+
+def downhill(potential: Callable[[np.ndarray, np.ndarray], float], item: Sequence) -> list[float]:
+    """Minus the gradient of a potential of two people's difference of places, and of velocities."""
+    apart = item.x[0, 0] - item.x[0, 1]
+    v, h = item.v[0, 0] - item.v[0, 1], 1e-5  # type: ignore[index]
+    return [
+        -(potential(apart + h * u, v) - potential(apart - h * u, v)) / (2 * h) for u in np.eye(2)
+    ]
 
 
 def crowd(n: int, seed: int, side: float) -> Sequence:
@@ -119,13 +127,12 @@ def test_the_power_law_is_the_gradient_of_its_energy() -> None:
     k, t0 = 1.5, 3.0
     one = scene([[0, 0], [3.0, 0.2]], [[1.2, 0.1], [-0.9, 0.0]])
 
-    def energy(x: np.ndarray) -> float:
-        t = time_to_collision(x, one.v[0, 0] - one.v[0, 1], 2 * R)  # type: ignore[index]
+    def energy(x: np.ndarray, v: np.ndarray) -> float:
+        t = time_to_collision(x, v, 2 * R)
         return k / t**2 * math.exp(-t / t0)
 
-    apart, h = one.x[0, 0] - one.x[0, 1], 1e-5
-    wanted = [-(energy(apart + h * u) - energy(apart - h * u)) / (2 * h) for u in np.eye(2)]
-    found, v = force(model("ttc", k=k, t0=t0, r=R), one), one.v[0, 0] - one.v[0, 1]  # type: ignore[index]
+    wanted, found = downhill(energy, one), force(model("ttc", k=k, t0=t0, r=R), one)
+    apart, v = one.x[0, 0] - one.x[0, 1], one.v[0, 0] - one.v[0, 1]  # type: ignore[index]
     # the formula's own factor, which takes the infinite force from who would just touch
     inside = (apart @ v) ** 2 - v @ v * (apart @ apart - 4 * R**2)
     np.testing.assert_allclose(found[0] * (inside + 0.01) / inside, wanted, rtol=1e-5)
@@ -179,15 +186,13 @@ def test_nobody_is_pushed_from_behind_or_by_who_walks_away() -> None:
 def test_the_elliptical_force_is_the_gradient_of_its_potential() -> None:
     A, B, stride, one = 0.8, 0.4, 0.7, scene([[0, 0], [1.1, 0.3]], [[1.2, 0.1], [-0.4, 0.3]])
 
-    def potential(x: np.ndarray) -> float:
-        y = -(one.v[0, 0] - one.v[0, 1]) * stride  # type: ignore[index]
+    def potential(x: np.ndarray, v: np.ndarray) -> float:
+        y = -v * stride
         far = np.linalg.norm(x) + np.linalg.norm(x - y)
         return A * B * math.exp((2 * R - math.sqrt(far**2 - y @ y) / 2) / B)
 
-    apart, h = one.x[0, 0] - one.x[0, 1], 1e-5
-    wanted = [-(potential(apart + h * u) - potential(apart - h * u)) / (2 * h) for u in np.eye(2)]
     found = force(model("esf", A=A, B=B, stride=stride, lam=1.0), one)
-    np.testing.assert_allclose(found[0], wanted, rtol=1e-5)
+    np.testing.assert_allclose(found[0], downhill(potential, one), rtol=1e-5)
 
 
 def test_without_velocities_it_is_circular() -> None:

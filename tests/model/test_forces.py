@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from nnode.data.sequence import Batch, Sequence, collate
-from nnode.model import Crowd, InteractionForce, Scene, State, Term, make_law
+from nnode.model import Crowd, InteractionForce, Law, Scene, State, Term, make_law
 from nnode.model.effects.crowd import FieldOfView
+from tests import builders
+from tests.model.following import rates
 
 A, K, KAPPA, R, B, MASS = 3.0, 40.0, 9.0, 0.25, 0.1, 70.0
 #: the walkable corridor lies between y = 0 and y = 2
@@ -22,21 +25,28 @@ def people(n: int, seed: int, walls: np.ndarray | None = WALLS) -> Sequence:
     """People close enough to touch each other and the walls."""
     draw = np.random.default_rng(seed)
     x = draw.uniform([0.2, 0.05], [1.0, 1.2], (3, n, 2))
-    return Sequence(
+    return builders.people(
+        x,
+        0.04,
         name=f"{n}-{seed}",
-        recording="r",
-        time=0.04 * np.arange(3),
-        x=x,
         v=draw.normal(0, 1.2, (3, n, 2)),
         destination=draw.uniform([2, 0], [3, 2], (n, 2)),
         walls=walls,
     )
 
 
+def state(batch: Batch, **more: Any) -> State:
+    return State(torch.zeros(()), batch.x[0], batch.v[0], Scene.of(batch, SPACING), **more)
+
+
+def network_force(**options: Any) -> Law:
+    """The same weights at every call."""
+    draw = torch.Generator().manual_seed(2)
+    return make_law("network_force", hidden=4, mass=MASS, generator=draw, **options)
+
+
 def accelerations(term: Term, batch: Batch) -> np.ndarray:
-    scene = Scene.of(batch, SPACING)
-    state = State(torch.zeros(()), batch.x[0], batch.v[0], scene)
-    return term(state).detach().numpy()
+    return term(state(batch)).detach().numpy()
 
 
 def wall_loop() -> list[tuple[np.ndarray, np.ndarray]]:
@@ -113,8 +123,7 @@ def test_the_samples_contain_contacts_with_people_and_walls() -> None:
 
 @pytest.mark.parametrize("oneself", [False, True])
 def test_network_force(oneself: bool) -> None:
-    draw = torch.Generator().manual_seed(2)
-    term = make_law("network_force", hidden=4, mass=MASS, self_interaction=oneself, generator=draw)
+    term = network_force(self_interaction=oneself)
     found = accelerations(term, collate(CROWDS))
     for b, item in enumerate(CROWDS):
         expected = network_loop(term, item, oneself)
@@ -122,17 +131,11 @@ def test_network_force(oneself: bool) -> None:
 
 
 def test_the_push_of_oneself_does_not_depend_on_where_others_are_seen() -> None:
-    batch, scene = collate(CROWDS), Scene.of(collate(CROWDS), SPACING)
+    batch = collate(CROWDS)
     x, v = batch.x[0], batch.v[0]
-    state = State(torch.zeros(()), x, v, scene, measured_others=(x + 0.3, v - 1))
-    found = []
-    for oneself in (False, True):
-        draw = torch.Generator().manual_seed(2)
-        term = make_law(
-            "network_force", hidden=4, mass=MASS, self_interaction=oneself, generator=draw
-        )
-        found.append(term(state))
-    at_nought = term.pair(torch.zeros_like(x[0, 0].repeat(2))) / MASS
+    seen = state(batch, measured_others=(x + 0.3, v - 1))
+    found = [network_force(self_interaction=oneself)(seen) for oneself in (False, True)]
+    at_nought = network_force().pair(torch.zeros_like(x[0, 0].repeat(2))) / MASS
     for b, item in enumerate(CROWDS):
         more = (found[1] - found[0])[b, : item.n_agents]
         torch.testing.assert_close(more, (at_nought / item.n_agents).expand_as(more).to(more))
@@ -140,14 +143,10 @@ def test_the_push_of_oneself_does_not_depend_on_where_others_are_seen() -> None:
 
 def test_effects_change_no_force_of_a_person_on_himself() -> None:
     # who does not see those behind him still feels the push that the printed sum gives everyone
-    batch, scene = collate(CROWDS), Scene.of(collate(CROWDS), SPACING)
     changes = []
     for oneself in (False, True):
-        draw = torch.Generator().manual_seed(2)
-        force = make_law("network_force", hidden=4, self_interaction=oneself, generator=draw)
-        terms = [force, FieldOfView(lambda_=0.2)]
-        state = State(torch.zeros(()), batch.x[0], batch.v[0], scene, terms)
-        changes.append(terms[1](state))
+        terms = [network_force(self_interaction=oneself), FieldOfView(lambda_=0.2)]
+        changes.append(terms[1](state(collate(CROWDS), terms=terms)))
     torch.testing.assert_close(changes[0], changes[1], rtol=0, atol=0)
 
 
@@ -180,21 +179,17 @@ def test_walls_can_be_left_out() -> None:
 )
 def test_components_add_up_to_the_term(make) -> None:  # type: ignore[no-untyped-def]
     term: InteractionForce = make()
-    batch = collate(CROWDS)
-    scene = Scene.of(batch, SPACING)
-    state = State(torch.zeros(()), batch.x[0], batch.v[0], scene)
-    parts = term.components(state)
+    parts = term.components(now := state(collate(CROWDS)))
     assert set(parts) == {"pair", "wall"}
     assert all(part.abs().max() > 0 for part in parts.values())
-    torch.testing.assert_close(term(state), parts["pair"] + parts["wall"])
+    torch.testing.assert_close(term(now), parts["pair"] + parts["wall"])
 
 
 def test_a_crowd_is_relaxation_plus_interaction_of_second_order() -> None:
     batch = collate(CROWDS[:1])
     terms = [make_law("relaxation", tau=0.5), make_law("social_force", A=A, k=K, kappa=KAPPA)]
     model = Crowd(terms, SPACING)
-    y = model.initial(batch)
-    rate = model(torch.zeros(()), y, model.scene(batch)).detach()
+    rate = rates(model, batch)
     torch.testing.assert_close(rate[..., :2], batch.v[0])
     expected = accelerations(terms[0], batch) + accelerations(terms[1], batch)
     np.testing.assert_allclose(rate[..., 2:], expected, rtol=1e-12)

@@ -3,40 +3,33 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-from nnode.data.sequence import Sequence, collate
-from nnode.model import Law, Scene, State, Traffic, make_law
+from nnode.data.sequence import Batch, collate
+from nnode.model import Scene, State, Traffic, make_law
 from tests.builders import lane
+from tests.model.following import rates
 
 GAPS = [2.5, 5.0, 7.3, 18.0, 60.0]
 
 
-def platoon(name: str, positions: list[float], samples: int = 2) -> Sequence:
-    """Vehicles at rest at ``positions`` (m), the last one leading."""
-    return lane(np.tile(positions, (samples, 1)), name=name)
-
-
-def rates(term: Law, *platoons: list[float]) -> Tensor:
-    batch = collate([platoon(str(i), p) for i, p in enumerate(platoons)])
-    scene = Scene.of(batch)
-    return term(State(torch.zeros(()), batch.x[0], None, scene))[..., 0].detach()
+def at_rest(*platoons: list[float]) -> Batch:
+    """Vehicles at rest at positions (m), the last of each platoon leading."""
+    return collate([lane([p, p], name=str(i)) for i, p in enumerate(platoons)])
 
 
 @pytest.mark.parametrize("gap", GAPS)
-def test_lin(gap: float) -> None:
-    speed = make_law("lin", v0=27.0, L=4.0).speed(torch.tensor(gap, dtype=torch.float64))
-    assert speed.item() == pytest.approx(27.0 * (1 - 4.0 / gap), rel=1e-14)
-
-
-@pytest.mark.parametrize("gap", GAPS)
-def test_log(gap: float) -> None:
-    speed = make_law("log", v0=27.0, L=4.0).speed(torch.tensor(gap, dtype=torch.float64))
-    assert speed.item() == pytest.approx(27.0 * math.log(gap / 4.0), rel=1e-14)
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("lin", lambda gap: 27.0 * (1 - 4.0 / gap)), ("log", lambda gap: 27.0 * math.log(gap / 4.0))],
+)
+def test_speeds_of_laws(name: str, expected: Callable[[float], float], gap: float) -> None:
+    speed = make_law(name, v0=27.0, L=4.0).speed(torch.tensor(gap, dtype=torch.float64))
+    assert speed.item() == pytest.approx(expected(gap), rel=1e-14)
 
 
 @pytest.mark.parametrize("gap", [0.0, -3.0, -1e6])
@@ -65,39 +58,33 @@ def test_network_speed_is_its_network_of_the_gap() -> None:
 
 
 def test_each_vehicle_looks_at_the_next_and_the_last_drives_at_v0() -> None:
-    found = rates(make_law("lin", v0=20.0, L=4.0), [0.0, 8.0, 28.0, 30.0], [5.0, 15.0])
-    expected = [20 * (1 - 4 / 8), 20 * (1 - 4 / 20), 20 * (1 - 4 / 2), 20.0]
-    np.testing.assert_allclose(found[0], expected, rtol=1e-14)
-    np.testing.assert_allclose(found[1], [20 * (1 - 4 / 10), 20.0, 0.0, 0.0], rtol=1e-14)
-
-
-def test_a_vehicle_alone_drives_at_v0() -> None:
-    np.testing.assert_allclose(rates(make_law("log", v0=17.0), [3.0]), [[17.0]])
+    term = make_law("lin", v0=20.0, L=4.0)
+    batch = at_rest([0.0, 8.0, 28.0, 30.0], [5.0, 15.0], [3.0])
+    found = term(State(torch.zeros(()), batch.x[0], None, Scene.of(batch)))[..., 0].detach()
+    expected = [
+        [20 * (1 - 4 / 8), 20 * (1 - 4 / 20), 20 * (1 - 4 / 2), 20.0],
+        [20 * (1 - 4 / 10), 20.0, 0.0, 0.0],
+        [20.0, 0.0, 0.0, 0.0],
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
 
 
 def test_a_measured_leader_is_not_driven_by_the_law() -> None:
-    batch = collate([platoon("a", [0.0, 8.0])])
     model = Traffic([make_law("lin", v0=20.0, L=4.0)], leader="measured")
-    rate = model(torch.zeros(()), batch.x[0], model.scene(batch))
-    np.testing.assert_allclose(rate[0, :, 0].detach(), [10.0, 0.0])
+    np.testing.assert_allclose(rates(model, at_rest([0.0, 8.0]))[0, :, 0], [10.0, 0.0])
 
 
 def test_terms_add_up() -> None:
-    batch = collate([platoon("a", [0.0, 8.0])])
     model = Traffic([make_law("lin", v0=20.0, L=4.0), make_law("lin", v0=3.0, L=2.0)])
-    rate = model(torch.zeros(()), batch.x[0], model.scene(batch))
-    np.testing.assert_allclose(rate[0, :, 0].detach(), [10.0 + 2.25, 23.0])
+    np.testing.assert_allclose(rates(model, at_rest([0.0, 8.0]))[0, :, 0], [10.0 + 2.25, 23.0])
 
 
 @pytest.mark.parametrize("law", ["lin", "log"])
-def test_length_is_projected_onto_its_bound(law: str) -> None:
-    term = make_law(law, v0=-3.0, L=0.5, L_min=2.0)
+@pytest.mark.parametrize(("start", "length"), [(0.5, 2.0), (7.25, 7.25)])
+def test_length_is_projected_onto_its_bound(law: str, start: float, length: float) -> None:
+    term = make_law(law, v0=-3.0, L=start, L_min=2.0)
     term.project_()
-    assert term.L.item() == 2.0
-    assert term.v0.item() == -3.0
-    far = make_law(law, L=7.25, L_min=2.0)
-    far.project_()
-    assert far.L.item() == 7.25
+    assert (term.L.item(), term.v0.item()) == (length, -3.0)
 
 
 def test_box_bounds_the_weights_and_nothing_else() -> None:

@@ -7,11 +7,12 @@ from typing import Any
 import pytest
 import torch
 
-from nnode.data.sequence import Batch, collate
+from nnode.data.sequence import collate
 from nnode.errors import ConfigError
 from nnode.model import Crowd, build_model, make_law
 from nnode.model.effects import CATALOGUE
 from nnode.simulation import FusedSolver
+from tests.model.following import rates
 from tests.model.test_forces import people
 
 LAW: dict[str, Any] = {
@@ -38,16 +39,12 @@ def same() -> Crowd:
     return Crowd([make_law("relaxation", tau=0.7), more])
 
 
-def rates(model: Crowd, batch: Batch) -> torch.Tensor:
-    found = model(torch.zeros((), dtype=torch.float64), model.initial(batch), model.scene(batch))
-    return torch.as_tensor(found[batch.agent]).detach()
-
-
 def test_it_computes_what_it_says() -> None:
     batch, model = collate([people(5, 1), people(3, 2)]), own()
-    torch.testing.assert_close(rates(model, batch), rates(same(), batch), rtol=1e-12, atol=1e-12)
-    found = {name: (float(value), unit) for name, (value, unit) in model.physical().items()}
-    assert found == {
+    found, wanted = (rates(m, batch)[batch.agent] for m in (model, same()))
+    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
+    physical = {name: (float(value), unit) for name, (value, unit) in model.physical().items()}
+    assert physical == {
         "mine.A": (2.0, "m/s²"),
         "mine.B": (pytest.approx(0.4), "m"),
         "mine.tau": (0.7, "s"),
@@ -79,12 +76,9 @@ def test_what_is_wrong_is_told(changes: dict[str, Any], message: str) -> None:
 def test_without_interaction_it_is_its_drive() -> None:
     batch, model = collate([people(5, 1), people(3, 2)]), own()
     bare = Crowd([model.terms[0].alone()])  # type: ignore[union-attr, operator]
-    wanted = rates(Crowd([make_law("relaxation", tau=0.7)]), batch)
-    torch.testing.assert_close(rates(bare, batch), wanted, rtol=1e-12, atol=1e-12)
+    drive = Crowd([make_law("relaxation", tau=0.7)])
+    found, wanted = (rates(m, batch)[batch.agent] for m in (bare, drive))
+    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
     with torch.no_grad():
-        torch.testing.assert_close(
-            FusedSolver(0.02)(bare, batch).x[batch.valid],
-            FusedSolver(0.02)(Crowd([make_law("relaxation", tau=0.7)]), batch).x[batch.valid],
-            rtol=1e-12,
-            atol=1e-12,
-        )
+        found, wanted = (FusedSolver(0.02)(m, batch).x[batch.valid] for m in (bare, drive))
+    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)

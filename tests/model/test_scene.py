@@ -15,26 +15,22 @@ from tests.builders import lane
 NAN = float("nan")
 
 
-def test_points_are_equally_spaced_and_closer_than_asked() -> None:
-    walls = torch.tensor([[[0.0, 0.0, 3.0, 4.0]]], dtype=torch.float64)  # 5 m long
-    points, _, real = wall_points(walls, 0.3)
-    # ceil(5 / 0.3) = 17 pieces
-    expected = np.linspace([0, 0], [3, 4], 18)
-    np.testing.assert_allclose(points[0], expected, atol=1e-14)
+@pytest.mark.parametrize(
+    ("wall", "spacing", "number"),
+    [
+        ([0.0, 0.0, 3.0, 4.0], 0.3, 18),  # 5 m long: ceil(5 / 0.3) = 17 pieces
+        ([1.0, -2.0, 1.0, 2.0], 0.5, 9),  # a spacing that divides is met
+        ([1.0, -2.0, 1.0, 2.0], 0.25, 17),
+        ([1.0, -2.0, 1.0, 2.0], 0.1, 41),
+        ([1.0, 2.0, 1.1, 2.0], 0.25, 2),  # shorter than the spacing
+    ],
+)
+def test_points_are_equally_spaced_and_not_farther_apart_than_asked(
+    wall: list[float], spacing: float, number: int
+) -> None:
+    points, _, real = wall_points(torch.tensor([[wall]], dtype=torch.float64), spacing)
+    np.testing.assert_allclose(points[0], np.linspace(wall[:2], wall[2:], number), atol=1e-14)
     assert bool(real.all())
-
-
-@pytest.mark.parametrize("spacing", [0.5, 0.25, 0.1])
-def test_a_spacing_that_divides_is_met(spacing: float) -> None:
-    walls = torch.tensor([[[1.0, -2.0, 1.0, 2.0]]], dtype=torch.float64)
-    points, _, _ = wall_points(walls, spacing)
-    steps = points[0].diff(dim=0).norm(dim=1)
-    np.testing.assert_allclose(steps, spacing, rtol=1e-12)
-
-
-def test_a_wall_shorter_than_the_spacing_keeps_its_ends() -> None:
-    points, _, _ = wall_points(torch.tensor([[[1.0, 2.0, 1.1, 2.0]]], dtype=torch.float64), 0.25)
-    np.testing.assert_allclose(points[0], [[1.0, 2.0], [1.1, 2.0]])
 
 
 @pytest.mark.parametrize(

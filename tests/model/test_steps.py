@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,12 @@ from scipy.integrate import solve_ivp
 
 from nnode.data.sequence import collate
 from nnode.errors import ConfigError, SimulationError
-from nnode.model import Traffic, build_model, make_law
+from nnode.model import Traffic, make_law
 from nnode.model.laws import CAR_FOLLOWING_LAWS
 from nnode.model.steps import METHODS, STAGES, stepped
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from tests.builders import lane
-from tests.model.following import DT, behind, model, numbers
+from tests.model.following import DT, behind, idm, model, numbers
 
 #: A car that brakes with b m/s², whatever is ahead, and one that accelerates.
 BRAKE = {"parameters": {"b": "3 m/s²"}, "rate": {"v": "0*dv*b/gap - b"}}
@@ -114,8 +113,7 @@ def test_orders_of_accuracy_against_dop853() -> None:
 
     def rates(t: float, y: np.ndarray) -> np.ndarray:
         x, v = np.append(y[:2], start[2] + 14 * t), np.append(y[2:], 14.0)
-        wish = p.s0 + np.maximum(v[:2] * p.T - v[:2] * np.diff(v) / (2 * sqrt(p.a * p.b)), 0)
-        return np.append(v[:2], p.a * (1 - (v[:2] / p.v0) ** 4 - (wish / np.diff(x)) ** 2))
+        return np.append(v[:2], idm(np.diff(x), v[:2], v[1:], p))
 
     exact = solve_ivp(
         rates, (0, seconds), [*start[:2], *speed[:2]], "DOP853", rtol=1e-12, atol=1e-12
@@ -185,9 +183,7 @@ def test_the_default_follows_the_solution_for_half_a_minute() -> None:
             part = np.array([1 - t / DT, t / DT])
             x, v = np.append(y[: n - 1], part @ lead[k : k + 2]), y[n - 1 :]
             ahead = np.append(v[1:], part @ fast[k : k + 2])
-            wish = p.s0 + np.maximum(v * p.T + v * (v - ahead) / (2 * sqrt(p.a * p.b)), 0)
-            rate = p.a * (1 - (v / p.v0) ** 4 - (wish / (np.diff(x) - 4.0)) ** 2)
-            return np.append(v, rate)
+            return np.append(v, idm(np.diff(x) - 4.0, v, ahead, p))
 
         known = solve_ivp(rates, (0, DT), known, "DOP853", rtol=1e-9, atol=1e-9).y[:, -1]
         found.append(known[: n - 1])
@@ -214,15 +210,7 @@ def test_maps_from_step_to_step_have_no_stages(law: str) -> None:
 
 def test_unknown_methods_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"model\.law\.step=leapfrog is unknown, expected euler"):
-        build_model(
-            {
-                "term": "formula",
-                "name": "a",
-                "leader": "measured",
-                "effects": [],
-                "law": {**BRAKE, "step": "leapfrog"},
-            }
-        )
+        model({**BRAKE, "step": "leapfrog"})
     with pytest.raises(ConfigError, match=r"solver\.method=leapfrog.*ballistic"):
         FusedSolver(method="leapfrog")
     with pytest.raises(ConfigError, match=r"solver\.method=leapfrog.*ballistic"):

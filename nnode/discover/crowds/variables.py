@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from nnode.discover.residuals.variables import Variable, clock, knots_of, since_start, waves_of
-from nnode.model.crowd import dot, norm
-from nnode.model.crowd_formula import walls_of
+from nnode.model.crowd_formula import dot, norm, walls_of
 from nnode.model.effects.crowd import heading
 from nnode.model.term import State
 

@@ -303,8 +303,9 @@ def write_events(
             values = {n: c.value for n, c in effect.coefficients.items()}
             row |= {f"effects/{effect.name}/{n}": value for n, value in values.items()}
         book.scalars({name: value for name, value in row.items() if _number(value)}, step)
-    book.text("verdict", sentence(d))
-    book.text("effects", "\n\n".join(f"{e.name}: {interval(e)}; {e.where}" for e in d.effects))
+    book.add_text("verdict", sentence(d), 0)
+    effects = "\n\n".join(f"{e.name}: {interval(e)}; {e.where}" for e in d.effects)
+    book.add_text("effects", effects, 0)
     for path in pictures:
         book.picture(f"diagnosis/{path.stem}", path, 1)
     book.close()

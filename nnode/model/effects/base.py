@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch
@@ -12,10 +12,11 @@ from torch import Tensor
 
 from nnode.data.sequence import Batch, Domain
 from nnode.model.formula import contribution, effect_increment
-from nnode.model.laws import Law, entries
+from nnode.model.laws import Law, entries, packaged
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.model.term import Interval, State, Term
+from nnode.model.terms import Rule
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,9 @@ class Setting:
     unit: str
 
 
+P = TypeVar("P", Strength, Setting)
+
+
 class Effect(Term):
     """A named effect: a term with strengths, settings, and probes for a diagnosis.
 
@@ -95,6 +99,7 @@ class Effect(Term):
         of_drivers: whether the effect only describes differences between drivers.
         acts_on: the part of a pedestrian law that it changes, ``force`` or ``drive``, see
             :class:`nnode.model.terms.Rule`; empty if it acts on every model.
+        min_agents: smallest number of agents of a sequence in which it can be detected.
         rank: position in the sum of terms. An effect with a greater rank is added later and
             modifies the sum of the effects before it.
         confusable_group: name of the group of effects that data often cannot distinguish from it;
@@ -118,6 +123,7 @@ class Effect(Term):
     settings: ClassVar[dict[str, Setting]] = {}
     tried: ClassVar[dict[str, tuple[float, ...]]] = {}
     acts_on: ClassVar[str] = ""
+    min_agents: ClassVar[int] = 1
     rank: ClassVar[int] = 0
     confusable_group: ClassVar[str] = ""
     distinguishing_data: ClassVar[str] = ""
@@ -180,8 +186,15 @@ class Effect(Term):
 
     @classmethod
     def applies(cls, batch: Batch, system: System) -> bool:
-        """Whether it can act on ``system`` and be detected in ``batch``."""
-        return cls.finds(system.terms)
+        """Whether it can act on ``system`` and be detected in ``batch``.
+
+        An effect on a speed whose formula calls the law needs a law of the gap.
+        """
+        law = system.find(Law)
+        by_law = "law(" in str(cls.rules.get(system.order))
+        callable_law = law is not None and (law.of_gap or system.order > 1)
+        enough = int(batch.agent.sum(1).max()) >= cls.min_agents
+        return enough and (callable_law or not by_law) and cls.finds(system.terms)
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
@@ -298,3 +311,37 @@ class Catalogue:
 
 #: The effects that models can have by name.
 CATALOGUE = Catalogue()
+
+
+def declare_effects(domain: Domain, file: str, module: dict[str, Any]) -> None:
+    """Create the effects that a file of the package declares, and add them to the catalogue.
+
+    Every effect becomes a class of the module, with the name in capitalised words.
+
+    Args:
+        domain: the effects' domain.
+        file: name of the YAML file, of names to class attributes.
+        module: the module's names. A class with the name of the effect has the effect's code, and
+            the effect replaces it.
+    """
+    for name, entry in packaged(f"effects/{file}").items():
+        title = name.title().replace("_", "")
+        attributes = {key: tuple(v) if isinstance(v, list) else v for key, v in entry.items()}
+        attributes |= {
+            "__doc__": attributes.pop("about"),
+            "__module__": module["__name__"],
+            "name": name,
+            "domain": domain,
+            "rules": {order: Rule(**rule) for order, rule in entry["rules"].items()},
+            "strengths": _parameters(Strength, entry.get("strengths", {})),
+            "settings": _parameters(Setting, entry.get("settings", {})),
+        }
+        effect = type(title, (module.get(title, Effect),), attributes)
+        module[title] = CATALOGUE.add(cast(type[Effect], effect))
+
+
+def _parameters(kind: type[P], entries: Mapping[str, Any]) -> dict[str, P]:
+    return {
+        name: kind(**{**entry, "range": Interval(*entry["range"])})
+        for name, entry in entries.items()
+    }

@@ -57,6 +57,12 @@ _PARAMETER = {"value", "low", "high", "unit"}
 _ENDS = {"low": "at least", "high": "at most"}
 
 
+def packaged(file: str) -> Any:
+    """The content of a YAML file of the package ``nnode.model``."""
+    text = (files("nnode.model") / file).read_text("utf-8")
+    return yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+
+
 @cache
 def entries() -> dict[str, dict[str, Any]]:
     """The package's laws by name, in the order of their ranks, from their files.
@@ -70,9 +76,8 @@ def entries() -> dict[str, dict[str, Any]]:
     that it changes if it is true. A parameter whose value is a list of two values starts uniform
     between them.
     """
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     laws = {
-        file.name.removesuffix(".yaml"): yaml.load(file.read_text("utf-8"), loader)
+        file.name.removesuffix(".yaml"): packaged(f"laws/{file.name}")
         for file in files("nnode.model.laws").iterdir()
         if file.name.endswith(".yaml")
     }
@@ -319,7 +324,8 @@ class Law(Term):
         """Whether it is a speed that depends only on the gap."""
         if self.domain != "traffic" or self.order != 1 or self.formulas.memory:
             return False
-        return _names_gap_alone(self.dynamics(called=True))
+        lane = self.dynamics(called=True)
+        return {"gap", *lane.owned}.issuperset(symbols([_law_alone(lane)]))
 
     def names(self, parameter: str) -> bool:
         """Whether the rate of a vehicle contains a parameter."""
@@ -455,11 +461,6 @@ def _law_alone(lane: LaneDynamics) -> Expr:
     """A law's rate, with fixed quantities as numbers."""
     assert lane.law is not None
     return substitute(lane.law, lane.fixed)
-
-
-@cache
-def _names_gap_alone(lane: LaneDynamics) -> bool:
-    return {"gap", *lane.owned}.issuperset(symbols([_law_alone(lane)]))
 
 
 def _network_output(network: FeedForward, *inputs: Tensor) -> Tensor:

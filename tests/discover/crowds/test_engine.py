@@ -21,7 +21,7 @@ from nnode.discover.locate.curves import columns_of
 from nnode.discover.residuals.fit import evaluated, refine
 from nnode.discover.statistics.score import Screen, traces
 from nnode.model import Crowd
-from nnode.model.crowd import norm
+from nnode.model.crowd_formula import norm
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect, Probe, Setting, Strength
 from nnode.model.effects.crowd import Alignment, Drift, GaitSway, PairRepulsion, heading
 from nnode.model.extend import extended

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from nnode.errors import ConfigError
 from nnode.model import Crowd, Scene, State, make_law
 from nnode.model.build import add_effects
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
+from tests import builders
 
 A, K, KAPPA, R, B = 3.0, 40.0, 9.0, 0.2, 0.3
 WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 3.0, 0.0, 3.0], [1.0, 1.0, 2.0, 1.5]])
@@ -42,11 +44,11 @@ VALUES: dict[str, dict[str, float]] = {
 def people(n: int, seed: int) -> Sequence:
     draw = np.random.default_rng(seed)
     names = ("a", "b", "a", "", "b", "a", "", "c")
-    return Sequence(
+    return builders.people(
+        draw.uniform([0.3, 0.2], [3.0, 2.7], (n, 2)) + np.zeros((4, 1, 1)),
+        0.1,
+        start=12.0,
         name=f"{n}-{seed}",
-        recording="r",
-        time=12.0 + 0.1 * np.arange(4),
-        x=draw.uniform([0.3, 0.2], [3.0, 2.7], (n, 2)) + np.zeros((4, 1, 1)),
         v=draw.normal(0, 1.0, (4, n, 2)),
         destination=draw.uniform([4, 0], [6, 3], (n, 2)),
         group=names[:n],
@@ -248,23 +250,20 @@ def test_turning_and_moving_everything_turns_the_acceleration(name: str) -> None
         assert item.v is not None
         assert item.destination is not None
         items.append(
-            Sequence(
-                name=item.name,
-                recording="r",
-                time=item.time,
+            replace(
+                item,
                 x=place(item.x),
                 v=turn(item.v),
                 destination=place(item.destination),
-                group=item.group,
                 walls=np.concatenate([place(WALLS[:, :2]), place(WALLS[:, 2:])], 1),
             )
         )
     other = collate(items)
     effect, model = effect_of(name)
-    there = State(
+    turned = State(
         torch.tensor(0.2), other.x[0], other.v[0], Scene.of(other), terms=list(model.terms)
     )
-    found, here = effect(there).detach().numpy(), effect(state(model)).detach().numpy()
+    found, here = effect(turned).detach().numpy(), effect(state(model)).detach().numpy()
     real = BATCH.agent.numpy()
     np.testing.assert_allclose(found[real], turn(here[real]), rtol=1e-8, atol=1e-9)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import exp, sqrt
+from math import exp
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +16,7 @@ from nnode.model import build_model
 from nnode.model.effects import CATALOGUE
 from nnode.simulation import TorchdiffeqSolver
 from tests.builders import lane
+from tests.model import following
 from tests.model.following import DT, accelerations, behind, model, numbers
 
 LONG, TRUCK = 4.0, 10.0
@@ -35,12 +36,10 @@ def platoon() -> Batch:
 def idm(
     i: int, p: Any, *, gap: float | None = None, dv: float | None = None, **other: float
 ) -> float:
-    """Acceleration of vehicle i (Treiber, Hennecke & Helbing 2000), with other numbers in it."""
-    q = SimpleNamespace(**{**vars(p), **other})
+    """Acceleration of vehicle i, with other numbers in it."""
     net = (GAPS[i] if gap is None else gap) - (TRUCK if i == 0 else LONG)
-    v, closing = SPEEDS[i], SPEEDS[i] - SPEEDS[i + 1] if dv is None else dv
-    wish = q.s0 + max(0.0, v * q.T + v * closing / (2 * sqrt(q.a * q.b)))
-    return q.a * (1 - (v / q.v0) ** 4 - (wish / net) ** 2)
+    ahead = SPEEDS[i + 1] if dv is None else SPEEDS[i] - dv
+    return float(following.idm(net, SPEEDS[i], ahead, SimpleNamespace(**{**vars(p), **other})))
 
 
 P = numbers(model("idm"))
@@ -155,9 +154,7 @@ def test_a_pure_delay_is_a_list_of_what_was(T: float) -> None:
     x, v = batch.x[:, 0, :, 0].numpy().copy(), batch.v[:, 0, :, 0].numpy().copy()
     past: list[np.ndarray] = []
     for k in range(len(x) - 1):
-        gap, dv = np.diff(x[k]) - LONG, -np.diff(v[k])
-        wish = P.s0 + np.maximum(v[k, :2] * P.T + v[k, :2] * dv / (2 * sqrt(P.a * P.b)), 0)
-        now = P.a * (1 - (v[k, :2] / P.v0) ** 4 - (wish / gap) ** 2)
+        now = following.idm(np.diff(x[k]) - LONG, v[k, :2], v[k, 1:], P)
         past = [now] * (steps + 1) if k == 0 else [now, *past[:steps]]
         whole = min(int(T / DT + 1e-9), steps - 1)
         part = T / DT - whole
@@ -194,9 +191,8 @@ def _remembered(batch: Batch, start: list[float], tau: float, step: float) -> np
     for s in range(per * (len(place) - 1)):
         at = s / per
         ahead, u = (np.interp(at, np.arange(len(place)), z) for z in (place, speed))
-        gap, dv = np.diff([*x, ahead]) - LONG, -np.diff([*v, u])
-        wish = P.s0 + np.maximum(v * q + v * dv / (2 * sqrt(P.a * P.b)), 0)
-        a = P.a * (1 - (v / P.v0) ** 4 - (wish / gap) ** 2)
+        now = SimpleNamespace(**{**vars(P), "T": q})
+        a = following.idm(np.diff([*x, ahead]) - LONG, v, np.array([*v[1:], u]), now)
         x, v, q = x + step * v + step**2 / 2 * a, v + step * a, q + step * (P.T - q) / tau
     return x
 

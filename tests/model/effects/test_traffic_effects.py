@@ -17,6 +17,7 @@ from nnode.model.effects import CATALOGUE
 from nnode.model.extend import extended, without
 from nnode.simulation import TorchdiffeqSolver
 from tests.builders import lane
+from tests.model.following import rates
 
 NAMES = [effect.name for effect in CATALOGUE.of("traffic")]
 V0, LENGTH = 30.0, 6.0
@@ -39,12 +40,10 @@ def model(*effects: dict[str, Any]) -> System:
     return build_model({"term": "lin", "name": "lin", **options, "effects": list(effects)})
 
 
-def rates(system: System, data: Batch, t: float = 0.0) -> np.ndarray:
+def speeds(system: System, data: Batch) -> np.ndarray:
     """Speeds of the followers of the first sequence."""
-    y = system.initial(data)
-    found = system(torch.tensor(t).double(), y, system.scene(data))
     followers = int(data.agent[0].sum()) - 1
-    return found[0, :followers, 0].detach().numpy()
+    return rates(system, data)[0, :followers, 0].numpy()
 
 
 def law(gap: float) -> float:
@@ -52,6 +51,12 @@ def law(gap: float) -> float:
 
 
 W = np.array([law(20), law(30), law(40)])
+LAST = W[2] + 0.1 * (12 - W[2])
+SECOND = W[1] + (0.6 if W[1] < LAST else 0.1) * (LAST - W[1])
+TIME_GAPS = [12.0]
+for _gap in (40, 30, 20):
+    TIME_GAPS.insert(0, V0 * (1 - (LENGTH + 0.2 * TIME_GAPS[0]) / _gap))
+del TIME_GAPS[3]
 
 
 @pytest.mark.parametrize(
@@ -81,26 +86,17 @@ W = np.array([law(20), law(30), law(40)])
             {"name": "leader_length", "beta": 1.0},
             [law(20 - 4.5), law(30 + 1.5), law(40 + 1.5)],
         ),
+        # the last one closes in on the leader, the second one on the last one
+        (
+            {"name": "asymmetric_response", "kappa_open": 0.6, "kappa_close": 0.1},
+            [W[0] + 0.6 * (SECOND - W[0]), SECOND, LAST],
+        ),
+        # L + h v of the vehicle ahead in place of L
+        ({"name": "time_gap", "h": 0.2}, TIME_GAPS),
     ],
 )
 def test_rates_are_those_of_the_formula(effect: dict[str, Any], expected: Any) -> None:
-    assert rates(model(effect), batch()) == pytest.approx(np.array(expected), rel=1e-9)
-
-
-def test_response_is_asymmetric() -> None:
-    effect = {"name": "asymmetric_response", "kappa_open": 0.6, "kappa_close": 0.1}
-    found = rates(model(effect), batch())
-    assert found[2] == pytest.approx(W[2] + 0.1 * (12 - W[2]))  # closing in on the leader
-    ahead = found[2]
-    factor = 0.6 if ahead > W[1] else 0.1
-    assert found[1] == pytest.approx(W[1] + factor * (ahead - W[1]))
-
-
-def test_time_gap_lengthens_with_the_speed_ahead() -> None:
-    found = rates(model({"name": "time_gap", "h": 0.2}), batch())
-    last = V0 * (1 - (LENGTH + 0.2 * 12) / 40)
-    assert found[2] == pytest.approx(last)
-    assert found[1] == pytest.approx(V0 * (1 - (LENGTH + 0.2 * last) / 30))
+    assert speeds(model(effect), batch()) == pytest.approx(np.array(expected), rel=1e-9)
 
 
 def ramp(opening: float) -> Batch:
@@ -126,10 +122,9 @@ def test_a_delayed_driver_sees_the_gap_of_before() -> None:
 
 def test_inertia_approaches_the_law_exponentially() -> None:
     system = model({"name": "inertia", "tau_v": 0.5})
-    data = batch()
-    y = system.initial(data)
+    y = system.initial(batch())
     y[..., 1] = 0.0  # at rest
-    found = system(torch.tensor(0.0).double(), y, system.scene(data)).detach()
+    found = rates(system, batch(), y=y)
     assert found[0, :3, 0].tolist() == [0.0, 0.0, 0.0]
     assert found[0, :3, 1].numpy() == pytest.approx(W / 0.5)
 
@@ -137,13 +132,11 @@ def test_inertia_approaches_the_law_exponentially() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_padding_does_not_matter_and_all_is_finite(name: str) -> None:
     system = model({"name": name})
-    alone, padded = rates(system, batch()), rates(system, batch(more=3))
+    alone, padded = speeds(system, batch()), speeds(system, batch(more=3))
     # the mean length of vehicles is that of the batch
     if name != "leader_length":
         assert padded == pytest.approx(alone)
-    y = system.initial(batch(more=3))
-    found = system(torch.tensor(0.3).double(), y, system.scene(batch(more=3)))
-    assert torch.isfinite(found).all()
+    assert torch.isfinite(rates(system, batch(more=3), 0.3)).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -166,9 +159,7 @@ def test_a_driven_leader_is_measured() -> None:
     options = {"leader": "constant", "v0": V0, "L": LENGTH, "L_min": 1.0}
     effect = {"name": "leader_speed", "weight": 0.25}
     system = build_model({"term": "lin", "name": "lin", **options, "effects": [effect]})
-    data = batch()
-    found = system(torch.tensor(0.0).double(), system.initial(data), system.scene(data))
-    assert float(found[0, 3, 0]) == pytest.approx(0.75 * V0 + 0.25 * 12)
+    assert float(rates(system, batch())[0, 3, 0]) == pytest.approx(0.75 * V0 + 0.25 * 12)
 
 
 def test_effects_stand_in_the_order_of_their_ranks_and_can_be_removed() -> None:
