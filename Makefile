@@ -18,7 +18,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 # Check, calibration and diagnosis of synthetic tables, and the paper's crowd, on one page.
 demo: setup
 	rm -rf $(DEMO)
-	$(BIN)/python -m nnode.app.demo $(DEMO)
+	$(BIN)/python -m studies.demo.study $(DEMO)
 
 # Files of tests side by side, on at most four cores.
 test: setup

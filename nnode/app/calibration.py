@@ -282,13 +282,14 @@ class Calibration:
         unit, fit, lines = self.cost_unit, self.fit, []
         if self.status == "stalled":
             lines.append(STALLED)
-        lines.append(f"{self.noise}{self._started()}")
+        lines.append(f"{self.noise}{self._noise_of_speeds()}")
         if self.filled:
             lines.append(f"missing samples that were interpolated: {self.filled}")
-        if "change" in self.start_speeds:
-            whose = "smoothed paths" if self.start_speeds.get("smoothed") else "the data"
+        speeds = self.start_speeds
+        if "change" in speeds:
+            whose = "smoothed paths" if speeds.get("smoothed") else "the data"
             lines.append(
-                f"first speeds of training sequences are fitted: {self.start_speeds['change']:.3g} "
+                f"first speeds of training sequences are fitted: {speeds['change']:.3g} "
                 f"m/s (root mean square) from those of {whose}, which held-out sequences start with"
             )
         if self.pooling:
@@ -389,22 +390,19 @@ class Calibration:
         dtype = next(self.model.parameters()).dtype
         return simulated(lambda b: self.solver(self.model, b), sequences, dtype=dtype)
 
-    def _started(self) -> str:
+    def _noise_of_speeds(self) -> str:
         """The remark on noisy first speeds; empty if the noise is small."""
-        bad = self.noise.beyond and self.model.domain == "traffic" and self.model.order > 1
-        if not bad:
+        if not self.noise.beyond or self.model.domain != "traffic" or self.model.order == 1:
             return ""
+        beyond = f", more than the {BEARABLE:g} m/s that a law of second order bears: "
         if self.start_speeds.get("smoothed"):
             return (
-                f", more than the {BEARABLE:g} m/s that a law of second order bears: speeds are "
-                "those of smoothed paths (trainer.start_speeds=given takes the data's)"
+                f"{beyond}speeds are those of smoothed paths (trainer.start_speeds=given takes the "
+                "data's)"
             )
-        if self.start_speeds["kind"] != "measured":
-            return ""
-        return (
-            f", more than the {BEARABLE:g} m/s that a law of second order bears: estimates are "
-            "biased; take trainer.start_speeds=auto"
-        )
+        if self.start_speeds["kind"] == "measured":
+            return f"{beyond}estimates are biased; take trainer.start_speeds=auto"
+        return ""
 
     def plot(self) -> Figure:
         """The calibrated speed curve, or the force between two people, over the training data.
@@ -426,24 +424,17 @@ class Calibration:
 
         Needs xarray: ``pip install 'nnode[xarray]'``.
         """
-        names = [str(name) for name in self.parameters.index]
-        variables = {
-            key: ("parameter", self.parameters[key].to_numpy(dtype=float))
-            for key in ("estimate", "lower", "upper")
-        }
+        table = self.parameters[["estimate", "lower", "upper", "unit"]].rename_axis("parameter")
+        costs = self.history.set_index("epoch").filter(regex="^cost/")
+        arrays = xarray().Dataset.from_dataframe
+        dataset: Dataset = arrays(table).set_coords("unit")
+        dataset = dataset.merge(arrays(costs.rename(columns=lambda name: name.replace("/", "_"))))
         if self.correlation is not None:
-            table = self.correlation.loc[names, names].to_numpy(dtype=float)
-            variables["correlation"] = (("parameter", "other"), table)  # type: ignore[assignment]
-        for key, costs in self.history.filter(regex="^cost/").items():
-            variables[str(key).replace("/", "_")] = ("epoch", costs.to_numpy(dtype=float))
-        coords = {
-            "parameter": names,
-            "unit": ("parameter", self.parameters["unit"].to_list()),
-            "epoch": self.history["epoch"].to_numpy(dtype=int),
-        } | ({} if self.correlation is None else {"other": names})
-        return xarray().Dataset(
-            variables, coords, {"model": self.name, "cost_unit": self.cost_unit}
-        )
+            names = table.index
+            dataset = dataset.assign_coords(other=names.to_numpy())
+            values = self.correlation.loc[names, names].to_numpy(dtype=float)
+            dataset["correlation"] = (("parameter", "other"), values)
+        return dataset.assign_attrs(model=self.name, cost_unit=self.cost_unit)
 
     def save(self, path: str | Path) -> Path:
         """Write a checkpoint that :func:`nnode.load` and the commands read.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import cast
@@ -38,11 +39,9 @@ class Check:
 
     Attributes:
         examination: all results, in SI units.
-        options: overrides with which the commands read the file.
     """
 
     examination: Examination
-    options: list[str]
 
     @property
     def findings(self) -> list[Finding]:
@@ -54,25 +53,126 @@ class Check:
         """Probability of the units, summed over frame rates."""
         return self.examination.share
 
+    @cached_property
+    def options(self) -> list[str]:
+        """The overrides, quoted for the shell, with which the commands read the file."""
+        source = self.examination.source
+        defaults = group_defaults("data", source.group, "prepare_data")
+        # options that were not recognised keep the group's values
+        return [f"data={source.group}", *changes("data", changed_options(source.options), defaults)]
+
+    @property
+    def sentence(self) -> str:
+        """What there is, in a sentence."""
+        rows, levels = self.examination.rows, [finding.level for finding in self.findings]
+        errors, warnings = levels.count("error"), levels.count("warning")
+        wrong = f"{errors} error{'s' * (errors != 1)} and {warnings} warning{'s' * (warnings != 1)}"
+        who = "people" if self.examination.scale.domain == "crowd" else "vehicles"
+        return (
+            f"{len(set(rows.agent.tolist()))} {who}, {len(rows)} positions, "
+            f"sampled every {rows.dt:.4g} s: {wrong}."
+        )
+
+    @property
+    def python(self) -> list[str]:
+        """Lines of Python that read the file with all recognised options and calibrate a model."""
+        source = self.examination.source
+        options = changed_options(source.options)
+        path = options.pop("path", "")
+        arguments = [repr(path)] if path else []
+        arguments += [f"{k}={value!r}" for k, value in {"data": source.group, **options}.items()]
+        heldout = "" if self._can_hold_out else ", heldout=0"
+        return [
+            "import nnode",
+            f"data = nnode.sequences({', '.join(arguments)})",
+            f"nnode.fit(data, model={self._model!r}{heldout})",
+        ]
+
     def __repr__(self) -> str:
-        return summary(self.examination, self.options)
+        examination = self.examination
+        text = [f"{examination.path}: {self.sentence}"]
+        if examination.meanings:
+            columns = ", ".join(
+                f"{m} = {guess.column}" for m, guess in examination.meanings.items()
+            )
+            units = f"units: {_units(examination)} ({certainty(examination.share)})"
+            text += [f"columns: {columns}", units]
+        else:
+            text.append(f"format: {examination.raw.native}, whose reader knows its units")
+        text += [f"{_SIGNS[f.level]:>5}  {f.kind}: {f.text}" for f in self.findings]
+        prepare, *others = self._commands(" ")
+        text += ["", "to prepare the data:", f"  {prepare}"]
+        text += ["to calibrate and to diagnose a model:", *(f"  {line}" for line in others)]
+        text += ["in Python:", *(f"  {line}" for line in self.python)]
+        return "\n".join(printable(line) for line in text)
 
     def _repr_html_(self) -> str:
         table = _rows(self.findings).to_html() if self.findings else ""
-        return f"<p>{escape(sentence(self.examination))}</p>{table}"
+        return f"<p>{escape(self.sentence)}</p>{table}"
 
     def write(self, folder: str | Path) -> Path:
         """Write the page ``check.html`` with its tables, and return its path."""
+        shell, python = "\n".join(self._commands(" \\\n    ")), "\n".join(self.python)
+        usage = f"```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```"
         return write_page(
             [
-                *blocks(self.examination, self.options),
+                Heading("Findings"),
+                *_findings(self.findings),
+                Heading("Commands"),
+                Text(usage),
+                *_columns(self.examination),
+                *_units_blocks(self.examination),
+                Heading("Speeds, sampling and presence"),
+                *_figures(self.examination),
                 Provenance(how_made(("numpy", "pandas", "scipy", "matplotlib"))),
             ],
             Path(folder),
             title=f"Check of {self.examination.path.name}",
-            subtitle=sentence(self.examination),
+            subtitle=self.sentence,
             stem="check",
         )[0]
+
+    def _commands(self, separator: str) -> list[str]:
+        """The commands for the data, as far as there are enough sequences for them.
+
+        Args:
+            separator: text between the options.
+        """
+        options, number = separator.join(self.options), len(self._sound_sequences)
+        heldout = "" if self._can_hold_out else " data.split.heldout=0"
+        return [
+            f"nnode prepare_data {options}",
+            f"nnode train model={self._model} {options}{heldout}",
+            f"nnode discover model={self._model} {options}"
+            if number >= LEAST
+            else f"# a diagnosis needs at least {LEAST} sequences, there are {number}",
+        ]
+
+    @property
+    def _model(self) -> str:
+        """The domain's simplest model of an acceleration or a force."""
+        return "sf" if self.examination.scale.domain == "crowd" else "idm"
+
+    @cached_property
+    def _sound_sequences(self) -> list[Sequence]:
+        """The sequences without faults."""
+        sequences, options = self.examination.sequences, self.examination.source.options
+        if not sequences:
+            return []
+        agents, _ = identify(sequences, self.examination.scale.domain, options.agents)
+        unique = [replace(s, agents=names) for s, names in zip(sequences, agents, strict=True)]
+        return [s for s in unique if s.name not in self.examination.faults]
+
+    @property
+    def _can_hold_out(self) -> bool:
+        """Whether some of the sequences can be held out; True if there are none."""
+        sequences = self._sound_sequences
+        if not sequences:
+            return True
+        try:
+            return bool(split(index_of(sequences), self.examination.source.options.split).heldout)
+        except NNodeError:
+            return False
 
 
 def check_file(
@@ -93,8 +193,7 @@ def check_file(
         raise ConfigError(f"domain={domain}: expected traffic, crowd, or null to guess")
     if frame_rate is not None and not 0 < frame_rate < float("inf"):
         raise ConfigError(f"frame_rate={frame_rate}: expected a positive number, 1/s")
-    examination = examine(Path(file).expanduser(), domain, frame_rate)
-    return Check(examination, command(examination))
+    return Check(examine(Path(file).expanduser(), domain, frame_rate))
 
 
 def check(config: DictConfig, folder: Path) -> None:
@@ -108,121 +207,11 @@ def check(config: DictConfig, folder: Path) -> None:
     print(f"page: {result.write(folder)}")
 
 
-def command(examination: Examination) -> list[str]:
-    """The overrides, quoted for the shell, with which the commands read the file."""
-    source = examination.source
-    defaults = group_defaults("data", source.group, "prepare_data")
-    # options that were not recognised keep the group's values
-    return [f"data={source.group}", *changes("data", changed_options(source.options), defaults)]
-
-
-def sentence(examination: Examination) -> str:
-    """What there is, in a sentence."""
-    levels = [finding.level for finding in examination.findings]
-    errors, looks = levels.count("error"), levels.count("warning")
-    wrong = f"{errors} error{'s' * (errors != 1)} and {looks} warning{'s' * (looks != 1)}"
-    who = "people" if examination.scale.domain == "crowd" else "vehicles"
-    return (
-        f"{len(set(examination.rows.agent.tolist()))} {who}, {len(examination.rows)} positions, "
-        f"sampled every {examination.rows.dt:.4g} s: {wrong}."
-    )
-
-
-def summary(examination: Examination, lines: list[str]) -> str:
-    """The summary in plain text."""
-    text = [f"{examination.path}: {sentence(examination)}"]
-    if examination.meanings:
-        columns = ", ".join(
-            f"{m} = {finding.column}" for m, finding in examination.meanings.items()
-        )
-        text.append(f"columns: {columns}")
-        text.append(f"units: {_units(examination)} ({certainty(examination.share)})")
-    else:
-        text.append(f"format: {examination.raw.native}, whose reader knows its units")
-    text += [
-        f"{_SIGNS[finding.level]:>5}  {finding.kind}: {finding.text}"
-        for finding in examination.findings
-    ]
-    words = " ".join(lines)
-    text += ["", "to prepare the data:", f"  nnode prepare_data {words}"]
-    text += ["to calibrate and to diagnose a model:"]
-    text += [f"  {line}" for line in _next_commands(examination, words)]
-    text += ["in Python:", *(f"  {line}" for line in python_lines(examination))]
-    return "\n".join(printable(line) for line in text)
-
-
-def _next_commands(examination: Examination, words: str) -> list[str]:
-    """Further commands for the data, if there are enough sequences for them."""
-    usable = _sound_sequences(examination)
-    holdout = [] if _heldout(examination, usable) else ["data.split.heldout=0"]
-    lines = [" ".join([f"nnode train {_model(examination)} {words}", *holdout])]
-    if len(usable) >= LEAST:
-        lines.append(f"nnode discover {_model(examination)} {words}")
-    else:
-        lines.append(f"# a diagnosis needs at least {LEAST} sequences, there are {len(usable)}")
-    return lines
-
-
-def _sound_sequences(examination: Examination) -> list[Sequence]:
-    """The sequences without faults."""
-    domain, sequences = examination.scale.domain, examination.sequences
-    agents, _ = (
-        identify(sequences, domain, examination.source.options.agents) if sequences else ([], [])
-    )
-    unique = [replace(s, agents=names) for s, names in zip(sequences, agents, strict=True)]
-    return [s for s in unique if s.name not in examination.faults]
-
-
-def _heldout(examination: Examination, sequences: list[Sequence]) -> bool:
-    """Whether some of the sequences can be held out."""
-    if not sequences:
-        return True
-    try:
-        return bool(split(index_of(sequences), examination.source.options.split).heldout)
-    except NNodeError:
-        return False
-
-
-def _model(examination: Examination) -> str:
-    """The domain's simplest model of an acceleration or a force."""
-    return "model=sf" if examination.scale.domain == "crowd" else "model=idm"
-
-
-def python_lines(examination: Examination) -> list[str]:
-    """Lines of Python that read the file with all recognised options and calibrate a model."""
-    group, *_ = command(examination)
-    holdout = "" if _heldout(examination, _sound_sequences(examination)) else ", heldout=0"
-    options = changed_options(examination.source.options)
-    path = options.pop("path", "")
-    arguments = [repr(path)] if path else []
-    options = {"data": group.partition("=")[2], **options}
-    arguments += [f"{key}={value!r}" for key, value in options.items()]
-    return [
-        "import nnode",
-        f"data = nnode.sequences({', '.join(arguments)})",
-        f"nnode.fit(data, model={_model(examination).partition('=')[2]!r}{holdout})",
-    ]
-
-
 def _units(examination: Examination) -> str:
     scale = examination.scale
     clock = f"frames of 1/{scale.rate:g} s" if scale.rate else scale.time
     speeds = f", speeds in {scale.speed}" if examination.rows.v is not None else ""
     return f"{scale.domain}, positions in {scale.position}, times in {clock}{speeds}"
-
-
-def blocks(examination: Examination, lines: list[str]) -> list[Block]:
-    """The page: findings, commands, and the content of the file."""
-    return [
-        Heading("Findings"),
-        *_findings(examination.findings),
-        Heading("Commands"),
-        Text(_usage(examination, lines)),
-        *_columns(examination),
-        *_units_blocks(examination),
-        Heading("Speeds, sampling and presence"),
-        *_figures(examination),
-    ]
 
 
 def _rows(findings: list[Finding]) -> pd.DataFrame:
@@ -238,14 +227,6 @@ def _findings(findings: list[Finding]) -> list[Block]:
         "information."
     )
     return [TableBlock("findings", _rows(findings), caption)]
-
-
-def _usage(examination: Examination, lines: list[str]) -> str:
-    words = " \\\n    ".join(lines)
-    commands = [f"nnode prepare_data {words}"]
-    commands += _next_commands(examination, words)
-    shell, python = "\n".join(commands), "\n".join(python_lines(examination))
-    return f"```sh\n{shell}\n```\n\nIn Python:\n\n```python\n{python}\n```"
 
 
 def _columns(examination: Examination) -> list[Block]:

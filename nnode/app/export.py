@@ -162,33 +162,24 @@ def _csv(job: _Export) -> _Written:
     run, unit = job.run, job.run.convention.unit
     metrics = evaluate(run.simulate, run.batches(), run.convention)
     part = {name: key for key, names in run.checkpoint.split.items() for name in names}
-    tables: dict[str, tuple[list[str], list[tuple[Any, ...]]]] = {
-        "parameters": (
-            ["parameter", "value", "unit"],
-            [(name, float(value), of) for name, (value, of) in run.model.physical().items()],
-        ),
-        "history": (
-            ["epoch", "quantity", "value"],
-            [
-                (row.get("epoch"), name, value)
-                for row in run.checkpoint.history
-                for name, value in row.items()
-                if name != "epoch"
-            ],
-        ),
-        "sequences": (
-            ["sequence", "part", "cost", "unit"],
-            [(name, part.get(name, ""), cost, unit) for name, cost in metrics.costs.items()],
-        ),
-        "horizons": (
-            ["time_s", "rmse_m", "samples"],
-            [(row["t"], row["rmse"], row["n"]) for row in metrics.horizons],
+    physical = run.model.physical()
+    values = [(name, float(value), units) for name, (value, units) in physical.items()]
+    costs = [(name, part.get(name, ""), cost, unit) for name, cost in metrics.costs.items()]
+    history = [
+        (row.get("epoch"), name, value)
+        for row in run.checkpoint.history
+        for name, value in row.items()
+        if name != "epoch"
+    ]
+    tables = {
+        "parameters": pd.DataFrame(values, columns=["parameter", "value", "unit"]),
+        "history": pd.DataFrame(history, columns=["epoch", "quantity", "value"]),
+        "sequences": pd.DataFrame(costs, columns=["sequence", "part", "cost", "unit"]),
+        "horizons": pd.DataFrame(metrics.horizons, columns=["t", "rmse", "n"]).set_axis(
+            ["time_s", "rmse_m", "samples"], axis=1
         ),
     }
-    files = [
-        write_csv(job.folder / "csv" / f"{name}.csv", pd.DataFrame(rows, columns=columns))
-        for name, (columns, rows) in tables.items()
-    ]
+    files = [write_csv(job.folder / "csv" / f"{name}.csv", t) for name, t in tables.items()]
     return files, Counterpart()
 
 

@@ -48,7 +48,8 @@ def simulated(
     Args:
         size: number of sequences that are simulated at once.
     """
-    for group in _groups(sequences, size):
+    iterator = iter(sequences)
+    while group := list(islice(iterator, size)):
         path = simulate(collate(group).to(device, dtype))
         x = path.x.double().cpu().numpy()
         v = None if path.v is None else path.v.double().cpu().numpy()
@@ -189,12 +190,6 @@ def write_walls(path: Path, sequences: Iterable[Sequence]) -> tuple[Path | None,
 def _directed(s: Sequence) -> Sequence:
     """The sequence with explicit destinations, since a table's column is complete or absent."""
     return s if s.destination is not None else replace(s, destination=s.x[-1])
-
-
-def _groups(sequences: Iterable[Sequence], size: int) -> Iterator[list[Sequence]]:
-    iterator = iter(sequences)
-    while group := list(islice(iterator, size)):
-        yield group
 
 
 def _named(sequences: Iterable[Sequence]) -> Iterator[tuple[str, Sequence]]:

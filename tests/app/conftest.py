@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
@@ -28,6 +29,9 @@ COMMANDS = {
     *(path.stem for path in (ROOT / "nnode" / "app" / "commands").glob("[a-z]*.py")),
     *(f"scripts/{name}.py" for name in ("benchmark", "benchmark_discovery", "fault_injection")),
 }
+
+# Hydra copies all schemas in every composition, which takes a third of its time
+ConfigStore.__deepcopy__ = lambda store, _: store  # type: ignore[attr-defined]
 
 Script = Callable[..., subprocess.CompletedProcess[str]]
 

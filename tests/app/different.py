@@ -47,8 +47,8 @@ def table(
         gap, u = np.maximum(-np.diff(x) - LONG, 0.1), v[:, 1:]
         closing = u * np.diff(v) / (2 * np.sqrt(own["a"] * own["b"]))
         wish = own["s0"] + np.maximum(u * own["T"] + closing, 0.0)
-        found = own["a"] * (1 - (u / own["v0"]) ** 4 - (wish / gap) ** 2) + push
-        return np.asarray(found)
+        result = own["a"] * (1 - (u / own["v0"]) ** 4 - (wish / gap) ** 2) + push
+        return np.asarray(result)
 
     first = np.minimum(leader(0.0), 0.8 * own["v0"].min(1)[:, None])
     at_rest = (own["s0"] + first * own["T"]) / np.sqrt(1 - (first / own["v0"]) ** 4)
@@ -69,7 +69,7 @@ def table(
     samples, platoon, place = np.meshgrid(
         np.arange(len(paths)), np.arange(platoons), np.arange(cars), indexing="ij"
     )
-    found = pd.DataFrame(
+    result = pd.DataFrame(
         {
             "sequence": platoon.ravel(),
             "time": (DT * samples).ravel().round(6),
@@ -78,4 +78,4 @@ def table(
             "length": LONG,
         }
     )
-    return found, own
+    return result, own

@@ -56,8 +56,8 @@ FORMS: dict[str, tuple[Form, dict[str, Any]]] = {
 
 
 def fitted(given: nnode.Sequences) -> pd.DataFrame:
-    found: pd.DataFrame = nnode.Calibrator("idm", epochs=6, drivers="none").fit(given).parameters_
-    return found
+    result: pd.DataFrame = nnode.Calibrator("idm", epochs=6, drivers="none").fit(given).parameters_
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -66,30 +66,30 @@ def platoons() -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def known(platoons: pd.DataFrame) -> pd.DataFrame:
+def expected(platoons: pd.DataFrame) -> pd.DataFrame:
     return fitted(nnode.sequences(platoons))
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("form", FORMS)
 def test_a_fit_does_not_depend_on_how_the_table_is_written(
-    platoons: pd.DataFrame, known: pd.DataFrame, form: str
+    platoons: pd.DataFrame, expected: pd.DataFrame, form: str
 ) -> None:
     change, options = FORMS[form]
-    found = fitted(nnode.sequences(change(platoons), **options))
+    result = fitted(nnode.sequences(change(platoons), **options))
     # at a map's coordinates positions have lost the digits below 1e-9 m
-    np.testing.assert_allclose(found.estimate, known.estimate, rtol=1e-5)
+    np.testing.assert_allclose(result.estimate, expected.estimate, rtol=1e-5)
 
 
 def test_samples_that_are_missing_or_late_hardly_change_a_fit(
-    platoons: pd.DataFrame, known: pd.DataFrame
+    platoons: pd.DataFrame, expected: pd.DataFrame
 ) -> None:
     """2 % of the rows are missing; times jitter by up to 0.01 s, and positions with them."""
     rng = np.random.default_rng(8)
     lacking = platoons[rng.random(len(platoons)) > 0.02]
     given = nnode.sequences(lacking)
     assert sum(s.filled for s in given) > 0
-    found = fitted(given)
+    result = fitted(given)
     parts = []
     for _, own in platoons.groupby(["sequence", "agent"]):
         late = np.where(own.time.between(0.2, 5.8), rng.uniform(-0.01, 0.01, len(own)), 0.0)
@@ -98,9 +98,9 @@ def test_samples_that_are_missing_or_late_hardly_change_a_fit(
     jitter = pd.concat(parts)
     given = nnode.sequences(jitter)
     assert "times are uneven" in given.manifest["notes"][0]
-    for one in (found, fitted(given)):
+    for one in (result, fitted(given)):
         for name in ("idm.T", "idm.s0"):
-            assert one.estimate[name] == pytest.approx(known.estimate[name], rel=0.1)
+            assert one.estimate[name] == pytest.approx(expected.estimate[name], rel=0.1)
 
 
 def moved_people(s: Sequence, by: Callable[[np.ndarray], np.ndarray]) -> Sequence:

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 
 import nnode
-from nnode.app.check import sentence, summary
-from nnode.data.check.examine import examine
 from nnode.data.store import Store
 from nnode.errors import ConfigError
 from tests.app.conftest import Script
@@ -43,26 +41,21 @@ def pedpy(tmp_path: Path) -> Path:
     return text(people(), tmp_path, "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n", 100.0)
 
 
-def test_the_text_says_all(pedpy: Path) -> None:
-    found = examine(pedpy)
-    assert sentence(found).startswith("40 people, ")
-    told = summary(found, ["data=pedpy", "data.path=X"])
-    assert "columns: agent = column 1, frame = column 2, x = column 3, y = column 4" in told
-    assert "units: crowd, positions in cm, times in frames of 1/16 s (sure)" in told
-    assert "\n  nnode prepare_data data=pedpy data.path=X\n" in told
-    for one in found.findings:
-        assert one.text in told
-
-
 def test_in_python_it_is_an_object(pedpy: Path, tmp_path: Path) -> None:
-    found = nnode.check(pedpy)
-    assert isinstance(found, nnode.Check)
-    assert repr(found).splitlines()[0] == f"{pedpy}: {sentence(found.examination)}"
-    assert found.options[0] == "data=pedpy"
-    assert found.probability > 0.99
-    assert "<p>40 people, " in found._repr_html_()
-    for one in found.findings:
-        assert one.kind in found._repr_html_()
-    assert found.write(tmp_path / "page").name == "check.html"
+    result = nnode.check(pedpy)
+    assert isinstance(result, nnode.Check)
+    assert result.sentence.startswith("40 people, ")
+    assert result.options == ["data=pedpy", f"data.path={pedpy}"]
+    assert result.probability > 0.99
+    assert result.write(tmp_path / "page").name == "check.html"
+    text, html = repr(result), result._repr_html_()
+    assert text.splitlines()[0] == f"{pedpy}: {result.sentence}"
+    assert "columns: agent = column 1, frame = column 2, x = column 3, y = column 4" in text
+    assert "units: crowd, positions in cm, times in frames of 1/16 s (sure)" in text
+    assert f"\n  nnode prepare_data data=pedpy data.path={pedpy}\n" in text
+    assert f"<p>{result.sentence}</p>" in html
+    for finding in result.findings:
+        assert finding.text in text
+        assert finding.kind in html
     with pytest.raises(ConfigError, match="domain=sea: expected traffic, crowd, or null"):
         nnode.check(pedpy, "sea")  # type: ignore[arg-type]

@@ -55,8 +55,8 @@ def test_parts(
     expected: tuple[str, list[str], int],
 ) -> None:
     now = store(tmp_path / "now", recordings, t_seq=1.0, faults="keep", recording=recordings)
-    found, indices, trained = choose(now, checkpoint, part)
-    assert (found, [now.index[i]["name"] for i in indices], trained) == expected
+    result, indices, trained = choose(now, checkpoint, part)
+    assert (result, [now.index[i]["name"] for i in indices], trained) == expected
 
 
 def test_another_cutting_cannot_be_told_apart(tmp_path: Path, checkpoint: Checkpoint) -> None:

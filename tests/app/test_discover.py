@@ -321,12 +321,12 @@ def test_laws_are_compared_again_with_the_missing_effect(
     monkeypatch.setattr(thresholds, "LEVEL", 0.5)
     report = lin_diagnosed(tmp_path)
     assert report.nearest is None
-    first, again = report.diagnosis.laws, report.diagnosis.laws_again
+    first, repeated = report.diagnosis.laws, report.diagnosis.laws_again
     assert first is not None
-    assert again is not None
+    assert repeated is not None
     assert (first.best, first.effects) == ("idm", [])
-    assert (again.best, again.effects) == ("lin", ["speed_zone"])
-    assert again.ranking[1].behind > 0
+    assert (repeated.best, repeated.effects) == ("lin", ["speed_zone"])
+    assert repeated.ranking[1].behind > 0
 
 
 @pytest.mark.usefixtures("by_hand")

@@ -21,6 +21,7 @@ from nnode.exchange.running_sumo import Steps
 from nnode.model import build_model
 from tests.app.conftest import Script
 from tests.data.tables import saved, tidy
+from tests.exchange.by_sumo import configured
 
 
 @pytest.fixture(scope="module")
@@ -54,13 +55,7 @@ def run_of(folder: Path, name: str, *effects: dict[str, Any], **solver: Any) -> 
 def scene(sumo: Path, tmp_path: Path) -> Path:
     """Seven vehicles of type ``own`` behind one of type ``lead``, ballistic steps of 0.1 s."""
     by_sumo.write_scene(sumo, tmp_path, "Krauss", {"decel": 4.5})
-    path = tmp_path / "a.sumocfg"
-    path.write_text(
-        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
-        '</input><time><step-length value="0.1"/><end value="20"/></time>'
-        '<processing><step-method.ballistic value="true"/></processing></configuration>'
-    )
-    return path
+    return configured(tmp_path, end=20.0, ballistic=True)
 
 
 @pytest.mark.thorough
@@ -72,9 +67,9 @@ def test_the_script(script: Script, scene: Path, tmp_path: Path) -> None:
     assert (account["driven"], account["steps"], account["collisions"]) == (7, 200, 0)
     assert "driven: 7 vehicles, mean " in done.stdout
     assert "200 ballistic steps of 0.1 s" in done.stdout
-    (seen,) = read_sumo(out / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
-    assert (seen.n_agents, seen.n_samples) == (8, 200)
-    assert seen.kind == ("own",) * 7 + ("lead",)
+    (observed,) = read_sumo(out / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
+    assert (observed.n_agents, observed.n_samples) == (8, 200)
+    assert observed.kind == ("own",) * 7 + ("lead",)
     store = prepare(SumoOptions(path=str(out / "fcd.xml.gz")), tmp_path / "store")
     assert len(store) == 1
 
@@ -84,11 +79,11 @@ def test_the_script(script: Script, scene: Path, tmp_path: Path) -> None:
 
 def test_from_python(scene: Path, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", "idm")
-    found = nnode.drive(run, sumo=scene, vehicles=["own", "lead"], program="traci", lengths=True)
-    assert found.driven == 8
-    assert found.trajectories.is_file()
-    assert (found.step, found.method, found.seconds) == (0.1, "ballistic", pytest.approx(20.0))
-    assert 0 < found.in_sumo < found.wall
+    result = nnode.drive(run, sumo=scene, vehicles=["own", "lead"], program="traci", lengths=True)
+    assert result.driven == 8
+    assert result.trajectories.is_file()
+    assert (result.step, result.method, result.seconds) == (0.1, "ballistic", pytest.approx(20.0))
+    assert 0 < result.in_sumo < result.wall
 
 
 @pytest.mark.thorough
@@ -103,10 +98,10 @@ def test_steps_are_those_of_the_run(scene: Path, tmp_path: Path) -> None:
     words = r"ballistic steps of 0\.1 s.*semi_implicit steps of 0\.05 s.*solver\.dt=0\.1"
     with pytest.raises(ConfigError, match=words):
         nnode.drive(run, folder=tmp_path, **options)
-    found = nnode.drive(run, folder=tmp_path, steps="run", **options)
-    assert (found.step, found.method, found.steps) == (0.05, "semi_implicit", 400)
-    found = nnode.drive(run, folder=tmp_path, steps="scenario", **options)
-    assert (found.step, found.method, found.steps) == (0.1, "ballistic", 200)
+    result = nnode.drive(run, folder=tmp_path, steps="run", **options)
+    assert (result.step, result.method, result.steps) == (0.05, "semi_implicit", 400)
+    result = nnode.drive(run, folder=tmp_path, steps="scenario", **options)
+    assert (result.step, result.method, result.steps) == (0.1, "ballistic", 200)
     with pytest.raises(ConfigError, match="steps=any is unknown, expected one of match"):
         nnode.drive(run, folder=tmp_path, steps="any", **options)
 
@@ -125,8 +120,8 @@ def test_which_steps_a_run_made(
     name: str, given: dict[str, Any], expected: Steps, tmp_path: Path
 ) -> None:
     checkpoint = load_checkpoint(run_of(tmp_path, name, **given) / "checkpoints" / "best.pt")
-    found = steps_of(checkpoint, checkpoint.build())
-    assert (found.seconds, found.method) == (pytest.approx(expected.seconds), expected.method)
+    result = steps_of(checkpoint, checkpoint.build())
+    assert (result.seconds, result.method) == (pytest.approx(expected.seconds), expected.method)
 
 
 def test_what_is_refused_before_sumo_runs(tmp_path: Path) -> None:

@@ -49,32 +49,32 @@ def fitted(small: pd.DataFrame) -> nnode.Calibrator:
 def test_the_typical_driver_and_every_driver_are_found(
     drawn: tuple[pd.DataFrame, Own], fitted: nnode.Calibrator
 ) -> None:
-    found = fitted.result_
-    assert found.drivers is not None
+    result = fitted.result_
+    assert result.drivers is not None
     for name in ("T", "s0"):
-        row = found.parameters.loc[f"idm.{name}"]
+        row = result.parameters.loc[f"idm.{name}"]
         assert row["lower"] < TRUE[name] < row["upper"] < 2 * row["lower"]
-    rows = found.drivers.variability
+    rows = result.drivers.variability
     for name, true in {"T": 15.0, "push": PUSH, "push_time": LASTING}.items():
         assert rows.lower[name] < true < rows.upper[name]
     assert list(rows.unit) == ["m/s²", "s", "m", "%"]
     assert rows.estimate["measurement"] == pytest.approx(0.05, rel=0.1)
     own = drawn[1]["T"]
-    drivers = found.drivers.table.set_index("driver")
+    drivers = result.drivers.table.set_index("driver")
     true = {str(10 * b + i + 1): own[b, i] for b in range(6) for i in range(3)}
     away = (drivers["T"] - pd.Series(true)) / drivers["T_error"]
     assert len(drivers) == 18
     assert away.abs().max() < 5
     assert (away.abs() < 2).mean() > 0.8
     assert (drivers["T_shrinkage"] < 0.2).all()
-    assert "18 drivers; parameters that differ" in found.summary()
-    usual = found.conf_int()
+    assert "18 drivers; parameters that differ" in result.summary()
+    usual = result.conf_int()
     for end in ("lower", "upper"):
-        own = found.parameters[end].to_numpy(dtype=float)
+        own = result.parameters[end].to_numpy(dtype=float)
         assert usual[end].to_numpy() == pytest.approx(own, rel=1e-6, nan_ok=True)
-    assert found.fit.likelihood == "mixed-effects model"
-    assert np.isfinite(found.fit.bic)
-    assert found.drivers.plot().axes[0].get_xlabel() == "T (s)"
+    assert result.fit.likelihood == "mixed-effects model"
+    assert np.isfinite(result.fit.bic)
+    assert result.drivers.plot().axes[0].get_xlabel() == "T (s)"
 
 
 def options(table: pd.DataFrame, folder: Path) -> list[str]:
@@ -99,13 +99,13 @@ def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
     script("train", *options(small, tmp_path))
     run = tmp_path / "run"
     written = json.loads((run / "result.json").read_text())
-    found = fitted.result_
-    assert found.drivers is not None
-    ours = found.plain(written["paths"])
+    result = fitted.result_
+    assert result.drivers is not None
+    ours = result.plain(written["paths"])
     for key in ("parameters", "drivers"):
         assert json.dumps(ours[key], sort_keys=True) == json.dumps(written[key], sort_keys=True)
     own = pd.read_csv(run / "drivers.csv", dtype={"driver": str})
-    pd.testing.assert_frame_equal(own, found.drivers.table)
+    pd.testing.assert_frame_equal(own, result.drivers.table)
     model = nnode.load(run / "checkpoints" / "best.pt")
     values = {name: float(value) for name, (value, _) in model.physical().items()}
     assert values == {name: row["value"] for name, row in written["parameters"].items()}
@@ -117,12 +117,12 @@ def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
 @pytest.mark.parametrize("model", ["idm", "fvdm"])
 def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model: str) -> None:
     given = pairs(number=6, seconds=20.0)
-    found = nnode.Calibrator(model, drivers="auto", method="ballistic").fit(given)
+    calibrator = nnode.Calibrator(model, drivers="auto", method="ballistic").fit(given)
     if model == "idm":
-        assert found.result_.drivers is None
-        assert found.parameters_.estimate["idm.T"] == pytest.approx(EXACT["T"], rel=1e-4)
+        assert calibrator.result_.drivers is None
+        assert calibrator.parameters_.estimate["idm.T"] == pytest.approx(EXACT["T"], rel=1e-4)
     else:  # another law leaves more than that
-        assert found.result_.drivers is not None
+        assert calibrator.result_.drivers is not None
 
 
 @pytest.mark.parametrize(
@@ -144,26 +144,27 @@ def test_drivers_differ_by_default_in_laws_of_second_order(
     given = list(nnode.sequences(small if noise else pairs(number=6, seconds=20.0)))
     system = build_model(model_options(model, "measured"), 0)
     for exact in (True, False):
-        found = planned(TrainerOptions(**options), system, lambda: given, exact)
-        assert found == (plan if exact or options.get("drivers") else "none")
+        result = planned(TrainerOptions(**options), system, lambda: given, exact)
+        assert result == (plan if exact or options.get("drivers") else "none")
 
 
 def test_simulations_that_blow_up_are_refused_but_by_default_all_share_their_parameters(
     small: pd.DataFrame, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(population, "_simulated_finitely", lambda model: False)
-    found = nnode.Calibrator("idm", epochs=3).fit(small).result_
-    assert found.drivers is None
+    result = nnode.Calibrator("idm", epochs=3).fit(small).result_
+    assert result.drivers is None
     assert "how drivers differ could not be estimated" in caplog.text
     with pytest.raises(ConfigError, match=r"not simulated to finite .* drivers=none"):
         nnode.Calibrator("idm", drivers="auto", epochs=3).fit(small)
 
 
+@pytest.mark.thorough
 def test_a_short_delay_is_simulated_in_short_steps(small: pd.DataFrame) -> None:
     delay = {"name": "reaction_delay", "T": 0.3}
-    found = nnode.Calibrator("idm", effects=[delay], drivers=["T"], epochs=3).fit(small).result_
-    assert found.drivers is not None
-    assert found.drivers.differ == ["idm.T"]
+    result = nnode.Calibrator("idm", effects=[delay], drivers=["T"], epochs=3).fit(small).result_
+    assert result.drivers is not None
+    assert result.drivers.differ == ["idm.T"]
 
 
 @pytest.mark.thorough
@@ -219,16 +220,17 @@ def test_drivers_of_noisy_positions_are_told_apart() -> None:
     """Twenty platoons of five cars, whose positions a satellite's receiver measures."""
     differ = {"T": 0.15, "v0": 0.15}
     measured, _ = table(201, platoons=20, cars=5, seconds=60.0, noise=0.3, differ=differ)
-    found = nnode.fit(measured, model="idm", heldout=0.0)
-    assert found.drivers is not None
-    assert sorted(found.drivers.differ) == ["T", "v0"]
-    values = found.parameters.estimate
+    result = nnode.fit(measured, model="idm", heldout=0.0)
+    assert result.drivers is not None
+    assert sorted(result.drivers.differ) == ["T", "v0"]
+    values = result.parameters.estimate
     for name in ("T", "v0"):
         assert values[f"idm.{name}"] == pytest.approx(TRUE[name], rel=0.05)
-        assert 12 < found.drivers.variability.estimate[name] < 18
+        assert 12 < result.drivers.variability.estimate[name] < 18
     assert values["idm.s0"] == pytest.approx(TRUE["s0"], abs=0.5)
 
 
+@pytest.mark.thorough
 def test_the_summary_says_what_is_at_a_bound(fitted: nnode.Calibrator) -> None:
     drivers = fitted.result_.drivers
     assert drivers is not None

@@ -41,13 +41,9 @@ def trained(script: Script, raw: Path, domain: str, model: str) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def traffic(script: Script, raw: Path) -> Path:
-    return trained(script, raw, "traffic", "lin")
-
-
 @pytest.mark.thorough
-def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Path) -> None:
+def test_traffic_with_all_that_fits(script: Script, raw: Path, tmp_path: Path) -> None:
+    traffic = trained(script, raw, "traffic", "lin")
     done = script("export", f"run={traffic}", f"hydra.run.dir={tmp_path}")
     account = json.loads((tmp_path / "export.json").read_text())
     assert list(account["written"]) == ["sumo", "fcd", "parquet", "csv"]
@@ -77,10 +73,10 @@ def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Pat
         for k in range(1, a.n_samples):
             errors.setdefault(k, []).extend(((a.x[k] - b.x[k]) ** 2).ravel())
     lane = SumoOptions(path="", dt=measured[0].dt, min_vehicles=1, min_samples=2, window=None)
-    again = {s.recording: s.x for s in read_sumo(tmp_path / "simulated.xml.gz", lane)}
+    repeated = {s.recording: s.x for s in read_sumo(tmp_path / "simulated.xml.gz", lane)}
     for s in simulated:
         name = s.name.replace("/", "_")
-        np.testing.assert_allclose(again[f"simulated_{name}"], s.x, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(repeated[f"simulated_{name}"], s.x, rtol=0, atol=1e-9)
     horizons = pd.read_csv(tmp_path / "csv" / "horizons.csv")
     expected = [np.sqrt(np.mean(errors[k])) for k in sorted(errors)]
     np.testing.assert_allclose(horizons["rmse_m"], expected, rtol=1e-9)
@@ -92,17 +88,17 @@ def test_traffic_with_all_that_fits(script: Script, traffic: Path, tmp_path: Pat
 def test_idm_s_vehicle_type_has_the_run_s_intervals(
     script: Script, idm_run: Path, tmp_path: Path
 ) -> None:
-    found = json.loads((idm_run / "result.json").read_text())["parameters"]
+    result = json.loads((idm_run / "result.json").read_text())["parameters"]
     script("export", f"run={idm_run}", "to=sumo", f"hydra.run.dir={tmp_path}")
     text = (tmp_path / "vtype.add.xml").read_text()
-    known = [name for name, own in found.items() if own["low"] is not None]
+    known = [name for name, own in result.items() if own["low"] is not None]
     assert known
     for name in known:
-        own = found[name]
+        own = result[name]
         short = name.rpartition(".")[2]
         interval = f"95 % [{own['low']:.6g}, {own['high']:.6g}]"
         assert f"<!-- {short} = {own['value']:.6g} {own['unit']}, {interval} -->" in text
-    assert intervals_of(str(idm_run)) == found
+    assert intervals_of(str(idm_run)) == result
     assert intervals_of(str(tmp_path)) == {}
 
 
@@ -136,8 +132,8 @@ def test_crowd_held_out_and_simulated(script: Script, raw: Path, tmp_path: Path)
     assert content["agent"]["obstacle_scale"] > 0
 
 
-def test_one_clear_error(script: Script, traffic: Path, tmp_path: Path) -> None:
-    options = (f"run={traffic}", "to=[csv,jupedsim]", f"hydra.run.dir={tmp_path}")
+def test_one_clear_error(script: Script, idm_run: Path, tmp_path: Path) -> None:
+    options = (f"run={idm_run}", "to=[csv,jupedsim]", f"hydra.run.dir={tmp_path}")
     done = script("export", *options, status=2)
     assert "Traceback" not in done.stderr
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
@@ -173,7 +169,7 @@ def test_a_run_is_named_by_folder_or_checkpoint(tmp_path: Path) -> None:
     assert saved_groups(["to=csv"], "run") == []
 
 
-def test_the_run_s_own_data_and_solver_are_chosen(traffic: Path) -> None:
-    run, groups = f"run={traffic}", ("data", "solver")
-    assert saved_groups([run], "run", groups) == ["data=demo_traffic", "solver=torchdiffeq"]
-    assert saved_groups([run, "solver=fused"], "run", groups) == ["data=demo_traffic"]
+def test_the_run_s_own_data_and_solver_are_chosen(idm_run: Path) -> None:
+    run, groups = f"run={idm_run}", ("data", "solver")
+    assert saved_groups([run], "run", groups) == ["data=table", "solver=fused"]
+    assert saved_groups([run, "solver=torchdiffeq"], "run", groups) == ["data=table"]

@@ -24,6 +24,7 @@ from tests.app.forked import Forks
 from tests.builders import as_table
 from tests.discover import walkers
 from tests.discover.platoons import platoons
+from tests.exchange.by_sumo import configured
 
 #: Of vehicles and of people, of both orders.
 LAWS = {
@@ -267,20 +268,17 @@ def test_it_drives_in_sumo(copy: Script, trained: Path, tmp_path: Path) -> None:
     by_sumo.write_scene(
         Path(pytest.importorskip("sumo").SUMO_HOME), tmp_path, "Krauss", {"decel": 4.5}
     )
-    (tmp_path / "a.sumocfg").write_text(
-        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
-        '</input><time><step-length value="0.1"/><end value="20"/></time></configuration>'
-    )
+    path = configured(tmp_path, end=20.0)
     copy(
         "drive",
         f"run={trained}",
-        f"sumo={tmp_path / 'a.sumocfg'}",
+        f"sumo={path}",
         "vehicles=own",
         "steps=scenario",
         f"hydra.run.dir={tmp_path / 'out'}",
     )
-    (seen,) = read_sumo(tmp_path / "out" / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
+    (observed,) = read_sumo(tmp_path / "out" / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
     v0, reach, w = estimates(trained).values()
-    x = seen.x[..., 0]
+    x = observed.x[..., 0]
     wanted = v0 * (1 - np.exp(-np.diff(x) / reach)) + w * np.sin(x[:, :-1] / 60)
     np.testing.assert_allclose(np.diff(x[1:, :-1], axis=0) / 0.1, wanted[1:-1], atol=1e-6)

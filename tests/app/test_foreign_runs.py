@@ -221,9 +221,9 @@ def test_a_model_s_name_is_no_path(script: Script, made: Made, tmp_path: Path) -
     content["config"]["data"]["recording"] = "/../../../recorded"
     torch.save(content, both)
     script("plot_forces", f"checkpoint=[{path},{both}]", f"hydra.run.dir={out}")
-    found = [p for p in tmp_path.rglob("*") if "escaped" in p.name or "recorded" in p.name]
-    assert len(found) == 8
-    assert {p.parent for p in found} == {out}
+    result = [p for p in tmp_path.rglob("*") if "escaped" in p.name or "recorded" in p.name]
+    assert len(result) == 8
+    assert {p.parent for p in result} == {out}
 
 
 def test_the_traps_work(tmp_path: Path) -> None:

@@ -36,8 +36,8 @@ def test_new_drivers_are_predicted_better_than_the_typical_one(run: Path) -> Non
     rows = predictions.table
     assert len(rows.groupby(["sequence", "agent"])) == 6 * 3
     assert rows.loc[rows["given"], "time"].max() == pytest.approx(10.0)
-    known = rows[rows["given"]]
-    assert ((known["predicted"] - known["measured"]).abs() < 0.3).all()
+    expected = rows[rows["given"]]
+    assert ((expected["predicted"] - expected["measured"]).abs() < 0.3).all()
     assert "18 followers predicted from their first 10 s" in repr(predictions)
 
 

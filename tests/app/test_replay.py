@@ -49,8 +49,8 @@ def test_a_simulation_with_steps_of_its_own_is_shown_at_the_measured_times(tmp_p
         domain="traffic",
         zones=[Zone("zone", x=(10.0, 20.0))],
     )
-    found = held(path)
-    (scene,) = found["scenes"]
+    result = held(path)
+    (scene,) = result["scenes"]
     real = tracks(scene["measured"])
     np.testing.assert_allclose(real[1], 50 + 12 * 0.2 * np.arange(21), atol=0.0051)
     mine, short = (one["x"] for one in scene["simulated"])
@@ -58,7 +58,7 @@ def test_a_simulation_with_steps_of_its_own_is_shown_at_the_measured_times(tmp_p
     assert [row[16:] for row in mine] == [[None] * 5] * 2  # after 3 s nothing was simulated
     np.testing.assert_allclose(tracks([r[:16] for r in mine]), real[:, :16] - 2, atol=0.0101)
     assert short[1] == [None] * 21
-    assert found["zones"] == [{"label": "zone", "x": [10.0, 20.0]}]
+    assert result["zones"] == [{"label": "zone", "x": [10.0, 20.0]}]
 
 
 def test_files_of_people_and_walls(tmp_path: Path) -> None:

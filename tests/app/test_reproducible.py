@@ -44,8 +44,10 @@ def test_workers_change_no_bit_and_threads_only_the_rounding(
     assert len(set(first.values())) > 10
     for workers in (0, 1, 2):
         place = tmp_path / f"workers{workers}"
-        again = trained(script, raw, place, "trainer.threads=1", f"data.loader.workers={workers}")
-        assert again == first
+        repeated = trained(
+            script, raw, place, "trainer.threads=1", f"data.loader.workers={workers}"
+        )
+        assert repeated == first
     threads = trained(script, raw, tmp_path / "threads", "trainer.threads=2")
     assert threads == pytest.approx(first, rel=ROUNDING, abs=1e-12)
     other = trained(script, raw, tmp_path / "seed", "trainer.threads=1", "seed=7")

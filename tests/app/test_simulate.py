@@ -33,11 +33,11 @@ def test_a_run_is_sampled_and_scored(
     script: Script, idm_run: Path, simulated: nnode.Simulated, tmp_path: Path
 ) -> None:
     script("simulate", f"run={idm_run}", f"samples={SAMPLES}", f"hydra.run.dir={tmp_path}")
-    found = json.loads((tmp_path / "scores.json").read_text())
-    assert found["sequences"] == 2
-    assert set(found["scores"]) == {"idm", "idm, no noise", "constant_speed"}
-    assert found["scores"]["idm, no noise"]["coverage_position_95"]["mean"] < 0.5
-    near, far = (found["scores"][k]["crps_position_m"]["mean"] for k in ("idm", "constant_speed"))
+    result = json.loads((tmp_path / "scores.json").read_text())
+    assert result["sequences"] == 2
+    assert set(result["scores"]) == {"idm", "idm, no noise", "constant_speed"}
+    assert result["scores"]["idm, no noise"]["coverage_position_95"]["mean"] < 0.5
+    near, far = (result["scores"][k]["crps_position_m"]["mean"] for k in ("idm", "constant_speed"))
     assert near < 0.5 * far
     assert (tmp_path / "bands.png").stat().st_size > 10_000
     store = prepare(
@@ -47,7 +47,7 @@ def test_a_run_is_sampled_and_scored(
     assert store[0].n_agents == 3
     assert store[0].name.endswith("~1")
     # in Python it is the same work
-    assert json.loads(json.dumps(simulated.plain())) == found
+    assert json.loads(json.dumps(simulated.plain())) == result
     assert [s.name.rpartition("/")[2] for s in simulated.trajectories] == [
         s.name.rpartition("/")[2] for s in store
     ]
@@ -75,31 +75,31 @@ def test_in_python_it_is_an_object(simulated: nnode.Simulated, tmp_path: Path) -
     run = nnode.fit(drives, "traffic", model="idm", epochs=2, drivers="none")
     with pytest.raises(ConfigError, match="a table in memory; give it again, as data=TABLE"):
         nnode.simulate(run)
-    found = nnode.simulate(run, drives, samples=SAMPLES, seed=3)
-    assert isinstance(found, nnode.Simulated)
-    assert (found.model, found.part, found.run, found.trained_on) == ("idm", "heldout", "", 0)
-    assert found.crps == found.means["idm"]["crps_position_m"]
-    assert found.scores.loc[("idm", "crps_position_m"), "mean"] == found.crps.mean
-    assert found.crps.mean < found.means["constant_speed"]["crps_position_m"].mean
-    assert found.coverage[0.5].mean <= found.coverage[0.95].mean
-    samples = found.to_dataframe()
+    result = nnode.simulate(run, drives, samples=SAMPLES, seed=3)
+    assert isinstance(result, nnode.Simulated)
+    assert (result.model, result.part, result.run, result.trained_on) == ("idm", "heldout", "", 0)
+    assert result.crps == result.means["idm"]["crps_position_m"]
+    assert result.scores.loc[("idm", "crps_position_m"), "mean"] == result.crps.mean
+    assert result.crps.mean < result.means["constant_speed"]["crps_position_m"].mean
+    assert result.coverage[0.5].mean <= result.coverage[0.95].mean
+    samples = result.to_dataframe()
     assert set(samples) >= {"sequence", "time", "agent", "x", "length"}
-    assert samples["sequence"].nunique() == SAMPLES * len(found.sampling.indices)
+    assert samples["sequence"].nunique() == SAMPLES * len(result.sampling.indices)
     # who leads is where he was measured
-    first = found.trajectories[0]
+    first = result.trajectories[0]
     own = drives[drives["sequence"] == int(first.name.rpartition("/")[2].partition("~")[0])]
     lead = own.loc[own["agent"] == int(first.agents[-1]), "x"]
     np.testing.assert_allclose(first.x[:, -1, 0], lead, atol=1e-9)
-    assert "noise of idm: " in repr(found)
-    assert "<table" in found._repr_html_()
-    paths = found.write(tmp_path / "out", format=None)
+    assert "noise of idm: " in repr(result)
+    assert "<table" in result._repr_html_()
+    paths = result.write(tmp_path / "out", format=None)
     assert [path.name for path in paths] == ["scores.json", "bands.png"]
-    *_, path = found.write(tmp_path / "out", format="fcd")
+    *_, path = result.write(tmp_path / "out", format="fcd")
     assert path.name == "samples.xml.gz"
     options = SumoOptions(path=str(path), dt=first.dt, min_vehicles=2, window=None)
     again = {s.recording: s.x for s in read_sumo(path, options)}
-    assert len(again) == len(found.trajectories)
-    for s in found.trajectories:
+    assert len(again) == len(result.trajectories)
+    for s in result.trajectories:
         lane = s.name.replace("/", "_")
         np.testing.assert_allclose(again[f"samples_{lane}"], s.x, rtol=0, atol=1e-9)
     # the same calibration by the command, sampled with another seed
@@ -168,17 +168,17 @@ def test_people_are_sampled(tmp_path: Path) -> None:
         table, "crowd", model=model, walls=tmp_path / "walls.csv", epochs=2, heldout=0.4
     )
     data = nnode.sequences(table, data="table", domain="crowd", walls=str(tmp_path / "walls.csv"))
-    found = nnode.simulate(run, data, samples=SAMPLES)
-    name = found.model
-    score = {key: own["crps_position_m"].mean for key, own in found.means.items()}
-    assert found.crps.mean == score[name] < score[f"{name}, no noise"]
+    result = nnode.simulate(run, data, samples=SAMPLES)
+    name = result.model
+    score = {key: own["crps_position_m"].mean for key, own in result.means.items()}
+    assert result.crps.mean == score[name] < score[f"{name}, no noise"]
     assert score[name] < score["constant_speed"]
-    assert "crps_nearest_m" in found.means[name]
+    assert "crps_nearest_m" in result.means[name]
     # of 4 sequences with 4 people: far from none and from the band of 50 %
-    assert found.coverage[0.95].mean > 0.75
-    assert {"x", "y", "vx", "vy"} <= set(found.to_dataframe())
-    assert "m/s²" in repr(found)
-    names = {path.name for path in found.write(tmp_path / "out")}
+    assert result.coverage[0.95].mean > 0.75
+    assert {"x", "y", "vx", "vy"} <= set(result.to_dataframe())
+    assert "m/s²" in repr(result)
+    names = {path.name for path in result.write(tmp_path / "out")}
     assert names == {"scores.json", "bands.png", "samples.parquet", "walls.csv"}
     again = TableOptions(
         domain="crowd",
@@ -186,15 +186,15 @@ def test_people_are_sampled(tmp_path: Path) -> None:
         walls=str(tmp_path / "out" / "walls.csv"),
     )
     store = prepare(again, tmp_path / "again")
-    assert len(store) == SAMPLES * len(found.sampling.indices)
-    np.testing.assert_array_equal(store[5].x, found.trajectories[5].x)
+    assert len(store) == SAMPLES * len(result.sampling.indices)
+    np.testing.assert_array_equal(store[5].x, result.trajectories[5].x)
     assert store[5].walls is not None
-    one = found.trajectories[5]
+    one = result.trajectories[5]
     folder = tmp_path / "text"
-    assert len(found.write(folder, format="pedpy")) == 2 + len(store)
+    assert len(result.write(folder, format="pedpy")) == 2 + len(store)
     path = folder / "pedpy" / "samples" / f"{one.name.replace('/', '_')}.txt"
     seconds = float(one.time[-1] - one.time[0])
     (back,) = read_walkway(path, WalkwayOptions(path=str(path), t_seq=seconds))
     np.testing.assert_allclose(back.x, one.x, rtol=0, atol=5.1e-7)  # six digits are written
     with pytest.raises(ConfigError, match="format=fcd is not for crowd"):
-        found.write(folder, format="fcd")
+        result.write(folder, format="fcd")

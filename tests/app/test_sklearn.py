@@ -15,7 +15,7 @@ from tests.app.following import table
 pytest.importorskip("sklearn")
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError as TheirNotFittedError
-from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score, cross_validate
+from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
 from sklearn.utils import InputTags, Tags, TargetTags
 from sklearn.utils.estimator_checks import check_estimator
 from sklearn.utils.validation import check_is_fitted
@@ -74,10 +74,10 @@ class _OfMatrices(nnode.Calibrator):
 
 @pytest.mark.filterwarnings("ignore")
 def test_scikit_learn_s_checks_pass_where_they_apply() -> None:
-    found = check_estimator(_OfMatrices(), on_fail=None, on_skip=None)
-    failed = {row["check_name"] for row in found if row["status"] == "failed"}
-    passed = {row["check_name"] for row in found if row["status"] == "passed"}
-    assert failed == set(NOT_APPLICABLE), [r["exception"] for r in found if r["exception"]]
+    result = check_estimator(_OfMatrices(), on_fail=None, on_skip=None)
+    failed = {row["check_name"] for row in result if row["status"] == "failed"}
+    passed = {row["check_name"] for row in result if row["status"] == "passed"}
+    assert failed == set(NOT_APPLICABLE), [r["exception"] for r in result if r["exception"]]
     assert {
         "check_estimator_cloneable",
         "check_get_params_invariance",
@@ -140,16 +140,3 @@ def test_a_search_over_models_finds_the_law_that_was_driven(sequences: nnode.Seq
     assert search.best_params_ == {"model": "idm"}
     assert search.best_estimator_.parameters_.index[0] == "idm.v0"
     assert search.score(sequences) == search.best_estimator_.score(sequences)
-
-
-def test_estimators_of_the_folds_are_told(sequences: nnode.Sequences) -> None:
-    found = cross_validate(
-        nnode.Calibrator("lin", leader="measured", epochs=3),
-        sequences,
-        cv=GroupKFold(2),
-        groups=sequences.groups,
-        return_estimator=True,
-        return_train_score=True,
-    )
-    assert [len(e.result_.checkpoint.split["train"]) for e in found["estimator"]] == [3, 3]
-    assert np.isfinite(found["train_score"]).all()

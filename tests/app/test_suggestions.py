@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 
 import nnode
-from nnode.app.check import python_lines
 from nnode.data.store import Store
 from tests.app.conftest import Script
 from tests.data.check.planted import cars, people, saved, text
@@ -178,9 +177,9 @@ def test_what_is_told_in_python_reads_what_is_recognised(tmp_path: Path) -> None
         assert len(frame) == len(file) > 0
         for a, b in zip(frame, file, strict=True):
             assert a.x == pytest.approx(b.x, abs=1e-9)
-        found = nnode.check(path, frame_rate=rate.get("frame_rate")).examination
+        result = nnode.check(path, frame_rate=rate.get("frame_rate"))
         told: dict[str, nnode.Sequences] = {}
-        exec(compile("\n".join(python_lines(found)[:2]), "told", "exec"), told)
+        exec(compile("\n".join(result.python[:2]), "told", "exec"), told)
         for a, b in zip(told["data"], file, strict=True):
             assert a.x == pytest.approx(b.x, abs=1e-9)
 

@@ -10,10 +10,8 @@ from typing import Any
 
 import pytest
 
-from nnode.app.check import blocks
-from nnode.data.check.examine import examine
+from nnode.app.check import check_file
 from nnode.discover.report.page import draw
-from nnode.pages.page import write_page
 from tests.browser.chromium import MISSING, Browser
 from tests.data.check.planted import cars, saved
 from tests.discover.conftest import Case, traffic  # noqa: F401  a fixture
@@ -39,8 +37,7 @@ def pages(traffic: Case, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     inputs, found = with_faults(traffic), deepcopy(traffic.found)
     found.diagnosis.data_faults = inputs.data_faults
     draw(inputs, found, traffic.options, CONFIG, ["nnode evaluate X"], folder)()
-    examined = examine(saved(cars(), folder))
-    write_page(blocks(examined, ["data=vehicles"]), folder, title="Check", stem="check")
+    check_file(saved(cars(), folder)).write(folder)
     studies = {name: STUDIES / name / "study.html" for name in ("traffic", "crowd")}
     own = {name: folder / f"{name}.html" for name in ("report", "check")}
     return {**own, **studies}

@@ -77,9 +77,9 @@ def measured(path: Path, error: float, seed: int = 0) -> Path:
 
 def _places(people: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Starts in the left part, at least 0.8 m apart."""
-    found: list[np.ndarray] = []
-    while len(found) < people:
+    result: list[np.ndarray] = []
+    while len(result) < people:
         place = np.array([rng.uniform(1, 6), rng.uniform(0.5, WIDE - 0.5)])
-        if all(np.linalg.norm(place - other) > 0.8 for other in found):
-            found.append(place)
-    return found
+        if all(np.linalg.norm(place - other) > 0.8 for other in result):
+            result.append(place)
+    return result

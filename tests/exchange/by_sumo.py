@@ -93,13 +93,28 @@ def platoons(
     return folder / "fcd.xml.gz"
 
 
+def configured(
+    folder: Path, *, step: float = 0.1, end: float | None = None, ballistic: bool = False
+) -> Path:
+    """SUMO's configuration of ``a.net.xml`` and ``a.rou.xml`` in a folder."""
+    limit = "" if end is None else f'<end value="{end}"/>'
+    path = folder / "a.sumocfg"
+    path.write_text(
+        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
+        f'</input><time><step-length value="{step}"/>{limit}</time>'
+        f'<processing><step-method.ballistic value="{str(ballistic).lower()}"/></processing>'
+        '<report><no-warnings value="true"/></report></configuration>'
+    )
+    return path
+
+
 def measured(path: Path, error: float, seed: int = 0) -> Path:
     """The same positions, each with a normal error of ``error`` m, as a camera would have them."""
     rng = np.random.default_rng(seed)
     with gzip.open(path, "rt") as file:
         text = file.read()
-    found = path.with_name("measured.xml.gz")
-    with gzip.open(found, "wt") as file:
+    result = path.with_name("measured.xml.gz")
+    with gzip.open(result, "wt") as file:
         file.write(
             re.sub(
                 r' pos="([^"]+)"',
@@ -107,7 +122,7 @@ def measured(path: Path, error: float, seed: int = 0) -> Path:
                 text,
             )
         )
-    return found
+    return result
 
 
 def _roads(home: Path, folder: Path, number: int) -> Path:

@@ -12,8 +12,8 @@ import pytest
 
 @pytest.fixture(scope="session")
 def jupedsim() -> ModuleType:
-    found: ModuleType = pytest.importorskip("jupedsim", minversion="1.4")
-    return found
+    result: ModuleType = pytest.importorskip("jupedsim", minversion="1.4")
+    return result
 
 
 @pytest.fixture(scope="session")

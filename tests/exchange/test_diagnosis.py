@@ -31,6 +31,8 @@ MEAN = (by_sumo.SLOW + by_sumo.FAST) / 2
 KAPPA = 1 - 1 / (MEAN / by_sumo.DECEL + by_sumo.TAU)
 #: Their gap at this speed, m, from front to front.
 GAP = by_sumo.LENGTH + by_sumo.MIN_GAP + by_sumo.TAU * MEAN
+#: Of a diagnosis of the linear law on whole platoons.
+PLATOONS = ("model=lin", "model.leader=measured", "data=sumo", "data.window=null")
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +55,9 @@ def diagnosed(script: Script, folder: Path, *overrides: str) -> dict[str, Any]: 
 
 
 def law(model: System) -> Law:
-    found = model.find_law("lin")
-    assert found is not None
-    return found
+    result = model.find_law("lin")
+    assert result is not None
+    return result
 
 
 def test_the_law_of_sumo_s_drivers_is_calibrated(
@@ -86,11 +88,8 @@ def test_sumo_s_drivers_mind_the_speed_ahead(
     report = diagnosed(
         script,
         tmp_path,
-        "model=lin",
-        "model.leader=measured",
-        "data=sumo",
+        *PLATOONS,
         f"data.path={drive}",
-        "data.window=null",
     )
     effect, *bounds = report["effects"]
     assert effect["name"] == "asymmetric_response"
@@ -120,11 +119,8 @@ def test_sumo_s_drivers_are_understood_without_any_noise(
     report = diagnosed(
         script,
         tmp_path / "run",
-        "model=lin",
-        "model.leader=measured",
-        "data=sumo",
+        *PLATOONS,
         f"data.path={path}",
-        "data.window=null",
     )
     # without noise every law that is not exactly right leaves structure: beside what drivers
     # mind first, the bounds on their accelerations may be seen, as a short inertia
@@ -134,8 +130,8 @@ def test_sumo_s_drivers_are_understood_without_any_noise(
     kin = {"asymmetric_response", "relative_speed"}
     assert effect["name"] in kin
     assert {other["name"] for other in effect["alternatives"]} <= kin
-    found = {name: c["value"] for name, c in effect["coefficients"].items()}
-    assert found.get("kappa_close", found.get("kappa")) == pytest.approx(KAPPA, abs=0.1)
+    result = {name: c["value"] for name, c in effect["coefficients"].items()}
+    assert result.get("kappa_close", result.get("kappa")) == pytest.approx(KAPPA, abs=0.1)
     # of followers behind measured leaders, each with his most likely start; the bounds on
     # accelerations remain
     assert (report["gap"]["closed"] > 0.7) == bool(report["effects"])
@@ -150,22 +146,19 @@ def test_the_stretch_of_longer_times_is_found(
     report = diagnosed(
         script,
         tmp_path / "run",
-        "model=lin",
-        "model.leader=measured",
+        *PLATOONS,
         f"model.effects=[{{name: asymmetric_response, kappa_open: {KAPPA}, kappa_close: {KAPPA}}}]",
-        "data=sumo",
         f"data.path={by_sumo.measured(path, ROAD_ERROR)}",
-        "data.window=null",
     )
     assert report["verdict"] == "named"
     effect, *others = report["effects"]
     assert effect["name"] == "speed_zone"
     # where the stretch begins and ends, SUMO bounds accelerations, which the model does not
     assert {other["name"] for other in others} <= {"inertia", "time_gap"}
-    found = {name: c["value"] for name, c in effect["coefficients"].items()}
-    assert found["alpha"] == pytest.approx(by_sumo.TAU / LONGER, abs=0.05)
-    assert found["a"] == pytest.approx(STRETCH[0], abs=10)
-    assert found["b"] == pytest.approx(STRETCH[1], abs=10)
+    result = {name: c["value"] for name, c in effect["coefficients"].items()}
+    assert result["alpha"] == pytest.approx(by_sumo.TAU / LONGER, abs=0.05)
+    assert result["a"] == pytest.approx(STRETCH[0], abs=10)
+    assert result["b"] == pytest.approx(STRETCH[1], abs=10)
     assert report["gap"]["closed"] > 0.9
 
 
@@ -188,8 +181,8 @@ def test_jupedsim_s_people_return_to_their_speed(
     assert report["verdict"] == "named"
     (effect,) = report["effects"]
     assert effect["name"] == "preferred_speed"
-    found = {name: c["value"] for name, c in effect["coefficients"].items()}
-    assert found["c"] == pytest.approx(1 / by_jupedsim.REACTION, rel=0.1)
-    assert found["v_pref"] == pytest.approx(by_jupedsim.SPEED, rel=0.02)
+    result = {name: c["value"] for name, c in effect["coefficients"].items()}
+    assert result["c"] == pytest.approx(1 / by_jupedsim.REACTION, rel=0.1)
+    assert result["v_pref"] == pytest.approx(by_jupedsim.SPEED, rel=0.02)
     assert report["gap"]["closed"] > 0.9
     assert report["gap"]["after"] < 0.3 * report["gap"]["before"]

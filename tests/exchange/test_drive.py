@@ -6,8 +6,9 @@ forgets keeps it so. What is more has its reason in the test that allows it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.programs import laws
 from benchmarks.programs import sumo as by_sumo
+from benchmarks.programs.laws import IDM
 from benchmarks.programs.sumo import SLOWLY
 from nnode.app.python.inputs import model_options
 from nnode.data.readers.sumo import SumoOptions, read_sumo
@@ -26,6 +27,7 @@ from nnode.exchange.drive import Drive, drive
 from nnode.exchange.running_sumo import RunningSumo, Steps
 from nnode.model import System, build_model
 from nnode.simulation import FusedSolver
+from tests.exchange.by_sumo import configured
 
 #: m: rounding of what SUMO writes, on both sides.
 ROUNDED = 1e-9
@@ -37,20 +39,11 @@ LIN = {"v0": 15.0, "L": 9.0}
 def model(what: str | Mapping[str, Any], *effects: dict[str, Any], **values: float) -> System:
     """A model with effects, its law's parameters as given."""
     options = {**model_options(what, "measured"), "effects": list(effects)}
-    found = build_model(options).double()
+    result = build_model(options).double()
     with torch.no_grad():
         for name, value in values.items():
-            getattr(found.terms[0], name).fill_(value)
-    return found
-
-
-def weighted(system: System, *layers: tuple[list[list[float]], list[float]]) -> System:
-    """A network with these weights and biases."""
-    with torch.no_grad():
-        for layer, (weight, bias) in zip(system.terms[0].network.layers, layers, strict=True):
-            layer.weight.copy_(torch.tensor(weight))
-            layer.bias.copy_(torch.tensor(bias))
-    return system
+            getattr(result.terms[0], name).fill_(value)
+    return result
 
 
 def scenario(
@@ -59,19 +52,11 @@ def scenario(
     *,
     ballistic: bool = False,
     step: float = 0.1,
-    seconds: float = by_sumo.SECONDS,
     speed: float = 12.0,
 ) -> Path:
     """One leader and seven followers on a road."""
     by_sumo.write_scene(sumo, folder, "Krauss", {"decel": 4.5}, speed=speed)
-    path = folder / "a.sumocfg"
-    path.write_text(
-        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
-        f'</input><time><step-length value="{step}"/><end value="{seconds + step}"/></time>'
-        f'<processing><step-method.ballistic value="{str(ballistic).lower()}"/></processing>'
-        '<report><no-warnings value="true"/></report></configuration>'
-    )
-    return path
+    return configured(folder, step=step, end=by_sumo.SECONDS + step, ballistic=ballistic)
 
 
 def led(profile: np.ndarray) -> Any:
@@ -98,16 +83,16 @@ def driven(
 ) -> tuple[Drive, Sequence]:
     """What came of it, and what SUMO wrote, with the lengths that it does not write."""
     path = scenario(sumo, folder, ballistic=ballistic, speed=float(profile[0, 1]))
-    found = drive(
+    result = drive(
         system, path, ["own"], folder / "out", program=program, steer=led(profile), **options
     )
-    (seen,) = read_sumo(found.trajectories, SumoOptions(path=str(found.trajectories), dt=0.1))
-    return found, replace(seen, length=np.full(seen.n_agents, by_sumo.LENGTH))
+    (observed,) = read_sumo(result.trajectories, SumoOptions(path=str(result.trajectories), dt=0.1))
+    return result, replace(observed, length=np.full(observed.n_agents, by_sumo.LENGTH))
 
 
-def apart(system: System, seen: Sequence, method: str) -> float:
+def apart(system: System, observed: Sequence, method: str) -> float:
     """The largest distance of a vehicle in SUMO from where the compiled simulation has it, m."""
-    batch = collate([seen])
+    batch = collate([observed])
     assert batch.n_samples == round(by_sumo.SECONDS / by_sumo.STEP) + 1
     with torch.no_grad():
         path = FusedSolver(dt=by_sumo.STEP, method=method)(system, batch)
@@ -116,40 +101,32 @@ def apart(system: System, seen: Sequence, method: str) -> float:
 
 def test_idm_in_euler_s_steps(sumo: Path, program: str, tmp_path: Path) -> None:
     system = model("idm")
-    found, seen = driven(system, sumo, program, tmp_path)
-    assert apart(system, seen, "semi_implicit") < ROUNDED
-    assert seen.v is not None
-    assert seen.v.min() == 0  # they stop, and nobody drives backwards
-    assert (found.driven, found.steps, found.collisions, found.teleports) == (7, 601, 0, 0)
-    assert found.stranded == 0
-    assert found.mean_speed == pytest.approx(seen.v[:, :-1].mean(), rel=0.01)
+    result, observed = driven(system, sumo, program, tmp_path)
+    assert apart(system, observed, "semi_implicit") < ROUNDED
+    assert observed.v is not None
+    assert observed.v.min() == 0  # they stop, and nobody drives backwards
+    assert (result.driven, result.steps, result.collisions, result.teleports) == (7, 601, 0, 0)
+    assert result.stranded == 0
+    assert result.mean_speed == pytest.approx(observed.v[:, :-1].mean(), rel=0.01)
 
 
 def test_idm_in_ballistic_steps(sumo: Path, program: str, tmp_path: Path) -> None:
     # a step that ends at rest is v²/(2|a|) long here, v dt/2 in SUMO, which only knows a speed of
     # 0: at most a dt²/8 less, 2 mm with idm's b of 1.7 m/s²; each of seven stops behind another
     system = model("idm")
-    _, seen = driven(system, sumo, program, tmp_path, ballistic=True)
-    assert ROUNDED < apart(system, seen, "ballistic") < 7 * 1.7 * 0.1**2 / 8 < 1.5 * CENTIMETRE
-    assert apart(system, seen, "ballistic") < CENTIMETRE
-
-
-def test_where_no_step_ends_at_rest_ballistic_steps_are_the_same(
-    sumo: Path, program: str, tmp_path: Path
-) -> None:
-    system = model({"term": "formula", "name": "own", "law": laws.IDM})  # brakes by v/dt at most
-    _, seen = driven(system, sumo, program, tmp_path, ballistic=True)
-    assert apart(system, seen, "ballistic") < ROUNDED
+    _, observed = driven(system, sumo, program, tmp_path, ballistic=True)
+    assert ROUNDED < apart(system, observed, "ballistic") < 7 * 1.7 * 0.1**2 / 8 < 1.5 * CENTIMETRE
+    assert apart(system, observed, "ballistic") < CENTIMETRE
 
 
 @pytest.mark.thorough
 def test_both_ways_to_run_sumo_are_the_same(sumo: Path, tmp_path: Path) -> None:
     pytest.importorskip("libsumo")
-    seen = [
+    observed = [
         driven(model("idm"), sumo, program, tmp_path / program)[1]
         for program in ("libsumo", "traci")
     ]
-    np.testing.assert_array_equal(seen[0].x, seen[1].x)
+    np.testing.assert_array_equal(observed[0].x, observed[1].x)
 
 
 FIRST_ORDER = {
@@ -162,16 +139,6 @@ FIRST_ORDER = {
     "clock": [{"speed_period": {"alpha": 0.7, "a": 20.0, "b": 30.0}}],
     "class": [{"vehicle_class": {"kind": "own", "phi": 0.8}}],
 }
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", FIRST_ORDER)
-def test_laws_of_first_order(sumo: Path, program: str, tmp_path: Path, name: str) -> None:
-    system = model("lin", *FIRST_ORDER[name], **LIN)
-    _, seen = driven(system, sumo, program, tmp_path, profile=SLOWLY, far=200.0)
-    assert apart(system, seen, "euler") < ROUNDED
-
-
 SECOND_ORDER = {
     "relative_speed": {"kappa": 0.3},
     "memory": {"tau_m": 60.0},
@@ -184,42 +151,84 @@ SECOND_ORDER = {
 }
 
 
-@pytest.mark.parametrize("name", SECOND_ORDER)
-def test_effects_on_accelerations(sumo: Path, program: str, tmp_path: Path, name: str) -> None:
-    system = model("idm", {name: SECOND_ORDER[name]})
-    _, seen = driven(system, sumo, program, tmp_path)
-    assert apart(system, seen, "semi_implicit") < 2 * ROUNDED
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", ["krauss", "gipps", "newell"])
-def test_other_laws_of_the_field(sumo: Path, program: str, tmp_path: Path, name: str) -> None:
+def network(name: str, *layers: tuple[list[list[float]], list[float]]) -> System:
+    """A model with a network of these weights and biases."""
     system = model(name)
-    _, seen = driven(system, sumo, program, tmp_path, far=200.0)
-    assert apart(system, seen, "semi_implicit") < ROUNDED
+    with torch.no_grad():
+        for layer, (weight, bias) in zip(system.terms[0].network.layers, layers, strict=True):
+            layer.weight.copy_(torch.tensor(weight))
+            layer.bias.copy_(torch.tensor(bias))
+    return system
 
 
-@pytest.mark.parametrize("ballistic", [False, True])
-def test_a_network_of_accelerations(
-    sumo: Path, program: str, tmp_path: Path, ballistic: bool
+ACCELERATIONS = partial(
+    network, "a2", ([[2.0, -1.2, -1.0], [-2.0, 1.2, 1.0]], [-0.7, 0.7]), ([[1.0, -1.5]], [0.35])
+)
+SPEEDS = partial(
+    network,
+    "n4",
+    ([[0.25], [0.25], [-0.25], [0.05]], [-2.0, -9.0, 1.0, -1.0]),
+    ([[3.0, -3.0, -0.1, 0.01]], [0.0]),
+)
+
+
+def case(
+    name: str,
+    make: Callable[[], System],
+    method: str,
+    *marks: Any,
+    off: float = ROUNDED,
+    **how: Any,
+) -> Any:
+    return pytest.param(make, method, how, off, id=name, marks=marks)
+
+
+@pytest.mark.parametrize(
+    ("make", "method", "how", "off"),
+    [
+        *(
+            case(
+                f"lin {name}",
+                partial(model, "lin", *effects, **LIN),
+                "euler",
+                pytest.mark.thorough,
+                profile=SLOWLY,
+                far=200.0,
+            )
+            for name, effects in FIRST_ORDER.items()
+        ),
+        *(
+            case(
+                f"idm {name}",
+                partial(model, "idm", {name: values}),
+                "semi_implicit",
+                off=2 * ROUNDED,
+            )
+            for name, values in SECOND_ORDER.items()
+        ),
+        *(
+            case(name, partial(model, name), "semi_implicit", pytest.mark.thorough, far=200.0)
+            for name in ("krauss", "gipps", "newell")
+        ),
+        # it brakes by v/dt at most, so that no step ends at rest
+        case("own", partial(model, {"term": "formula", "name": "own", "law": IDM}), "ballistic"),
+        case("a2", ACCELERATIONS, "semi_implicit", profile=SLOWLY, far=100.0),
+        case("a2 ballistic", ACCELERATIONS, "ballistic", profile=SLOWLY, far=100.0),
+        case("n4", SPEEDS, "euler", profile=SLOWLY, far=100.0),
+    ],
+)
+def test_paths_are_those_of_the_compiled_simulation(
+    sumo: Path,
+    program: str,
+    tmp_path: Path,
+    make: Callable[[], System],
+    method: str,
+    how: dict[str, Any],
+    off: float,
 ) -> None:
-    system = weighted(
-        model("a2"), ([[2.0, -1.2, -1.0], [-2.0, 1.2, 1.0]], [-0.7, 0.7]), ([[1.0, -1.5]], [0.35])
-    )
-    _, seen = driven(
-        system, sumo, program, tmp_path, ballistic=ballistic, profile=SLOWLY, far=100.0
-    )
-    assert apart(system, seen, "ballistic" if ballistic else "semi_implicit") < ROUNDED
-
-
-def test_a_network_of_speeds(sumo: Path, program: str, tmp_path: Path) -> None:
-    system = weighted(
-        model("n4"),
-        ([[0.25], [0.25], [-0.25], [0.05]], [-2.0, -9.0, 1.0, -1.0]),
-        ([[3.0, -3.0, -0.1, 0.01]], [0.0]),
-    )
-    _, seen = driven(system, sumo, program, tmp_path, profile=SLOWLY, far=100.0)
-    assert apart(system, seen, "euler") < ROUNDED
+    system = make()
+    _, observed = driven(system, sumo, program, tmp_path, ballistic=method == "ballistic", **how)
+    assert apart(system, observed, method) < off
 
 
 def two_edges(home: Path, folder: Path, *, length: int, lanes: int, speed: int) -> None:
@@ -245,11 +254,7 @@ def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path:
         '<flow id="q" type="own" route="r" begin="1" end="40" period="4" departLane="0" '
         'departSpeed="8"/></routes>'
     )
-    path = tmp_path / "a.sumocfg"
-    path.write_text(
-        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
-        '</input><time><step-length value="0.1"/></time></configuration>'
-    )
+    path = configured(tmp_path)
     stays, changes = (
         drive(
             model("idm", {"pure_delay": {"T": 0.3}}),
@@ -261,8 +266,8 @@ def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path:
         )
         for free in (False, True)
     )
-    for found in (stays, changes):
-        assert (found.driven, found.collisions, found.teleports) == (10, 0, 0)
+    for result in (stays, changes):
+        assert (result.driven, result.collisions, result.teleports) == (10, 0, 0)
     assert stays.mean_speed is not None
     assert changes.mean_speed is not None
     # who may not change lanes goes on behind 6 m/s
@@ -278,11 +283,7 @@ def test_who_stands_where_a_lane_does_not_lead_on(sumo: Path, program: str, tmp_
         )
         + "</routes>"
     )
-    path = tmp_path / "a.sumocfg"
-    path.write_text(
-        '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
-        '</input><time><step-length value="0.1"/><end value="60"/></time></configuration>'
-    )
+    path = configured(tmp_path, end=60.0)
     stays, changes = (
         drive(model("idm"), path, ["own"], tmp_path / str(free), program=program, lane_changes=free)
         for free in (False, True)
@@ -299,7 +300,7 @@ def test_a_scenario_with_other_steps_is_refused(sumo: Path, program: str, tmp_pa
         ConfigError, match=r"semi_implicit steps of 0\.5 s.*ballistic steps of 0\.1"
     ):
         drive(model("idm"), path, ["own"], tmp_path, program=program, expected=expected)
-    found = drive(
+    result = drive(
         model("idm"),
         path,
         ["own"],
@@ -309,7 +310,7 @@ def test_a_scenario_with_other_steps_is_refused(sumo: Path, program: str, tmp_pa
         forced_steps=expected,
         end=5.0,
     )
-    assert (found.step, found.method, found.steps) == (0.1, "ballistic", 50)
+    assert (result.step, result.method, result.steps) == (0.1, "ballistic", 50)
 
 
 def test_speeds_and_ballistic_steps_do_not_go_together(

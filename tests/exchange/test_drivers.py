@@ -22,7 +22,7 @@ def model(name: str, *effects: dict[str, Any], leader: str = "measured") -> Syst
     return build_model({**model_options(name, leader), "effects": list(effects)}).double()
 
 
-def seen(
+def observed(
     v: list[float], gap: list[float], lead: list[int] | None = None, **more: Any
 ) -> DriverInputs:
     """Vehicles whose leaders, where they are others, drive as fast as they do."""
@@ -51,7 +51,9 @@ def idm(v: float, net: float, dv: float) -> float:
 def test_one_step_of_idm_is_its_formula() -> None:
     drivers = Drivers(model("idm"), DT, "semi_implicit")
     drivers.enter([()] * 3)
-    said = drivers.speeds(0.0, seen([12.0, 14.0, 3.0], [25.0, np.inf, 6.0], v_1=[11.0, 0.0, 0.0]))
+    said = drivers.speeds(
+        0.0, observed([12.0, 14.0, 3.0], [25.0, np.inf, 6.0], v_1=[11.0, 0.0, 0.0])
+    )
     alone = 14 + DT * 1.3 * (1 - (14 / 30) ** 4)
     np.testing.assert_allclose(said[0], 12 + DT * idm(12.0, 20.0, 1.0), rtol=1e-12)
     np.testing.assert_allclose(said[1], alone, rtol=1e-9)  # an empty road is 1e9 m long
@@ -61,7 +63,7 @@ def test_one_step_of_idm_is_its_formula() -> None:
 def test_gaps_from_front_to_front_where_no_lengths_were_known() -> None:
     drivers = Drivers(model("idm"), DT, "semi_implicit", lengths=False)
     drivers.enter([()])
-    said = drivers.speeds(0.0, seen([12.0], [25.0]))
+    said = drivers.speeds(0.0, observed([12.0], [25.0]))
     np.testing.assert_allclose(said, 12 + DT * idm(12.0, 25.0, 0.0), rtol=1e-12)
 
 
@@ -69,7 +71,7 @@ def test_nobody_drives_backwards() -> None:
     first, second = Drivers(model("lin"), DT, "euler"), Drivers(model("idm"), DT, "ballistic")
     for drivers in (first, second):
         drivers.enter([()])
-        assert drivers.speeds(0.0, seen([0.5], [0.2])) == [0.0]
+        assert drivers.speeds(0.0, observed([0.5], [0.2])) == [0.0]
 
 
 def test_memories_belong_to_drivers() -> None:
@@ -85,13 +87,13 @@ def test_memories_belong_to_drivers() -> None:
             among.keep(np.array([False, True]))
         if k == 20:
             among.enter([(), ()])
-        one = alone.speeds(k * DT, seen([v], [gap]))
+        one = alone.speeds(k * DT, observed([v], [gap]))
         here = 1 if k < 10 else 0
         others = [8.0] * (len(among) - 1)
         speeds, gaps = (
             ([8.0, v], [50.0, gap]) if here else ([v, *others], [gap, *[40.0] * len(others)])
         )
-        many = among.speeds(k * DT, seen(speeds, gaps))
+        many = among.speeds(k * DT, observed(speeds, gaps))
         assert many[here] == one[0]
         v = float(one[0])
     # and it is one: after 1 s the acceleration is still between those of both gaps
@@ -102,7 +104,7 @@ def test_a_delay_begins_where_a_driver_is_taken_over() -> None:
     drivers = Drivers(model("idm", {"pure_delay": {"T": 0.3}}), DT, "semi_implicit")
     drivers.enter([()])
     now = [
-        float(drivers.speeds(k * DT, seen([12.0], [gap]))[0])
+        float(drivers.speeds(k * DT, observed([12.0], [gap]))[0])
         for k, gap in enumerate([25.0, 60.0, 60.0, 60.0, 60.0])
     ]
     before, after = (12 + DT * idm(12.0, gap - 5, 0.0) for gap in (25.0, 60.0))
@@ -116,7 +118,9 @@ def test_who_looks_at_the_speed_ahead_is_computed_after_it() -> None:
     drivers.enter([()] * 4)
     gaps = [20.0, 30.0, 25.0, 40.0]  # 2 follows 0, 0 follows 3, 3 a vehicle of SUMO's, 1 nobody
     lead = [3, -1, 0, -1]
-    said = drivers.speeds(0.0, seen([9.0] * 4, [20.0, np.inf, 25.0, 40.0], lead, v_1=[9, 9, 9, 7]))
+    said = drivers.speeds(
+        0.0, observed([9.0] * 4, [20.0, np.inf, 25.0, 40.0], lead, v_1=[9, 9, 9, 7])
+    )
     law = [v0 - v0 * L / gap for gap in gaps]
     third = law[3] + kappa * (7 - law[3])
     zeroth = law[0] + kappa * (third - law[0])
@@ -139,7 +143,7 @@ def test_laws_with_a_speed_on_an_empty_road(name: str) -> None:
     drivers.enter([()])
     v = 10.0
     for k in range(3000):
-        v = float(drivers.speeds(k * DT, seen([v], [np.inf]))[0])
+        v = float(drivers.speeds(k * DT, observed([v], [np.inf]))[0])
     assert v == pytest.approx(30.0, rel=2e-3)  # v0; gipps' approaches it slowly
 
 
@@ -159,7 +163,8 @@ def test_what_is_far_away_is_nobody() -> None:
     drivers = Drivers(model("helly"), DT, "semi_implicit", far=80.0)
     drivers.enter([()] * 3)
     said = drivers.speeds(
-        0.0, seen([9.0] * 3, [np.inf, 81.0, 80.0], v_1=[9.0, 2.0, 9.0], length_1=[0.0, 5.0, 0.0])
+        0.0,
+        observed([9.0] * 3, [np.inf, 81.0, 80.0], v_1=[9.0, 2.0, 9.0], length_1=[0.0, 5.0, 0.0]),
     )
     assert said[0] == said[1] == said[2]
     for far in (0.0, -1.0, 2e6):
@@ -174,7 +179,7 @@ def test_drivers_who_differ_are_drawn_from_the_fitted_distribution() -> None:
     def speeds(seed: int) -> np.ndarray:
         drivers = Drivers(model("lin", effect), DT, "euler", seed=seed)
         drivers.enter([()] * n)
-        return drivers.speeds(0.0, seen([9.0] * n, [20.0] * n))
+        return drivers.speeds(0.0, observed([9.0] * n, [20.0] * n))
 
     pace = speeds(1) / (30.0 * (1 - 5 / 20)) - 1
     assert abs(pace.mean()) < 4 * sigma / np.sqrt(n)
@@ -187,7 +192,7 @@ def test_without_a_spread_it_is_that_of_the_drivers_who_were_seen() -> None:
     effect = {"name": "driver_heterogeneity", "people": {"a": [0.3, -0.3], "b": [0.3, -0.3]}}
     drivers = Drivers(model("lin", effect), DT, "euler")
     drivers.enter([()] * 4000)
-    said = drivers.speeds(0.0, seen([9.0] * 4000, [20.0] * 4000)) / 22.5 - 1
+    said = drivers.speeds(0.0, observed([9.0] * 4000, [20.0] * 4000)) / 22.5 - 1
     assert said.std() == pytest.approx(0.3, rel=0.05)
     assert said.min() >= -0.9  # nobody's pace is turned round
 
@@ -196,7 +201,7 @@ def test_a_class_acts_on_its_own() -> None:
     effect = {"vehicle_class": {"kind": "truck", "phi": 0.5}}
     drivers = Drivers(model("lin", effect), DT, "euler")
     drivers.enter([{"own", "truck"}, {"own", "passenger"}])
-    slow, fast = drivers.speeds(0.0, seen([9.0] * 2, [20.0] * 2))
+    slow, fast = drivers.speeds(0.0, observed([9.0] * 2, [20.0] * 2))
     assert slow == pytest.approx(fast / 2)
 
 
@@ -207,7 +212,7 @@ def test_numbers_that_are_none() -> None:
     drivers = Drivers(build_model(options).double(), DT, "euler", far=100.0)
     drivers.enter([()])
     with np.errstate(invalid="ignore"), pytest.raises(SimulationError, match=r"gap of 5\.5 m"):
-        drivers.speeds(3.0, seen([9.0], [5.5]))
+        drivers.speeds(3.0, observed([9.0], [5.5]))
 
 
 class Coded(FollowTheLeader):

@@ -34,8 +34,8 @@ def crowd(**options: object) -> Crowd:
 
 
 def test_social_force_by_jupedsim_s_names() -> None:
-    found = jupedsim_parameters(crowd(r=0.2, B=0.1, mass=2.0), SCENES)
-    content = json.loads(found.text)
+    result = jupedsim_parameters(crowd(r=0.2, B=0.1, mass=2.0), SCENES)
+    content = json.loads(result.text)
     assert content["model"] == {"body_force": 10.0, "friction": 5.0}
     agent = content["agent"]
     obstacle = agent.pop("obstacle_scale")
@@ -48,7 +48,7 @@ def test_social_force_by_jupedsim_s_names() -> None:
         "force_distance": 0.1,
         "radius": 0.2,
     }
-    assert content["no_counterpart"] == found.missing
+    assert content["no_counterpart"] == result.missing
 
 
 def test_what_jupedsim_cannot_say() -> None:
@@ -64,9 +64,9 @@ def test_what_jupedsim_cannot_say() -> None:
 
 def test_without_walls_nobody_is_pushed_by_them() -> None:
     for model, points in ((crowd(walls=False), 50.0), (crowd(), 0.0)):
-        found = jupedsim_parameters(model, Scenes(12.0, points, 0.25, 1.3))
-        assert json.loads(found.text)["agent"]["obstacle_scale"] == 0
-        assert not any("walls" in line for line in found.missing)
+        result = jupedsim_parameters(model, Scenes(12.0, points, 0.25, 1.3))
+        assert json.loads(result.text)["agent"]["obstacle_scale"] == 0
+        assert not any("walls" in line for line in result.missing)
 
 
 @pytest.mark.parametrize(
@@ -109,18 +109,18 @@ def values(model: System, speed: float = 15.0, length: float | None = 4.2) -> di
 
 
 def test_a_linear_law_as_a_vehicle_type() -> None:
-    found = values(Traffic([make_law("lin", v0=30.0, L=7.0)]))
-    assert found["id"] == "lin"
-    assert (float(found["length"]), float(found["minGap"])) == (4.2, pytest.approx(2.8))
-    assert float(found["maxSpeed"]) == 30
+    result = values(Traffic([make_law("lin", v0=30.0, L=7.0)]))
+    assert result["id"] == "lin"
+    assert (float(result["length"]), float(result["minGap"])) == (4.2, pytest.approx(2.8))
+    assert float(result["maxSpeed"]) == 30
     # at 15 m/s the law asks for twice the gap at rest
-    assert float(found["tau"]) == pytest.approx(7 / 15, rel=1e-5)
-    assert "actionStepLength" not in found
+    assert float(result["tau"]) == pytest.approx(7 / 15, rel=1e-5)
+    assert "actionStepLength" not in result
 
 
 def test_a_law_shorter_than_a_car() -> None:
-    found = values(Traffic([make_law("lin", v0=30.0, L=3.5)]), length=None)
-    assert (float(found["length"]), float(found["minGap"])) == (3.5, 0)
+    result = values(Traffic([make_law("lin", v0=30.0, L=3.5)]), length=None)
+    assert (float(result["length"]), float(result["minGap"])) == (3.5, 0)
 
 
 def test_a_logarithmic_law_knows_no_greatest_speed() -> None:
@@ -141,21 +141,21 @@ def field(name: str) -> System:
 def test_laws_that_sumo_has(law: str, follow: str) -> None:
     system = field(law)
     assert has_type(system)
-    found = values(system, length=4.5)
-    known = {name.rpartition(".")[2]: float(v) for name, (v, _) in system.physical().items()}
-    assert (found["id"], found["carFollowModel"]) == ("lin", follow)
+    result = values(system, length=4.5)
+    expected = {name.rpartition(".")[2]: float(v) for name, (v, _) in system.physical().items()}
+    assert (result["id"], result["carFollowModel"]) == ("lin", follow)
     names = {"v0": "maxSpeed", "T": "tau", "a": "accel", "b": "decel", "s0": "minGap"}
     for own, theirs in names.items():
-        assert float(found[theirs]) == pytest.approx(known[own], rel=1e-11)
-    assert float(found["length"]) == 4.5
+        assert float(result[theirs]) == pytest.approx(expected[own], rel=1e-11)
+    assert float(result["length"]) == 4.5
     # without lengths the gap at rest contains one
-    found = values(system, length=None)
-    assert float(found["length"]) + float(found["minGap"]) == pytest.approx(known["s0"])
+    result = values(system, length=None)
+    assert float(result["length"]) + float(result["minGap"]) == pytest.approx(expected["s0"])
 
 
 def test_intervals_stand_in_comments() -> None:
-    known = {"mine.T": {"value": 1.2, "low": 1.125, "high": 1.25}, "mine.a": {"low": None}}
-    text = sumo_type(field("idm"), "x", 15.0, 4.5, known).text
+    expected = {"mine.T": {"value": 1.2, "low": 1.125, "high": 1.25}, "mine.a": {"low": None}}
+    text = sumo_type(field("idm"), "x", 15.0, 4.5, expected).text
     assert "<!-- T = 1.2 s, 95 % [1.125, 1.25] -->" in text
     assert "<!-- a = 1.3 m/s², no interval -->" in text
     content = json.loads(
@@ -208,10 +208,10 @@ def test_effects_with_a_counterpart() -> None:
         {"name": "relative_speed", "kappa": 0.3},
     ]
     add_effects(model, chosen)
-    found = values(model)
-    assert float(found["actionStepLength"]) == pytest.approx(0.8)
-    assert float(found["maxSpeed"]) == 25
-    assert float(found["tau"]) == pytest.approx((2 * (7 + 0.2 * 15) - 7) / 15, rel=1e-5)
+    result = values(model)
+    assert float(result["actionStepLength"]) == pytest.approx(0.8)
+    assert float(result["maxSpeed"]) == 25
+    assert float(result["tau"]) == pytest.approx((2 * (7 + 0.2 * 15) - 7) / 15, rel=1e-5)
     told = [t for t in sumo_type(model, "lin", 15.0, None).missing if t.startswith("effect")]
     assert len(told) == 1
     assert "relative_speed" in told[0]

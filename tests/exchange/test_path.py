@@ -49,9 +49,9 @@ def platoons(number: int = 30, cars: int = 4, seconds: float = 30.0, seed: int =
         x = np.cumsum([rng.uniform(0, 200), *rng.uniform(25, 45, cars - 1)])
         v = np.full(cars, mean + deep * np.cos(phase))
         for t in STEP * np.arange(round(seconds / STEP) + 1):
-            seen = x + 0.02 * rng.standard_normal(cars)
+            observed = x + 0.02 * rng.standard_normal(cars)
             clock = round(100.0 * k + t, 3)
-            rows += [(k, clock, f"{k}-{n}", round(seen[n], 3), LONG) for n in range(cars)]
+            rows += [(k, clock, f"{k}-{n}", round(observed[n], 3), LONG) for n in range(cars)]
             lead = mean + deep * np.cos(0.35 * (t + STEP) + phase)
             new = np.append(stepped(x[:-1], v[:-1], np.diff(x) - LONG, v[1:]), lead)
             x, v = x + STEP * (v + new) / 2, new
@@ -132,9 +132,9 @@ def test_the_file_is_looked_at_and_the_law_calibrated(work: Path) -> None:
 
 
 def test_the_diagnosis_finds_the_zone(work: Path) -> None:
-    found = read(work / "runs/lacks/report.json")
-    assert found["verdict"] == "named"
-    (effect,) = found["effects"]
+    result = read(work / "runs/lacks/report.json")
+    assert result["verdict"] == "named"
+    (effect,) = result["effects"]
     assert effect["name"] == "speed_zone"
     value = {name: one["value"] for name, one in effect["coefficients"].items()}
     assert (value["a"], value["b"]) == pytest.approx(ZONE, abs=EDGE["m"])
@@ -165,17 +165,19 @@ def test_vehicles_in_sumo_are_slow_in_the_zone(work: Path) -> None:
     assert (account["driven"], account["collisions"], account["teleports"]) == (4, 0, 0)
     assert (account["step"], account["method"]) == (STEP, "ballistic")
     with gzip.open(work / "runs/drive/fcd.xml.gz") as file:
-        seen = ElementTree.parse(file).iter("vehicle")
-        driven = np.array([float(one.attrib["pos"]) for one in seen if one.attrib["id"] == "c0"])
-    x, v, known = np.array([START]), np.array([SPEED]), [START]
+        observed = ElementTree.parse(file).iter("vehicle")
+        driven = np.array(
+            [float(one.attrib["pos"]) for one in observed if one.attrib["id"] == "c0"]
+        )
+    x, v, expected = np.array([START]), np.array([SPEED]), [START]
     while x[0] < ZONE[1] + 50:
         new = stepped(x, v, np.array([1e9]), v)
         x, v = x + STEP * (v + new) / 2, new
-        known.append(x[0])
+        expected.append(x[0])
     # s lost in the zone, to one who drives as fast as wanted elsewhere
     lost = [
         np.diff(np.interp(ZONE, way, STEP * np.arange(len(way))))[0]
         - (ZONE[1] - ZONE[0]) / TRUE["v0"]
-        for way in (driven, np.array(known))
+        for way in (driven, np.array(expected))
     ]
     assert lost[0] == pytest.approx(lost[1], rel=SHARE)

@@ -13,19 +13,16 @@ import pytest
 import torch
 
 from benchmarks.programs.sumo import call, network
-from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.options import Faults
 from nnode.data.prepare import prepare
 from nnode.data.readers.jupedsim import WalkwayOptions, read_walkway, walls_of
 from nnode.data.readers.sumo import SumoOptions
 from nnode.data.sequence import Sequence, collate
-from nnode.data.store import Store
 from nnode.exchange.jupedsim import jupedsim_parameters, scenes_of
 from nnode.exchange.sumo import equilibrium_gap, sumo_type
 from nnode.exchange.trajectories import write_pedpy
 from nnode.model import Crowd, Traffic, make_law
 from nnode.model.term import State
-from tests.app.conftest import Script, forks, script  # noqa: F401
 
 ROOM = [(0, 0), (12, 0), (12, 4), (0, 4)]
 PILLAR = [(5.5, 1.8), (6.5, 1.8), (6.5, 2.2), (5.5, 2.2)]
@@ -71,25 +68,6 @@ def test_a_simulation_by_jupedsim_is_read(walked: Path, tmp_path: Path) -> None:
     for x1, y1, x2, y2 in walls:
         if y1 == y2 and y1 in (0, 1.8):
             assert (x2 - x1) * (centre[1] - y1) > 0
-
-
-@pytest.mark.slow
-def test_a_simulation_by_jupedsim_calibrates(
-    walked: Path,
-    tmp_path: Path,
-    script: Script,  # noqa: F811
-) -> None:
-    script(
-        "train",
-        "model=sf",
-        "data=jupedsim",
-        f"data.path={walked}",
-        "data.split.heldout=0",
-        "trainer.max_epochs=3",
-        f"hydra.run.dir={tmp_path}",
-    )
-    history = load_checkpoint(tmp_path / "checkpoints" / "best.pt").history
-    assert history[-1]["cost/train"] < history[0]["cost/train"]
 
 
 def test_pedpy_reads_the_same_database(walked: Path) -> None:
@@ -144,8 +122,8 @@ def accelerations(jupedsim: ModuleType, content: dict, x: np.ndarray, v: np.ndar
         for place, speed in zip(x, v, strict=True)
     ]
     simulation.iterate()
-    found = np.array([simulation.agent(i).model.velocity for i in ids])
-    return (found - v) / dt + v / agent["reaction_time"]
+    result = np.array([simulation.agent(i).model.velocity for i in ids])
+    return (result - v) / dt + v / agent["reaction_time"]
 
 
 def forces(model: Crowd, x: np.ndarray, v: np.ndarray, walls: np.ndarray | None) -> np.ndarray:
@@ -255,31 +233,6 @@ def test_a_platoon_by_sumo_is_read(sumo: Path, road: Path, types: Path, tmp_path
     assert store[2].v is not None
     np.testing.assert_allclose(store[2].v[-1], 12.0, atol=1.0)
     np.testing.assert_allclose(np.diff(store[2].x[:, -1, 0]), 2.4, atol=0.011)
-
-
-@pytest.mark.slow
-def test_a_platoon_by_sumo_calibrates(
-    sumo: Path,
-    road: Path,
-    types: Path,
-    tmp_path: Path,
-    script: Script,  # noqa: F811
-) -> None:
-    path = platoon(sumo, road, tmp_path, types, 31)
-    run = tmp_path / "run"
-    script(
-        "train",
-        "model=lin",
-        "data=sumo",
-        f"data.path={path}",
-        "data.split.heldout=0",
-        "solver=fused",
-        "trainer.max_epochs=5",
-        f"hydra.run.dir={run}",
-    )
-    assert len(Store(run / "data")) == 3
-    history = load_checkpoint(run / "checkpoints" / "best.pt").history
-    assert history[-1]["cost/train"] < history[0]["cost/train"]
 
 
 def test_sumo_s_drivers_keep_the_law_s_gap(sumo: Path, road: Path, tmp_path: Path) -> None:

@@ -35,9 +35,9 @@ def recovered(name: str) -> Recovered:
         return CASES[name].recovered(Path(folder))
 
 
-def check(found: Recovered, unknown: set[str], same: float = SAME) -> None:
+def check(result: Recovered, unknown: set[str], same: float = SAME) -> None:
     """All but the unknown are found, and said to be; intervals hold what was typed in."""
-    parameters = found.parameters
+    parameters = result.parameters
     assert set(parameters.index[~parameters["identified"]]) == unknown
     identified = parameters[parameters["identified"]]
     assert (identified["off"] < same).all()
@@ -47,17 +47,17 @@ def check(found: Recovered, unknown: set[str], same: float = SAME) -> None:
 
 @pytest.mark.parametrize("name", ["idm_euler", "idm_ballistic_rest", "krauss_crawl"])
 def test_sumo_s_laws_are_the_same_to_the_last_decimal(sumo: Path, name: str) -> None:
-    found = recovered(name)
-    assert found.forward < ROUNDED
-    assert found.worst < 3 * ROUNDED
-    check(found, set())
+    result = recovered(name)
+    assert result.forward < ROUNDED
+    assert result.worst < 3 * ROUNDED
+    check(result, set())
 
 
 def test_a_speed_that_nobody_reaches_is_not_identified(sumo: Path) -> None:
-    found = recovered("krauss_moving")
-    assert found.forward < ROUNDED
-    check(found, {"v0"})
-    assert np.isinf(found.parameters.loc["v0", "half"])
+    result = recovered("krauss_moving")
+    assert result.forward < ROUNDED
+    check(result, {"v0"})
+    assert np.isinf(result.parameters.loc["v0", "half"])
 
 
 def test_the_field_s_idm_differs_from_sumo_s_where_a_ballistic_step_ends_at_rest(
@@ -65,11 +65,11 @@ def test_the_field_s_idm_differs_from_sumo_s_where_a_ballistic_step_ends_at_rest
 ) -> None:
     # SUMO drives v dt/2 in it, here it is v²/(2 A): at most A dt²/8 less, A being what they brake
     # with, b at most as they come to rest; and each of seven stops behind the one ahead
-    found = recovered("idm_ballistic")
-    once = found.parameters.loc["b", "typed"] * 0.1**2 / 8
-    assert ROUNDED < found.worst < 7 * once
+    result = recovered("idm_ballistic")
+    once = result.parameters.loc["b", "typed"] * 0.1**2 / 8
+    assert ROUNDED < result.worst < 7 * once
     # what 1 mm does: a hundredth of 0.1 m, which leave 0.3 %
-    check(found, set(), same=3e-5)
+    check(result, set(), same=3e-5)
 
 
 def test_the_field_s_krauss_differs_from_sumo_s_in_the_last_metre_behind_who_stands(
@@ -77,42 +77,42 @@ def test_the_field_s_krauss_differs_from_sumo_s_in_the_last_metre_behind_who_sta
 ) -> None:
     # there SUMO drives at b dt until a centimetre is left, here the gap shrinks at its own rate
     # 1/T: at most the stretch itself, b dt (1 s)
-    found = recovered("krauss_stopping")
-    stretch = found.parameters.loc["b", "typed"] * 0.1
-    assert 1e-3 < found.worst < stretch
-    assert (found.parameters["off"] < 0.01).all()
+    result = recovered("krauss_stopping")
+    stretch = result.parameters.loc["b", "typed"] * 0.1
+    assert 1e-3 < result.worst < stretch
+    assert (result.parameters["off"] < 0.01).all()
 
 
 def test_sumo_s_krauss_in_ballistic_steps_is_a_formula(sumo: Path) -> None:
-    found = recovered("krauss_ballistic")
-    assert found.worst < 1e-4  # as they start: a hundredth of a millimetre
-    check(found, set(), same=1e-6)
+    result = recovered("krauss_ballistic")
+    assert result.worst < 1e-4  # as they start: a hundredth of a millimetre
+    check(result, set(), same=1e-6)
 
 
 def test_jupedsim_s_social_force_is_the_same(jupedsim: ModuleType) -> None:
-    found = recovered("force_contact")
-    assert found.worst < 1e-12
-    check(found, set())
+    result = recovered("force_contact")
+    assert result.worst < 1e-12
+    check(result, set())
 
 
 def test_forces_of_contact_are_not_identified_where_nobody_touches(jupedsim: ModuleType) -> None:
-    found = recovered("force_default")
-    assert found.worst < 1e-12
-    check(found, {"k", "kappa"})
+    result = recovered("force_default")
+    assert result.worst < 1e-12
+    check(result, {"k", "kappa"})
 
 
 def test_jupedsim_s_collision_free_speeds_are_the_same(jupedsim: ModuleType) -> None:
-    found = recovered("collision_free")
+    result = recovered("collision_free")
     # directions here have 1e-6 m and 1e-12 added within their lengths
-    assert found.worst < 1e-9
+    assert result.worst < 1e-9
     # with errors of measurement the cost has many minima, and intervals are those of one of them
-    assert found.parameters["identified"].all()
-    assert (found.parameters["off"] < SAME).all()
+    assert result.parameters["identified"].all()
+    assert (result.parameters["off"] < SAME).all()
 
 
 def test_jupedsim_s_centrifugal_force_is_the_same_but_for_who_stands(jupedsim: ModuleType) -> None:
     # the ellipse of somebody at 3 mm/s turns with any rounding: 1e-7 m become millimetres
-    found = recovered("centrifugal")
-    assert found.forward < 0.01
-    assert found.parameters["identified"].all()
-    assert (found.parameters["off"] < 0.01).all()
+    result = recovered("centrifugal")
+    assert result.forward < 0.01
+    assert result.parameters["identified"].all()
+    assert (result.parameters["off"] < 0.01).all()

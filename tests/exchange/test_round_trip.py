@@ -27,6 +27,9 @@ from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, law_from
 from nnode.simulation import FusedSolver
 from tests.exchange.test_recovery import recovered
 
+#: A short step of JuPedSim, s.
+DT = 1e-4
+
 
 def of_the_field(law: Any, name: str) -> Any:
     """A law with the parameters that a search has found, in float64."""
@@ -69,8 +72,8 @@ def test_sumo_s_vehicles(
     written = dict(kind.attrib)
     follow, length = written.pop("carFollowModel"), float(written.pop("length"))
     assert (follow, length) == (SAME[law], by_sumo.LENGTH)
-    again = {k: float(v) for k, v in written.items() if k in {*names.values(), "sigma"}}
-    second = vehicles(by_sumo.platoon(sumo, tmp_path / "b", follow, again, profile=profile))
+    repeated = {k: float(v) for k, v in written.items() if k in {*names.values(), "sigma"}}
+    second = vehicles(by_sumo.platoon(sumo, tmp_path / "b", follow, repeated, profile=profile))
     # parameters are found to 1e-9 and written with twelve digits: a micrometre in 60 s
     assert np.abs(first.x - second.x).max() < 1e-6
 
@@ -155,19 +158,45 @@ def test_jupedsim_s_social_force(jupedsim: ModuleType, tmp_path: Path) -> None:
         assert np.abs(a.x - b.x).max() < 0.01
 
 
-def test_jupedsim_s_centrifugal_people_who_walk_at_each_other(
-    jupedsim: ModuleType, tmp_path: Path
-) -> None:
+def after_a_step(
+    jupedsim: ModuleType,
+    written: dict[str, Any],
+    room: tuple[float, float, float, float],
+    persons: list[dict[str, Any]],
+    targets: np.ndarray,
+) -> list[Any]:
+    """JuPedSim's agents in a rectangular room after a step of DT."""
+    import shapely
+
+    model, person = (getattr(jupedsim, written["classes"][part]) for part in ("model", "agent"))
+    simulation = jupedsim.Simulation(
+        model=model(**written["model"]), geometry=shapely.box(*room), dt=DT
+    )
+    stage = simulation.add_direct_steering_stage()
+    journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
+    ids = []
+    for values, target in zip(persons, targets, strict=True):
+        agent = person(journey_id=journey, stage_id=stage, **written["agent"], **values)
+        ids.append(simulation.add_agent(agent))
+        simulation.agent(ids[-1]).target = tuple(target)
+    simulation.iterate()
+    return [simulation.agent(i) for i in ids]
+
+
+def first_rate(system: System, s: Sequence) -> np.ndarray:
+    """``(N, ...)`` rates of the people's states at the start."""
+    batch = collate([s])
+    rate = system(torch.tensor(0.0), system.initial(batch), system.scene(batch)).detach()[0]
+    return np.asarray(rate)
+
+
+def test_jupedsim_s_centrifugal_people_who_walk_at_each_other(jupedsim: ModuleType) -> None:
     """Head-on the distance of bodies is the same in both, and so are accelerations: where bodies
     are farther apart than JuPedSim's interpolation begins, and centres nearer than the law fades.
     """
-    import shapely
-
     system = Crowd([law_from("gcfm", PEDESTRIAN_LAWS["gcfm"])])
-    apart, speed, dt = 1.4, 0.2, 1e-4
-    x = np.array([[0.0, 0.0], [apart, 0.0]])
-    v = np.array([[speed, 0.0], [-speed, 0.0]])
-    way = np.array([[1.3, 0.0], [-1.3, 0.0]])
+    speed, x = 0.2, np.array([[0.0, 0.0], [1.4, 0.0]])
+    v, way = (np.array([[value, 0.0], [-value, 0.0]]) for value in (speed, 1.3))
     s = Sequence(
         name="a",
         recording="a",
@@ -177,33 +206,19 @@ def test_jupedsim_s_centrifugal_people_who_walk_at_each_other(
         destination=x + 100 * way,
         preferred=way,
     )
-    written = exported(system, [s])
-    simulation = jupedsim.Simulation(
-        model=jupedsim.GeneralizedCentrifugalForceModel(**written["model"]),
-        geometry=shapely.box(-500, -500, 500, 500),
-        dt=dt,
-    )
-    stage = simulation.add_direct_steering_stage()
-    journey = simulation.add_journey(jupedsim.JourneyDescription([stage]))
-    ids = []
-    for place, aim in zip(x, way, strict=True):
-        towards = tuple(np.sign(aim))
-        person = jupedsim.GeneralizedCentrifugalForceModelAgentParameters(
-            position=tuple(place),
-            journey_id=journey,
-            stage_id=stage,
-            speed=speed,
-            orientation=towards,
-            desired_direction=towards,
-            **written["agent"],
-        )
-        ids.append(simulation.add_agent(person))
-        simulation.agent(ids[-1]).target = tuple(place + 200 * aim)
-    simulation.iterate()
-    theirs = np.array([simulation.agent(i).model.speed - speed for i in ids]) / dt
-    batch = collate([s])
-    rate = system(torch.tensor(0.0), system.initial(batch), system.scene(batch)).detach()[0]
-    ours = rate[:, 2].numpy() * np.sign(way[:, 0])
+    persons = [
+        {
+            "position": tuple(place),
+            "speed": speed,
+            "orientation": tuple(np.sign(aim)),
+            "desired_direction": tuple(np.sign(aim)),
+        }
+        for place, aim in zip(x, way, strict=True)
+    ]
+    room = (-500, -500, 500, 500)
+    agents = after_a_step(jupedsim, exported(system, [s]), room, persons, x + 200 * way)
+    theirs = np.array([agent.model.speed - speed for agent in agents]) / DT
+    ours = first_rate(system, s)[:, 2] * np.sign(way[:, 0])
     assert (ours < 1.3 / 0.5 - speed / 0.5 - 0.05).all()  # each pushes the other
     np.testing.assert_allclose(theirs, ours, rtol=1e-3)
 
@@ -213,9 +228,7 @@ def in_a_room(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(2,) velocities after a short step to the right, of one person in a room: JuPedSim's, and
     those of the law that was exported to it."""
-    import shapely
-
-    dt, goal = 1e-4, (4.99, place[1])
+    goal = np.array([[4.99, place[1]]])
     room = np.array([[-5.0, -2, 5, -2], [5, -2, 5, 2], [5, 2, -5, 2], [-5, 2, -5, -2]])
     x, v = np.array([place]), np.array([[speed, 0.0]])
     s = Sequence(
@@ -224,34 +237,17 @@ def in_a_room(
         time=np.arange(2.0),
         x=np.stack([x, x + v]),
         v=np.stack([v, v]),
-        destination=np.array([goal]),
+        destination=goal,
         preferred=np.array([[1.3, 0.0]]),
         walls=room,
     )
     system = Crowd([law_from(name, PEDESTRIAN_LAWS[name])], desired="exit")
-    written = exported(system, [s])
-    simulation = jupedsim.Simulation(
-        model=getattr(jupedsim, written["classes"]["model"])(**written["model"]),
-        geometry=shapely.box(-5, -2, 5, 2),
-        dt=dt,
-    )
-    stage = simulation.add_direct_steering_stage()
     moving = {"speed": speed, "orientation": (1.0, 0.0), "desired_direction": (1.0, 0.0)}
-    person = getattr(jupedsim, written["classes"]["agent"])(
-        position=tuple(place),
-        stage_id=stage,
-        **written["agent"],
-        journey_id=simulation.add_journey(jupedsim.JourneyDescription([stage])),
-        **(moving if name == "gcfm" else {}),
-    )
-    own = simulation.add_agent(person)
-    simulation.agent(own).target = goal
-    simulation.iterate()
-    theirs = (np.array(simulation.agent(own).position) - x[0]) / dt
-    batch = collate([s])
-    rate = system(torch.tensor(0.0), system.initial(batch), system.scene(batch)).detach()[0, 0]
-    rate = rate[-2:].numpy()
-    return theirs, rate if system.order == 1 else v[0] + dt * rate
+    person = {"position": tuple(place), **(moving if name == "gcfm" else {})}
+    (agent,) = after_a_step(jupedsim, exported(system, [s]), (-5, -2, 5, 2), [person], goal)
+    theirs = (np.array(agent.position) - x[0]) / DT
+    rate = first_rate(system, s)[0, -2:]
+    return theirs, rate if system.order == 1 else v[0] + DT * rate
 
 
 @pytest.mark.parametrize("place", [[0.0, -1.82], [1.0, 1.84], [-4.83, -1.81], [0.0, 0.0]])
@@ -270,6 +266,6 @@ def test_jupedsim_s_centrifugal_people_who_walk_at_a_wall(
     """Where bodies are so far from it that JuPedSim neither interpolates nor pushes with its
     greatest force (within 0.4 m and a radius), and centres nearer than the law fades."""
     theirs, ours = in_a_room(jupedsim, "gcfm", [5.0 - apart, 0.3], speed)
-    free = speed + 1e-4 * (1.3 - speed) / 0.5
+    free = speed + DT * (1.3 - speed) / 0.5
     assert (ours[0] < free - 1e-6) == (apart < 2)
     np.testing.assert_allclose(theirs[0] - speed, ours[0] - speed, rtol=1e-3)

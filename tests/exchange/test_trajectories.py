@@ -128,20 +128,20 @@ def test_vehicles_are_read_as_they_were(tmp_path: Path) -> None:
     path = write_fcd(tmp_path / "samples.xml.gz", given_)
     options = SumoOptions(path=str(path), dt=0.1, min_vehicles=2, window=None)
     lanes = ["road_0~1", "road_0~2", "road_1~1", "road_1~1_"]
-    found = {s.recording: s for s in read_sumo(path, options)}
-    assert sorted(found) == [f"samples_{lane}" for lane in lanes]
+    result = {s.recording: s for s in read_sumo(path, options)}
+    assert sorted(result) == [f"samples_{lane}" for lane in lanes]
     for lane, s in zip(lanes, given_, strict=True):
-        back = found[f"samples_{lane}"]
+        back = result[f"samples_{lane}"]
         assert back.agents == tuple(f"{lane}.{a}" for a in s.agents or map(str, range(s.n_agents)))
         np.testing.assert_allclose(back.time, s.time, rtol=0, atol=1e-9)
         np.testing.assert_allclose(back.x, s.x, rtol=0, atol=1e-9)
         np.testing.assert_allclose(back.v, s.v, rtol=0, atol=1e-9)
-    first, second = (found[f"samples_{lane}"] for lane in lanes[:2])
+    first, second = (result[f"samples_{lane}"] for lane in lanes[:2])
     assert (first.kind, second.kind) == (("car", "truck", "car"), ("", "", ""))
     np.testing.assert_array_equal(first.length, given_[0].length)
     assert second.length is None
-    again = write_fcd(tmp_path / "again.xml.gz", given_)
-    assert again.read_bytes() == path.read_bytes()
+    repeated = write_fcd(tmp_path / "again.xml.gz", given_)
+    assert repeated.read_bytes() == path.read_bytes()
 
 
 def test_vehicles_without_speeds(tmp_path: Path) -> None:
@@ -158,13 +158,13 @@ def test_a_crowd_s_table_is_read_as_it_was(tmp_path: Path, ending: str) -> None:
     first = walk(group=("g", "", "g"), kind=("child", "", ""), length=np.array([0.3, 0.4, np.nan]))
     second = walk(start=30, name="run/003", group=("", "", ""), kind=("child", "", ""))
     path = write_table(tmp_path / "deep" / f"walk.{ending}", [first, second], 2)
-    found = read_table(path, TableOptions(domain="crowd", path=str(path)))
-    for back, s in zip(found, (first, second), strict=True):
+    result = read_table(path, TableOptions(domain="crowd", path=str(path)))
+    for back, s in zip(result, (first, second), strict=True):
         assert (back.name, back.recording, back.agents) == (s.name, s.recording, s.agents)
         np.testing.assert_array_equal(back.x, s.x)
         np.testing.assert_array_equal(back.destination, s.x[-1])
         assert (back.group, back.kind) == (s.group, s.kind)
-    np.testing.assert_array_equal(found[0].length, first.length)
+    np.testing.assert_array_equal(result[0].length, first.length)
 
 
 @pytest.mark.parametrize("ending", ["parquet", "csv"])
@@ -214,8 +214,8 @@ def test_simulated_sequences_lose_their_padding(size: int) -> None:
         return Trajectory(batch.x[0] + t * batch.v[0], batch.v[:1].expand_as(batch.x))
 
     given_ = [walk(3, 11), walk(1, 21, name="run/003"), walk(2, 5, name="run/004")]
-    found = list(simulated(straight, given_, size=size))
-    for s, back in zip(given_, found, strict=True):
+    result = list(simulated(straight, given_, size=size))
+    for s, back in zip(given_, result, strict=True):
         assert (back.name, back.agents) == (s.name, s.agents)
         speed = s.velocity()[0]
         np.testing.assert_allclose(back.x, s.x[0] + (s.time - s.time[0])[:, None, None] * speed)

@@ -37,14 +37,14 @@ _FLAGS = {
 }
 
 
-def help_text(name: str, *, _root_: DictConfig) -> str:
-    """The help of a command, as a template for Hydra.
+def help_text(name: str, config: DictConfig) -> str:
+    """The help of a command.
 
     Args:
         name: name of the command.
-        _root_: the composed configuration, including Hydra's part.
+        config: the composed configuration, including Hydra's part.
     """
-    hydra = _root_.hydra
+    hydra = config.hydra
     folders = [Path(s.path) for s in hydra.runtime.config_sources if s.schema == "file"]
     choices = []
     for group, chosen in hydra.runtime.choices.items():
@@ -56,13 +56,13 @@ def help_text(name: str, *, _root_: DictConfig) -> str:
             choices.append("\n".join([f"{group}=", *rows]))
     if choices:
         choices.insert(0, "Choices, GROUP=NAME; * marks the present choice")
-    config = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
+    values = plain(OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"]))
     head = "Options, NAME=VALUE, with their present values; null means none"
-    parts = [words(name), *choices, head, "\n".join(_options(_root_, plain(config)))]
+    parts = [words(name), *choices, head, "\n".join(_options(config, values))]
     place = re.sub(r"\d{4}(-\d\d){2}_\d\d(-\d\d){2}", "TIME", hydra.run.dir)
     flags = {"hydra.run.dir=FOLDER": f"folder of the results; the default is {place}", **_FLAGS}
     parts.append("\n".join(["Running", *(_row(*flag) for flag in flags.items())]))
-    return "\n\n".join(parts).replace("$", "$$")
+    return "\n\n".join(parts)
 
 
 def first_comment(path: Path) -> str:

@@ -9,11 +9,10 @@ import math
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import is_dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
-from hydra.core.global_hydra import GlobalHydra
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -21,7 +20,6 @@ from hydra.errors import (
     HydraException,
     MissingConfigException,
     OverrideParseException,
-    SearchPathException,
 )
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
@@ -31,22 +29,23 @@ from omegaconf.errors import (
     ValidationError,
 )
 
-from nnode.app.cli.saved import composed
 from nnode.app.cli.typed import group_defaults
 from nnode.errors import ConfigError, suggestion
 from nnode.program import configuration
 
+#: Hydra's option for folders with further choices.
+SEARCH_PATH = "hydra.searchpath"
 #: OmegaConf's name of a type to the description of the expected value.
 _KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
 _BOUNDS = {"low": "at least", "high": "at most"}
 
 
-def in_words(error: Exception, name: str, overrides: list[str], flags: list[str]) -> ConfigError:
+def in_words(error: Exception, name: str, overrides: list[str]) -> ConfigError:
     """The package's error for an error of Hydra or OmegaConf in the composition of a command line.
 
     Args:
         name: name of the command.
-        overrides, flags: the typed overrides and flags.
+        overrides: the typed overrides.
     """
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     message = _first_line(cause)
@@ -60,8 +59,6 @@ def in_words(error: Exception, name: str, overrides: list[str], flags: list[str]
         group, _, chosen = str(error.missing_cfg_file).removesuffix(".yaml").rpartition("/")
         names = (str(choice) for choice in error.options or ())
         return unknown_choice(group, chosen, [n for n in names if not n.endswith("_schema")])
-    if isinstance(error, SearchPathException):
-        return ConfigError(f"{message}; name a folder that is there with --config-dir")
     if ambiguous := re.match(r"Ambiguous value for argument '(.*)'$", message):
         key, _, values = ambiguous[1].partition("=")
         return ConfigError(
@@ -77,11 +74,11 @@ def in_words(error: Exception, name: str, overrides: list[str], flags: list[str]
     key = undeletable[1] if undeletable else str(getattr(cause, "full_key", None) or "")
     if isinstance(cause, ValidationError):
         override = _typed_for(key, overrides)
-        return wrong_value(key, override, message, _composed(name, overrides, flags))
+        return wrong_value(key, override, message, _composed(name, overrides))
     missing = re.match(r"(?:Could not override|Key) '([^']*)'", str(error))
     if (undeletable or missing) and (key or missing):
         override = _typed_for(key or str(missing and missing[1]), overrides)
-        return unknown_option(override, _composed(name, overrides, flags), name)
+        return unknown_option(override, _composed(name, overrides), name)
     return without_value(cause)
 
 
@@ -174,7 +171,7 @@ def wrong_value(key: str, override: str, message: str, config: DictConfig | None
         expected = f"{key} has options of its own{has}; type {key}.NAME=VALUE, --help shows them"
     elif "None" in message or "not Optional" in message:
         expected = "null is no value of this option; leave it out"
-    elif "is not a ListConfig" in message:
+    elif "ListConfig" in message:
         expected = f"expected a list, such as [{value}]"
     else:
         expected = message
@@ -270,7 +267,7 @@ def _typed_for(key: str, overrides: list[str]) -> str:
     return key
 
 
-def _composed(name: str, overrides: list[str], flags: list[str]) -> DictConfig | None:
+def _composed(name: str, overrides: list[str]) -> DictConfig | None:
     """The configuration of the choices among the overrides, without other overrides."""
     parser = OverridesParser.create()
     kept: list[str] = []
@@ -279,14 +276,12 @@ def _composed(name: str, overrides: list[str], flags: list[str]) -> DictConfig |
             parsed = parser.parse_override(text)
         except HydraException:
             continue
-        if (configuration() / parsed.key_or_group).is_dir() and parsed.input_line:
+        if parsed.key_or_group == SEARCH_PATH:
+            kept.append(text)
+        elif (configuration() / parsed.key_or_group).is_dir():
             kept.append(f"{parsed.get_key_element()}={_first(parsed)}")
-    for before, flag in pairwise(flags):
-        if before in ("--config-dir", "-cd"):
-            kept.append(f"hydra.searchpath=[file://{Path(flag).absolute()}]")
     try:
-        GlobalHydra.instance().clear()
-        return composed(name, kept)
+        return compose(name, kept, return_hydra_config=True)
     except Exception:  # a second mistake, which is reported after the first one is corrected
         return None
 

@@ -8,24 +8,22 @@ import signal
 import sys
 import tempfile
 import warnings
+from argparse import ArgumentError, ArgumentParser, Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
-from itertools import pairwise
 from pathlib import Path
-from unittest.mock import patch
 
-import hydra
+from hydra import initialize_config_dir
 from hydra._internal.hydra import Hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from nnode.app.cli.help import help_text
-from nnode.app.cli.mistakes import in_words, refuse_added, without_value
+from nnode.app.cli.mistakes import SEARCH_PATH, in_words, refuse_added, without_value
 from nnode.app.cli.prepared import prepared_group
 from nnode.app.cli.runs import RESULT, end, failures, say
 from nnode.app.cli.typed import literal
@@ -39,17 +37,13 @@ from nnode.version import VERSION
 
 Job = Callable[[DictConfig, Path], None]
 
-#: Supported flags of Hydra, and those with a value, with the allowed values.
-_FLAGS = ("-h", "--help", "-m", "--multirun", "--version", "--resolve")
-_CFG = ("job", "hydra", "all")
-_VALUED: dict[str, tuple[str, ...]] = {
-    "-c": _CFG,
-    "--cfg": _CFG,
-    "-p": (),
-    "--package": (),
-    "-cd": (),
-    "--config-dir": (),
-}
+#: Supported flags of Hydra. All other words are overrides.
+_PARSER = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+for _names in (("-h", "--help"), ("-m", "--multirun"), ("--version",), ("--resolve",)):
+    _PARSER.add_argument(*_names, action="store_true")
+_PARSER.add_argument("-c", "--cfg", choices=("job", "hydra", "all"))
+_PARSER.add_argument("-p", "--package")
+_PARSER.add_argument("-cd", "--config-dir", type=Path)
 
 
 def run(
@@ -72,42 +66,54 @@ def run(
     """
     if started_together() and not parallel and os.environ["RANK"] != "0":
         return
-    if "--version" in sys.argv[1:]:
-        print(f"nnode {VERSION}")
-        return
-    if {"-h", "--help"} & set(sys.argv) and hasattr(signal, "SIGPIPE"):
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # a reader such as head may close the pipe
     register()
     # on a full disk, errors of the log must not hide the run's error
     logging.raiseExceptions = False
     running(name)
-    OmegaConf.register_new_resolver("nnode_help", partial(help_text, name), replace=True)
     try:
         if parallel:
             join()
         with World().together():
-            given, flags = _parted(bare)
+            flags, given = _parsed(bare)
             extra = prepared_group(given)
             given = [*extra, *(inject([*given, *extra]) if inject else []), *given]
     except NNodeError as error:
         end(error)
+    if flags.version:
+        print(f"nnode {VERSION}")
+        return
     GlobalHydra.instance().clear()  # a forked process inherits the state
-    # Hydra raises its errors instead of printing them, and makes no list of groups for the help,
-    # which takes it 8 s and is not printed
-    with (
-        patch.dict(os.environ, {"HYDRA_FULL_ERROR": "1"}),
-        patch.object(Hydra, "format_config_groups", return_value=""),
-        _out_of_sight() as places,
-    ):
-        sys.argv[1:] = [*given, *places, *flags]
-        command = hydra.main(version_base="1.3", config_path=str(configuration()), config_name=name)
+    folder = str(configuration().absolute())
+    with initialize_config_dir(folder, name, "1.3"), _out_of_sight() as places:
+        hydra = GlobalHydra.instance().hydra
+        assert hydra is not None
         try:
-            command(_task(job, name))()
+            _execute(hydra, name, flags, [*given, *places], _task(job, name))
         except (HydraException, OmegaConfBaseException) as error:
-            end(in_words(error, name, given, flags))
+            end(in_words(error, name, given))
     World().leave()
     if failures():
         sys.exit(1)
+
+
+def _execute(
+    hydra: Hydra,
+    name: str,
+    flags: Namespace,
+    overrides: list[str],
+    task: Callable[[DictConfig], None],
+) -> None:
+    """Show what the flags request, or run the job, or all jobs of a sweep."""
+    if flags.help:
+        if hasattr(signal, "SIGPIPE"):  # a reader such as head may close the pipe
+            signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        print(help_text(name, hydra.compose_config(name, overrides, RunMode.RUN)))
+    elif flags.cfg:
+        hydra.show_cfg(name, overrides, flags.cfg, flags.package, flags.resolve)
+    elif flags.multirun:
+        hydra.multirun(name, task, [*overrides, "hydra.mode=MULTIRUN"])
+    else:
+        hydra.run(name, task, [*overrides, "hydra.mode=RUN"])
 
 
 def _task(job: Job, name: str) -> Callable[[DictConfig], None]:
@@ -141,50 +147,45 @@ def _task(job: Job, name: str) -> Callable[[DictConfig], None]:
     return task
 
 
-def _parted(bare: str | None) -> tuple[list[str], list[str]]:
-    """The overrides and the flags of the command line, since Hydra needs contiguous overrides.
+def _parsed(bare: str | None) -> tuple[Namespace, list[str]]:
+    """The flags and the overrides of the command line.
 
     Raises:
-        ConfigError: a word is neither an override nor a flag.
+        ConfigError: a word is neither an override nor a flag, or a flag's value is wrong.
     """
-    overrides, flags = [], []
-    for before, word in pairwise(["", *sys.argv[1:]]):
-        if before in _VALUED:
-            if _VALUED[before] and word not in _VALUED[before]:
-                raise ConfigError(f"{before} {word}: expected one of {', '.join(_VALUED[before])}")
-            flags.append(word)
-        elif word[:1] == "~" or ("=" in word and word[0] != "-"):
-            if not word.lstrip("+~").partition("=")[0].strip():
+    try:
+        flags, words = _PARSER.parse_known_args()
+    except ArgumentError as error:
+        raise ConfigError(f"{error}; --help shows examples") from error
+    overrides = []
+    for word in words:
+        key, equals, value = word.partition("=")
+        if word[:1] == "-":
+            raise _unknown_flag(key, value, flags)
+        if equals or word[:1] == "~":
+            if not key.lstrip("+~").strip():
                 raise ConfigError(f"{word} names no option: expected NAME=VALUE")
             overrides.append(word)
-        elif word[:1] == "-":
-            flags.append(_flag(word))
-        elif not word:
-            raise ConfigError("an empty word is no option: expected NAME=VALUE")
-        elif bare is None:
-            raise ConfigError(f"{word} is no option: expected NAME=VALUE, --help shows examples")
+        elif bare is None or not word:
+            shown = word or "an empty word"
+            raise ConfigError(f"{shown} is no option: expected NAME=VALUE, --help shows examples")
         else:
             overrides.append(f"{bare}={literal(word)}")
             bare = None
-    if len(sys.argv) > 1 and sys.argv[-1] in _VALUED:
-        raise ConfigError(f"{sys.argv[-1]} lacks its value; --help shows examples")
-    return overrides, flags
+    if (folder := flags.config_dir) is not None:
+        if not folder.is_dir():
+            raise ConfigError(f"--config-dir {folder}: there is no such folder; give another one")
+        overrides.append(f"{SEARCH_PATH}={literal([f'file://{folder.absolute()}'])}")
+    return flags, overrides
 
 
-def _flag(word: str) -> str:
-    """Check a flag.
-
-    Raises:
-        ConfigError: the flag does not exist.
-    """
-    name, _, value = word.partition("=")
-    if word in _FLAGS or name in _VALUED:
-        return word
-    if value and name not in _FLAGS:
-        raise ConfigError(f"{word}: options have no dashes; type {word.lstrip('-')}")
-    flags = [flag for flag in (*_FLAGS, *_VALUED) if flag.startswith("--")]
-    hint = suggestion(name, flags, cutoff=0.7) or ";"
-    raise ConfigError(f"there is no flag {word}{hint} --help shows all options and flags")
+def _unknown_flag(name: str, value: str, flags: Namespace) -> ConfigError:
+    if value:
+        option = f"{name.lstrip('-')}={value}"
+        return ConfigError(f"{name}={value}: options have no dashes; type {option}")
+    available = [f"--{flag.replace('_', '-')}" for flag in vars(flags)]
+    hint = suggestion(name, available, cutoff=0.7) or ";"
+    return ConfigError(f"there is no flag {name}{hint} --help shows all options and flags")
 
 
 @contextmanager

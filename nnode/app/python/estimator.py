@@ -28,6 +28,7 @@ from nnode.app.python.inputs import (
 from nnode.app.training import (
     build_solver,
     check,
+    check_domain,
     model_of,
     set_threads,
     threads_given_back,
@@ -254,11 +255,7 @@ class Calibrator:
         if not isinstance(self.model, System):
             return model_of(config)
         model = copy.deepcopy(self.model)
-        if model.domain != given.domain:
-            raise ConfigError(
-                f"this is a {model.domain} model, and these are {given.domain} data; choose both "
-                "of one domain"
-            )
+        check_domain(model, str(config.model.name), given.domain, str(config.data.name))
         add_effects(model, self.effects)
         set_threads(None, model.domain)
         return model

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as ListLike
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any, cast
 
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException, ValidationError
+from omegaconf.errors import ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
 from nnode.app.cli.mistakes import unknown_option, wrong_value
 from nnode.app.cli.saved import options_of, plain
@@ -60,29 +62,21 @@ def merged(section: str, schema: Any, *given: Mapping[str, Any]) -> DictConfig:
     Raises:
         ConfigError: an unknown option, or a value of the wrong type.
     """
-    try:
-        return cast(DictConfig, OmegaConf.merge(OmegaConf.structured(schema), *given))
-    except OmegaConfBaseException as error:
-        message = str(error).splitlines()[0]
-        key = str(error.full_key or _culprit(schema, given))
-        config = OmegaConf.create({section: OmegaConf.structured(schema)})
-        if not isinstance(error, ValidationError):
-            raise unknown_option(f"{section}.{key}", config, "nnode", "") from error
-        full, value = f"{section}.{key}", OmegaConf.select(OmegaConf.merge(*given), key)
-        raise wrong_value(full, f"{full}={value}", message, config) from error
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{section}: {str(error).splitlines()[0]}") from error
-
-
-def _culprit(schema: Any, given: tuple[Mapping[str, Any], ...]) -> str:
-    """The option whose value has the wrong type; empty for none."""
-    for options in given:
-        for key, value in options.items():
+    options = OmegaConf.structured(schema)
+    for values in given:
+        plain_values = OmegaConf.to_container(values) if OmegaConf.is_config(values) else values
+        for key, value in cast(Mapping[str, Any], plain_values).items():
             try:
-                OmegaConf.merge(OmegaConf.structured(schema), {key: value})
-            except OmegaConfBaseException:
-                return str(key)
-    return ""
+                options.merge_with({key: value})
+            except OmegaConfBaseException as error:
+                path = str(error.full_key or key)
+                full, config = f"{section}.{path}", OmegaConf.create({section: options})
+                if isinstance(error, ConfigKeyError):
+                    raise unknown_option(full, config, "nnode", "") from error
+                culprit = reduce(getitem, path.split(".")[1:], value)
+                message = str(error).splitlines()[0]
+                raise wrong_value(full, f"{full}={culprit}", message, config) from error
+    return cast(DictConfig, options)
 
 
 def choice(

@@ -22,7 +22,7 @@ SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py"))
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_help_names_purpose_choices_options_and_results(name: str) -> None:
     config = composed(name)
-    text = help_text(name, _root_=config)
+    text = help_text(name, config)
     assert text.splitlines()[0].endswith(".")
     assert "\nExamples:\n" in text
     assert "\nResults: " in text

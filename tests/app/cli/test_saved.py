@@ -40,8 +40,8 @@ def checkpoint(folder: Path, **groups: object) -> Path:
 def test_groups_are_files_of_the_configuration(tmp_path: Path) -> None:
     own = {"model": "idm", "data": "table", "optimizer": "gauss_newton", "solver": "fused"}
     path = checkpoint(tmp_path, **own)
-    found = saved_groups([f"resume={path}"], "resume")
-    assert found == [f"{group}={name}" for group, name in own.items()]
+    result = saved_groups([f"resume={path}"], "resume")
+    assert result == [f"{group}={name}" for group, name in own.items()]
     for group, name in own.items():
         assert name in choices(group)
     assert saved_groups([f"resume={path}", "data=esimas"], "resume", ("data",)) == []

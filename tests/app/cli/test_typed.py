@@ -61,9 +61,9 @@ def test_a_value_is_read_as_it_was(value: Any) -> None:
     config = OmegaConf.create({"option": None})
     with open_dict(config):
         config.option = plain(override.value())
-    found = OmegaConf.to_container(config)["option"]  # type: ignore[index, call-overload]
-    assert found == value
-    assert type(found) is type(value)
+    result = OmegaConf.to_container(config)["option"]  # type: ignore[index, call-overload]
+    assert result == value
+    assert type(result) is type(value)
 
 
 def plain(value: Any) -> Any:

@@ -48,15 +48,15 @@ def idm(tidy: pd.DataFrame) -> nnode.Calibration:
 
 def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
     # the method of stepping that the pairs are made with
-    found = nnode.Calibrator("idm", method="ballistic").fit(pairs(number=6, seconds=30.0))
+    calibrator = nnode.Calibrator("idm", method="ballistic").fit(pairs(number=6, seconds=30.0))
     for name, value in TRUE.items():
-        row = found.parameters_.loc[f"idm.{name}"]
+        row = calibrator.parameters_.loc[f"idm.{name}"]
         assert row["estimate"] == pytest.approx(value, rel=1e-4)
         assert row["lower"] <= value * (1 + 1e-4)
         assert row["upper"] >= value * (1 - 1e-4)
-    assert found.parameters_.unit["idm.T"] == "s"
-    assert found.result_.clusters == 6
-    assert found.score(pairs(number=2, seconds=20.0, seed=5)) == pytest.approx(0, abs=1e-3)
+    assert calibrator.parameters_.unit["idm.T"] == "s"
+    assert calibrator.result_.clusters == 6
+    assert calibrator.score(pairs(number=2, seconds=20.0, seed=5)) == pytest.approx(0, abs=1e-3)
 
 
 @pytest.mark.thorough
@@ -102,16 +102,16 @@ def test_the_command_finds_the_same_to_the_last_digits(
         f"hydra.run.dir={tmp_path}",
     )
     written = json.loads((tmp_path / "result.json").read_text())
-    found = nnode.Calibrator(**given, heldout=0.2, seed=3).fit(tidy)
-    ours = found.result_.plain(written["paths"])
+    calibrator = nnode.Calibrator(**given, heldout=0.2, seed=3).fit(tidy)
+    ours = calibrator.result_.plain(written["paths"])
     assert set(ours) == set(written)
     del ours["summary"]["seconds"], written["summary"]["seconds"]
     assert _numbers(ours) == pytest.approx(_numbers(written), rel=1e-12, abs=0, nan_ok=True)
-    assert found.cost_ == pytest.approx(written["summary"]["cost_train"], rel=1e-12)
-    assert found.n_iter_ == written["history"][-1]["epoch"]
-    assert found.result_.summary() in done.stdout
+    assert calibrator.cost_ == pytest.approx(written["summary"]["cost_train"], rel=1e-12)
+    assert calibrator.n_iter_ == written["history"][-1]["epoch"]
+    assert calibrator.result_.summary() in done.stdout
     assert "not in compiled code" not in done.stdout + done.stderr
-    own, path = found.result_.own, tmp_path / "own_parameters.csv"
+    own, path = calibrator.result_.own, tmp_path / "own_parameters.csv"
     assert (own is not None) == path.exists() == ("pooling" in given)
     if own is not None:
         pd.testing.assert_frame_equal(own, pd.read_csv(path, keep_default_na=False))
@@ -175,8 +175,8 @@ def test_a_fit_leaves_its_arguments_and_torch_as_they_were(tidy: pd.DataFrame) -
 def test_the_same_fit_twice_is_the_same_also_of_a_copy(
     tidy: pd.DataFrame, fitted: nnode.Calibrator
 ) -> None:
-    again = nnode.Calibrator(**fitted.get_params()).fit(list(nnode.sequences(tidy)))
-    assert again.parameters_.equals(fitted.parameters_)
+    repeated = nnode.Calibrator(**fitted.get_params()).fit(list(nnode.sequences(tidy)))
+    assert repeated.parameters_.equals(fitted.parameters_)
     copied = pickle.loads(pickle.dumps(fitted))
     assert copied.score(tidy) == fitted.score(tidy)
     assert copied.get_params() == fitted.get_params()
@@ -302,12 +302,12 @@ def test_published_pairs_are_calibrated(
 ) -> None:
     """Intervals are finite and hold what others published of the same pairs."""
     given = nnode.sequences(real_data / file, data="pairs", columns=columns)
-    found = nnode.Calibrator("idm").fit(given).parameters_
-    free = found[found.at_bound == ""]
+    result = nnode.Calibrator("idm").fit(given).parameters_
+    free = result[result.at_bound == ""]
     assert set(free.index) >= {"idm.T", "idm.s0", "idm.a", "idm.b"}
     assert np.isfinite(free[["lower", "upper"]].to_numpy(dtype=float)).all()
     for name, value in (("idm.T", T), ("idm.s0", s0)):
-        assert found.lower[name] < value < found.upper[name]
+        assert result.lower[name] < value < result.upper[name]
 
 
 def test_one_call_calibrates_with_some_held_out(idm: nnode.Calibration) -> None:
@@ -318,9 +318,9 @@ def test_one_call_calibrates_with_some_held_out(idm: nnode.Calibration) -> None:
 
 def test_models_bear_the_names_of_the_configuration() -> None:
     own = {"lin", "log", "n2", "n4", "n10", "formula", "sf", "nn"}
-    known = choices("model")
-    assert own | set(CAR_FOLLOWING_LAWS) | set(PEDESTRIAN_LAWS) == set(known)
-    assert all(model_options(name)["name"] == name for name in known)
+    expected = choices("model")
+    assert own | set(CAR_FOLLOWING_LAWS) | set(PEDESTRIAN_LAWS) == set(expected)
+    assert all(model_options(name)["name"] == name for name in expected)
     with pytest.raises(ConfigError, match="model=lwr is unknown, expected one of a10, a2"):
         model_options("lwr")
 

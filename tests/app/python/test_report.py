@@ -24,7 +24,7 @@ ALONE = app.DiscoverOptions(page=False, compare=[])
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> nnode.Report:
+def result(tmp_path_factory: pytest.TempPathFactory) -> nnode.Report:
     """Of results made by hand."""
     table = lane(tmp_path_factory.mktemp("lane") / "lane.csv", sequences=4, seconds=3.0, cars=3)
     with pytest.MonkeyPatch.context() as patch:
@@ -32,11 +32,11 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> nnode.Report:
         return nnode.diagnose(table, options=ALONE)
 
 
-def test_what_was_named_is_a_table(found: nnode.Report) -> None:
-    assert found.verdict == "named"
-    rows = found.to_dataframe()
-    assert set(rows.effect) == {effect.name for effect in [*found.effects, *found.leads]}
-    first = found.effects[0]
+def test_what_was_named_is_a_table(result: nnode.Report) -> None:
+    assert result.verdict == "named"
+    rows = result.to_dataframe()
+    assert set(rows.effect) == {effect.name for effect in [*result.effects, *result.leads]}
+    first = result.effects[0]
     (name, value), *_ = first.coefficients.items()
     row = rows[(rows.effect == first.name) & (rows.coefficient == name)].iloc[0]
     assert (row.estimate, row.lower, row.upper, row.unit) == (
@@ -46,21 +46,21 @@ def test_what_was_named_is_a_table(found: nnode.Report) -> None:
         value.unit,
     )
     assert row.named
-    assert [effect.name for effect in effects_of(found.model)] == [e.name for e in found.effects]
-    assert found.plain()["verdict"] == "named"
+    assert [effect.name for effect in effects_of(result.model)] == [e.name for e in result.effects]
+    assert result.plain()["verdict"] == "named"
 
 
-def test_a_notebook_shows_the_sentence_and_the_table(found: nnode.Report) -> None:
-    page = found._repr_html_()
+def test_a_notebook_shows_the_sentence_and_the_table(result: nnode.Report) -> None:
+    page = result._repr_html_()
     assert "<b>named</b>: The model lin lacks" in page
-    assert f"<td>{found.effects[0].name}</td>" in page
-    assert repr(found).startswith("named: The model lin lacks")
+    assert f"<td>{result.effects[0].name}</td>" in page
+    assert repr(result).startswith("named: The model lin lacks")
 
 
-def test_coefficients_are_a_labelled_array(found: nnode.Report) -> None:
+def test_coefficients_are_a_labelled_array(result: nnode.Report) -> None:
     pytest.importorskip("xarray")
-    told = found.to_xarray()
-    row = found.to_dataframe().iloc[0]
+    told = result.to_xarray()
+    row = result.to_dataframe().iloc[0]
     assert float(told.estimate.sel(coefficient=f"{row.effect}.{row.coefficient}")) == row.estimate
     assert told.attrs["verdict"] == "named"
 
@@ -68,12 +68,12 @@ def test_coefficients_are_a_labelled_array(found: nnode.Report) -> None:
 @pytest.mark.thorough
 def test_nothing_missing_is_an_empty_table() -> None:
     frame = as_table(platoons(number=14, seconds=8.0))
-    found = nnode.diagnose(frame, "traffic", model="lin", options=ALONE)
-    assert found.verdict == "none"
-    assert found.effects == []
-    assert found.to_dataframe().empty
-    assert "<table" not in found._repr_html_()
-    (panel, *_) = found.plot().axes
+    result = nnode.diagnose(frame, "traffic", model="lin", options=ALONE)
+    assert result.verdict == "none"
+    assert result.effects == []
+    assert result.to_dataframe().empty
+    assert "<table" not in result._repr_html_()
+    (panel, *_) = result.plot().axes
     assert panel.get_ylabel() == "position along the lane (m)"
 
 
@@ -99,14 +99,14 @@ def test_a_data_frame_is_kept_as_a_table_for_the_commands_that_the_report_tells(
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "table.parquet"), frame)
 
 
-def test_a_report_is_summarised(found: nnode.Report) -> None:
-    text = found.summary()
-    assert text.splitlines()[0] == found.sentence
-    for effect in found.effects:
+def test_a_report_is_summarised(result: nnode.Report) -> None:
+    text = result.summary()
+    assert text.splitlines()[0] == result.sentence
+    for effect in result.effects:
         assert all(f"{effect.name}.{name}" in text for name in effect.coefficients)
 
 
-def test_a_report_draws_its_figures(found: nnode.Report) -> None:
-    assert found.plot("coefficients").axes
+def test_a_report_draws_its_figures(result: nnode.Report) -> None:
+    assert result.plot("coefficients").axes
     with pytest.raises(ConfigError, match="there is no figure 'heat'; this diagnosis has "):
-        found.plot("heat")
+        result.plot("heat")

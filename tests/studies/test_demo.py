@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from nnode.app.demo import demo
+from studies.demo.study import demo
 
 
 @pytest.mark.thorough
