@@ -103,7 +103,7 @@ def page(
         for store in stores
         for file in store.manifest["files"].values()
     }
-    return [*blocks, Provenance(hashes)]
+    return [*blocks, Provenance(hashes)] if hashes else blocks
 
 
 def _line(text: str) -> str:

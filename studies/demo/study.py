@@ -102,20 +102,16 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
     )
     blocks = page(
         "demo",
-        {
-            "rows": table.head(3),
-            "findings": pd.DataFrame(findings, columns=["level", "kind", "finding"]),
-            "estimates": estimates,
-            "scipy": compared,
-            "effects": effects,
-            "absences": _absences(nothing),
-        },
-        {
-            "map": _map(report, truth),
-            "law": law,
-            "sealed": report.plot("sealed"),
-            "force": force,
-        },
+        rows=table.head(3),
+        findings=pd.DataFrame(findings, columns=["level", "kind", "finding"]),
+        estimates=estimates,
+        scipy=compared,
+        effects=effects,
+        absences=_absences(nothing),
+        deviations=_map(report, truth),
+        law=law,
+        errors_by_platoon=report.plot("sealed"),
+        force=force,
         truth=truth,
         report=report,
         nothing=nothing,
@@ -203,7 +199,7 @@ def _estimates(run: nnode.Calibration, truth: SlowZone) -> pd.DataFrame:
     )
 
 
-def _with_truth(rows: dict[str, tuple[float, float, float, float]]) -> pd.DataFrame:
+def _with_truth(rows: dict[str, tuple[Any, ...]]) -> pd.DataFrame:
     """Truth, estimate and interval by name; ``covered`` is a dash without an interval."""
     table = pd.DataFrame(rows, index=["truth", "estimate", "lower", "upper"], dtype=float).T
     inside = (table["lower"] <= table["truth"]) & (table["truth"] <= table["upper"])
