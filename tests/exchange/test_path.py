@@ -17,16 +17,18 @@ import pandas as pd
 import pytest
 
 from benchmarks.programs.sumo import network
-from nnode.model.effects.lane import EDGE
+from nnode.model.effects.lane import SpeedZone
 from tests.app.following import LONG, STEP, TRUE, idm
 from tests.app.test_replay import held, tracks
 from tests.installed import ROOT, Run, built, installed
 
 #: From and to, m, and the desired speed in between, of that elsewhere.
 ZONE, SLOWER = (400.0, 550.0), 0.55
+#: Width of the edges of the catalogue's effect, m.
+EDGE = SpeedZone.rules[1].constants["edge"][0]
 #: The zone of the catalogue's effect begins and ends over some metres, that of the table at once:
 #: lengths, and what goes with them, may differ by this share.
-SHARE = EDGE["m"] / (ZONE[1] - ZONE[0])
+SHARE = EDGE / (ZONE[1] - ZONE[0])
 #: Where the scenario's first vehicle begins, m, and its speed, m/s.
 START, SPEED = 50.0, 20.0
 #: s; what the whole may take.
@@ -137,7 +139,7 @@ def test_the_diagnosis_finds_the_zone(work: Path) -> None:
     (effect,) = result["effects"]
     assert effect["name"] == "speed_zone"
     value = {name: one["value"] for name, one in effect["coefficients"].items()}
-    assert (value["a"], value["b"]) == pytest.approx(ZONE, abs=EDGE["m"])
+    assert (value["a"], value["b"]) == pytest.approx(ZONE, abs=EDGE)
     assert 1 - value["alpha"] == pytest.approx(1 - SLOWER, rel=SHARE)
 
 
@@ -157,7 +159,7 @@ def test_the_page_of_motion_holds_the_table(work: Path) -> None:
         far = np.sort(tracks(simulated["x"]), 0) - np.sort(own, 0)
         assert np.sqrt((far**2).mean()) < 1.0
     (zone,) = page["zones"]
-    assert zone["x"] == pytest.approx(ZONE, abs=EDGE["m"])
+    assert zone["x"] == pytest.approx(ZONE, abs=EDGE)
 
 
 def test_vehicles_in_sumo_are_slow_in_the_zone(work: Path) -> None:
