@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import logging
 import os
 import resource
 import sys
 import time
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from functools import partial
@@ -20,11 +22,12 @@ from pathlib import Path
 from typing import Any
 from unicodedata import category
 
+import torch
 from hypothesis import HealthCheck, given, seed, settings
 
 from benchmarks.fault_injection.child import Child
 from benchmarks.fault_injection.row import Row
-from benchmarks.fault_injection.targets import OUTSIDE, Target, quiet
+from benchmarks.fault_injection.targets import OUTSIDE, Target
 from nnode.errors import LONGEST, NNodeError
 
 #: Bytes of address space that a child may take beyond what it has when it starts.
@@ -116,7 +119,10 @@ def fuzz(targets: list[Target], scratch: Path, inputs: int, number: int) -> Iter
 def _work(target: Target, inputs: int, number: int, scratch: Path, counts: Path) -> None:
     """The child: all inputs of a target; it ends with an error where one is a loss."""
     sys.dont_write_bytecode = True
-    quiet()
+    torch.set_num_threads(1)
+    # words of the libraries would cost more than the reading
+    logging.disable(logging.CRITICAL)
+    warnings.simplefilter("ignore")
     faulthandler.enable()
     address = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (address + ROOM, address + ROOM))

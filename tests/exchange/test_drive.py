@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.programs import laws
 from benchmarks.programs import sumo as by_sumo
+from benchmarks.programs.laws import LAWS
 from benchmarks.programs.sumo import SLOWLY
 from nnode.app.python.inputs import model_options
 from nnode.data.readers.sumo import SumoOptions, read_sumo
@@ -137,7 +137,8 @@ def test_idm_in_ballistic_steps(sumo: Path, program: str, tmp_path: Path) -> Non
 def test_where_no_step_ends_at_rest_ballistic_steps_are_the_same(
     sumo: Path, program: str, tmp_path: Path
 ) -> None:
-    system = model({"term": "formula", "name": "own", "law": laws.IDM})  # brakes by v/dt at most
+    # brakes by v/dt at most
+    system = model({"term": "formula", "name": "own", "law": LAWS["sumo_idm"]})
     _, seen = driven(system, sumo, program, tmp_path, ballistic=True)
     assert apart(system, seen, "ballistic") < ROUNDED
 
