@@ -37,31 +37,27 @@ SLOW = 10
 #: What a message must not hold: control and format characters, surrogates, separators of lines.
 _HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
-_STARTS = frozenset(
-    {
-        "os.system",
-        "os.exec",
-        "os.posix_spawn",
-        "os.spawn",
-        "subprocess.Popen",
-        "os.fork",
-        "os.forkpty",
-        "socket.connect",
-        "pty.spawn",
-    }
+#: Beginnings of the names of audit events that start a program, and of those that write.
+_STARTS = (
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.spawn",
+    "os.fork",
+    "subprocess.Popen",
+    "socket.connect",
+    "pty.spawn",
 )
-_WRITES = frozenset(
-    {
-        "os.mkdir",
-        "os.rename",
-        "os.remove",
-        "os.rmdir",
-        "os.link",
-        "os.symlink",
-        "os.truncate",
-        "shutil.move",
-        "shutil.rmtree",
-    }
+_WRITES = (
+    "os.mkdir",
+    "os.rename",
+    "os.remove",
+    "os.rmdir",
+    "os.link",
+    "os.symlink",
+    "os.truncate",
+    "shutil.move",
+    "shutil.rmtree",
 )
 
 
@@ -76,18 +72,18 @@ class _Watch:
     def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
         if not self.reading:
             return
-        if event in _STARTS:
+        if event.startswith(_STARTS):
             self.events.append(f"{event} {arguments[:1]!r}"[:200])
-        elif event in _WRITES or (event == "open" and self._writes(arguments)):
-            for path in arguments[:2] if event in ("os.rename", "shutil.move") else arguments[:1]:
+        elif event in _WRITES or (event == "open" and self._writes(*arguments)):
+            # the second argument of other events is no path
+            for path in arguments[: 2 if event in ("os.rename", "shutil.move") else 1]:
                 if isinstance(path, str | bytes | os.PathLike):
                     place = os.path.abspath(os.fsdecode(path))
                     if not place.startswith((self.folder, "/dev/null")):
                         self.events.append(f"{event} {place}"[:200])
 
     @staticmethod
-    def _writes(arguments: tuple[Any, ...]) -> bool:
-        _, mode, flags = arguments
+    def _writes(_: Any, mode: Any, flags: Any) -> bool:
         if isinstance(mode, str):
             return any(sign in mode for sign in "wax+")
         return isinstance(flags, int) and bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
