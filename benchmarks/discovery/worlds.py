@@ -100,7 +100,7 @@ def evaluate(program: str, scene: str, seed: int, law: str = "") -> dict[str, li
     report, nearest = diagnosis.plain(), diagnosis.nearest
     best_law = (report["laws_again"] or report["laws"])["ranking"][0]["name"]
     if program == "laws":
-        answer: dict[str, Any] = {"first": (scene,), "allowed": allowed(scene, best_law)}
+        answer = {"first": (scene,), "allowed": allowed(scene, best_law)}
     else:
         answer = SCENES[program][scene]["answer"]
     row = {"program": program, "scene": scene, "seed": seed}

@@ -138,7 +138,7 @@ class TrafficCase(Subject):
         away = np.diff(measured[:, :, -1], axis=1)[:, k]
         dt = self.case.size[2]
         simulated, _ = simulate(
-            Base(*map(float, parameters), self.law.logarithmic),  # type: ignore[call-arg, call-overload]
+            Base(*map(float, parameters), self.law.logarithmic),  # type: ignore[call-overload]
             hidden,
             own,
             (measured[:, k, -1] + away * (half - k), away / dt),

@@ -253,7 +253,7 @@ def simulate(
     """
     arrays = [np.ascontiguousarray(a, dtype=float) for a in (own, *lead, *past, kick)]
     paths = [
-        _platoon(base, hidden, *each, float(time), since, step)  # type: ignore[call-arg]
+        _platoon(base, hidden, *each, float(time), since, step)
         for *each, time in zip(*arrays, clock, strict=True)
     ]
     x, v = (np.stack(parts)[:, ::every] for parts in zip(*paths, strict=True))
