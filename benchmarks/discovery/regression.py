@@ -11,7 +11,9 @@ nothing.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,6 +30,7 @@ _RIDGES = (0.05, 0.5)
 _OWN = 1e-8
 
 
+@dataclass(frozen=True)
 class Library:
     """Columns to choose from.
 
@@ -42,17 +45,25 @@ class Library:
         y: ``(n,)`` the same of the target.
     """
 
-    def __init__(
-        self, columns: np.ndarray, target: np.ndarray, base: np.ndarray, cluster: np.ndarray
-    ) -> None:
-        self.columns, self.target, self.base, self.cluster = columns, target, base, cluster
-        basis = np.linalg.svd(base, full_matrices=False)[0]
-        x = columns - basis @ (basis.T @ columns)
-        y = target - basis @ (basis.T @ target)
+    columns: np.ndarray
+    target: np.ndarray
+    base: np.ndarray
+    cluster: np.ndarray
+    x: np.ndarray = field(init=False)
+    y: np.ndarray = field(init=False)
+    usable: np.ndarray = field(init=False)
+    scale: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        basis = np.linalg.svd(self.base, full_matrices=False)[0]
+        x = self.columns - basis @ (basis.T @ self.columns)
+        y = self.target - basis @ (basis.T @ self.target)
         norm, length = np.linalg.norm(x, axis=0), np.linalg.norm(y)
-        self.usable = norm > _OWN * np.linalg.norm(columns, axis=0)
-        self.x, self.y = x[:, self.usable] / norm[self.usable], y / length
-        self.scale = length / norm[self.usable]
+        usable = norm > _OWN * np.linalg.norm(self.columns, axis=0)
+        object.__setattr__(self, "x", x[:, usable] / norm[usable])
+        object.__setattr__(self, "y", y / length)
+        object.__setattr__(self, "usable", usable)
+        object.__setattr__(self, "scale", length / norm[usable])
 
     def folds(self, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Rows to fit and rows to predict; each cluster is predicted once, as a whole."""
@@ -64,9 +75,14 @@ class Library:
 
     def unscaled(self, theta: np.ndarray) -> np.ndarray:
         """``(p,)`` coefficients of the columns as they were given."""
-        unscaled = np.zeros(len(self.usable))
-        unscaled[self.usable] = theta * self.scale
-        return unscaled
+        found = np.zeros(len(self.usable))
+        found[self.usable] = theta * self.scale
+        return found
+
+
+def nothing(library: Library, seed: int) -> np.ndarray:
+    """Recalibration of the base model alone."""
+    return np.zeros(library.columns.shape[1])
 
 
 def lasso(library: Library, seed: int) -> np.ndarray:
@@ -114,22 +130,27 @@ def ensemble_sindy(library: Library, seed: int) -> np.ndarray:
         cv=library.folds(seed),
         error_score="raise",
     )
-    state = np.random.get_state()
-    np.random.seed(seed % 2**32)  # pysindy draws from NumPy's global generator
-    try:
-        with warnings.catch_warnings():
-            # it may choose nothing
-            warnings.filterwarnings("ignore", "Sparsity parameter is too big")
-            best = search.fit(library.x, library.y).best_estimator_.named_steps["stlsq"]
-            ensemble = EnsembleOptimizer(best, bagging=True).fit(library.x, library.y)
-    finally:
-        np.random.set_state(state)
+    with warnings.catch_warnings(), _seeded(seed):
+        warnings.filterwarnings("ignore", "Sparsity parameter is too big")  # it may choose nothing
+        best = search.fit(library.x, library.y).best_estimator_.named_steps["stlsq"]
+        ensemble = EnsembleOptimizer(best, bagging=True).fit(library.x, library.y)
     return library.unscaled(ensemble.coef_[0])
 
 
-#: Baselines by name; the first one only recalibrates the base model.
+@contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """NumPy's global generator, which pysindy draws from, seeded and put back."""
+    state = np.random.get_state()
+    np.random.seed(seed % 2**32)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)
+
+
+#: Baselines by name.
 BASELINES: dict[str, Callable[[Library, int], np.ndarray]] = {
-    "recalibration": lambda library, seed: np.zeros(library.columns.shape[1]),
+    "recalibration": nothing,
     "lasso": lasso,
     "lasso_bic": lasso_bic,
     "ensemble_sindy": ensemble_sindy,

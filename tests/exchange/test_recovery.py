@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 
 import numpy as np
 import pytest
 
-from benchmarks.discovery import recovery
-from benchmarks.discovery.recovery import NORMAL, Recovered
+from benchmarks.discovery.recovery import CASES, NORMAL, Recovered
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +31,8 @@ FAR = 3.3
 
 @cache
 def recovered(name: str) -> Recovered:
-    return recovery.recovered(name)
+    with TemporaryDirectory() as folder:
+        return CASES[name].recovered(Path(folder))
 
 
 def check(result: Recovered, unknown: set[str], same: float = SAME) -> None:
