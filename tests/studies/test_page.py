@@ -41,7 +41,7 @@ def loader(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_blocks_stand_in_the_template_s_order(loader: None) -> None:
     blocks = page.page("x", TABLE, number=2.0, drawn=new_figure(1, 1))
-    first, text, table, second, figure, end, _ = blocks
+    first, text, table, second, figure, end = blocks
     assert (first, second) == (Heading("First", 2), Heading("Second", 3))
     assert (text, end) == (Text("Of 2.00 numbers."), Text("End."))
     assert isinstance(table, TableBlock)
