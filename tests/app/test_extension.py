@@ -1,4 +1,4 @@
-"""A new law is one YAML file, and a new effect is one class with one rule: with nothing else
+"""A new law is one YAML file, and a new effect is one entry of a YAML file: with nothing else
 written, both work in every engine, in training, in the diagnosis, on its page and in a drive.
 
 The files lie in a copy of the package, or where a user's own files lie.
@@ -63,14 +63,25 @@ class Hills(Effect):
     rules = {1: Rule(rate="W + w*sin(x/long)", constants={"long": (60.0, "m")})}
     strengths = {"w": Strength(0.0, 0.2, Interval(-6.0, 6.0), "m/s", min_effect_size=1.0)}
 """
-WAVES = """
-
-@CATALOGUE.add
-class Waves(Effect):
-    name, domain, source, rank = "waves", "crowd", "none", 20
-    rules = {2: Rule(rate=("c*sin(x/long)", "c*cos(x/long)"), constants={"long": (1.5, "m")})}
-    strengths = {"c": Strength(0.0, 0.05, Interval(-2.0, 2.0), "m/s²", min_effect_size=0.2)}
-"""
+#: Entries of the package's effects, of lanes and of crowds.
+EFFECTS = {
+    "lane": """
+hills:
+  about: Hills.
+  source: none
+  rank: 20
+  strengths: {w: {neutral: 0.0, step: 0.2, range: [-6.0, 6.0], unit: m/s, min_effect_size: 1.0}}
+  rules: {1: {rate: W + w*sin(x/long), constants: {long: [60.0, m]}}}
+""",
+    "crowd": """
+waves:
+  about: Waves.
+  source: none
+  rank: 20
+  strengths: {c: {neutral: 0.0, step: 0.05, range: [-2.0, 2.0], unit: m/s², min_effect_size: 0.2}}
+  rules: {2: {rate: [c*sin(x/long), c*cos(x/long)], constants: {long: [1.5, m]}}}
+""",
+}
 #: What the made-up drivers and people do.
 V0, REACH, W, C = 27.0, 14.0, 2.5, 0.6
 TRUTH = {"saturating.v0": V0, "saturating.reach": REACH, "hills.w": W}
@@ -128,8 +139,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for rank, (name, text) in enumerate(LAWS.items(), 90):
         head = f"  about: A law.\n  source: none\n  rank: {rank}"
         (found / "nnode" / "model" / "laws" / f"{name}.yaml").write_text(head + text, "utf-8")
-    for name, text in (("lane", HILLS), ("crowd", WAVES)):
-        with (found / "nnode" / "model" / "effects" / f"{name}.py").open("a") as file:
+    for name, text in EFFECTS.items():
+        with (found / "nnode" / "model" / "effects" / f"{name}.yaml").open(
+            "a", encoding="utf-8"
+        ) as file:
             file.write(text)
     driven = platoons(lambda x, *_: speeds(x), number=16, vehicles=4, seconds=16.0, seed=4)
     as_table(driven).to_csv(found / "platoons.csv", index=False)
