@@ -227,7 +227,8 @@ def sample_each(
     if isinstance(system, Crowd):
         moving = copy.deepcopy(system)
         _assign_drivers(moving, repeated, batch.names, rng)
-        return [_sample_people(moving, repeated, noises[0], rng, dt)]
+        (noise,) = noises
+        return [_sample_people(moving, repeated, noise, rng, dt)]
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     n = substeps(batch.dt, dt, system)
     step = batch.dt / n

@@ -68,12 +68,14 @@ def _composed(empty: D, terms: Sequence[Term], called: bool = False, increment: 
         model: Any = empty
         named = list(zip(range(len(terms)), terms, owners(terms), strict=True))
         # laws come first, so that effects can use them whatever the order of the terms
-        for of_laws in (True, False):
-            for i, term, owner in named:
-                if isinstance(term, Law) is of_laws:
-                    model = with_term(model, term, owner, i, called)
-            if of_laws and increment:
-                model = replace(model, rate=(const(0), const(0)))
+        for place, term, owner in named:
+            if isinstance(term, Law):
+                model = with_term(model, term, owner, place, called)
+        if increment:
+            model = replace(model, rate=(const(0), const(0)))
+        for place, term, owner in named:
+            if not isinstance(term, Law):
+                model = with_term(model, term, owner, place)
         _FORMULAS[key] = model.flat()
     formula: D = _FORMULAS[key]
     return formula
@@ -181,7 +183,7 @@ def effect_alone(law: Term, term: Term) -> LaneDynamics:
         alone, before = LaneDynamics(order=1), symbol("before")
         if isinstance(law, Law) and law.rule is not None:
             alone = with_term(LaneDynamics(order=law.order), law, law.name, 0)
-        elif "law(" in str(term.rule_for(1)):
+        elif (rule := term.rule_for(1)) is not None and rule.calls_law:
             raise ConfigError(
                 f"effect {term.name} modifies the law of the gap and needs a model with one; "
                 "derive the model's own term from FollowTheLeader, or leave the effect out"

@@ -221,6 +221,11 @@ class Rule:
         return not isinstance(self.rate, str)
 
     @property
+    def calls_law(self) -> bool:
+        """Whether a formula is the law with other quantities, ``law(...)``."""
+        return "law(" in str(self)
+
+    @property
     def texts(self) -> list[str]:
         """Its formulas, except those of states and delays."""
         summands = (text for over in REDUCED for _, text in getattr(self, over).values())

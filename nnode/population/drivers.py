@@ -293,9 +293,9 @@ def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
     return [short[name] for name in drivers]
 
 
-def simulated_biases(population: Population, seed: int, pairs: int) -> tuple[np.ndarray, Estimate]:
-    """``(pairs, P)`` biases of the parameters in simulations of the model, first with the
-    estimates, then with the corrected parameters; and the estimate corrected by their mean.
+def simulated_biases(population: Population, seed: int, pairs: int) -> np.ndarray:
+    """``(pairs, P)`` biases of the parameters in simulations of the model with corrected
+    parameters. The first correction is by simulations with the estimates.
 
     The linearisation at the modes and the errors of smoothed leaders bias the estimates. Standard
     deviations are not corrected: their bias is smaller than the Monte Carlo error of a correction.
@@ -306,26 +306,31 @@ def simulated_biases(population: Population, seed: int, pairs: int) -> tuple[np.
     Raises:
         SimulationError: drawn drivers leave the road.
     """
-    model, before = population.model, population.estimate
-    corrected = before
-    for _ in range(CORRECTIONS):
-        biases = np.clip(
-            score_biases(model, PushNoise(), corrected, seed, pairs), -LONGEST, LONGEST
-        )
-        theta = np.clip(before.theta - biases.mean(0), model.low, model.high)
-        corrected = fit_deviations(model, PushNoise(), theta, before.variances)
-    return biases, replace(corrected, converged=before.converged)
+    model, estimate = population.model, population.estimate
+    for _ in range(CORRECTIONS - 1):
+        biases = score_biases(model, PushNoise(), estimate, seed, pairs)
+        estimate = _corrected(population, biases)
+    return score_biases(model, PushNoise(), estimate, seed, pairs)
 
 
 def _bias_corrected(population: Population, seed: int, pairs: int) -> Population:
     """The estimate, corrected for the bias of its parameters; the same if simulations diverge."""
+    before = population.estimate
     try:
-        _, corrected = simulated_biases(population, seed, pairs)
+        corrected = _corrected(population, simulated_biases(population, seed, pairs))
     except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
         log.warning("parameters are not corrected for their bias: simulated drivers left the road")
         return population
-    bias = population.estimate.theta - corrected.theta
-    return replace(population, estimate=corrected, bias=bias)
+    corrected = replace(corrected, converged=before.converged)
+    return replace(population, estimate=corrected, bias=before.theta - corrected.theta)
+
+
+def _corrected(population: Population, biases: np.ndarray) -> Estimate:
+    """The deviations of drivers and starts with parameters corrected by the mean of biases."""
+    model, before = population.model, population.estimate
+    bias = np.clip(biases.mean(0), -LONGEST, LONGEST)
+    theta = np.clip(before.theta - bias, model.low, model.high)
+    return fit_deviations(model, PushNoise(), theta, before.variances)
 
 
 def _estimated(
@@ -462,19 +467,21 @@ def _continued(population: Population, steps: int = STEPS) -> Population:
 def _without_least_needed(best: Population, price: float) -> Population | None:
     """The estimate without the random effect that raises the likelihood least; None if all raise it
     enough."""
-    before, limit = best.estimate, best.marginal.loglik - price
-    reduced = list[tuple[float, str, Variances]]()
-    for place, name in enumerate(best.random):
+    model, before = best.model, best.estimate
+    limit = best.marginal.loglik - price
+    reduced = list[tuple[float, int, Variances]]()
+    for place in range(len(model.random)):
         data = replace(before.data, random=np.delete(before.data.random, place))
         loglik, variances = _refitted(best, data, _without_random_effect(before.variances, place))
-        reduced.append((loglik, name, variances))
-    loglik, removed, variances = max(reduced, default=(-math.inf, "", before.variances))
+        reduced.append((loglik, place, variances))
+    if not reduced:
+        return None
+    loglik, place, variances = max(reduced)
     if loglik < limit:
         return None
-    place = best.random.index(removed)
-    model = best.model.with_random(name for name in best.random if name != removed)
+    smaller = model.with_random(np.delete(best.random, place))
     agents = np.delete(before.agents, place, 1)
-    fit = _estimated(model, before.theta, variances, agents, before.start)
+    fit = _estimated(smaller, before.theta, variances, agents, before.start)
     return fit if fit.marginal.loglik >= limit else None
 
 

@@ -328,7 +328,7 @@ class FollowersEngine(TrafficEngine):
         :func:`~nnode.population.drivers.simulated_biases`."""
         population = self._deviations_under(system, row)
         model, theta = population.model, population.estimate.theta
-        biases, _ = simulated_biases(population, seed, PAIRS)
+        biases = simulated_biases(population, seed, PAIRS)
         return model.natural(theta) - model.natural(theta - biases)
 
     def _deviations_under(self, system: System, row: Tensor) -> Population:

@@ -190,11 +190,12 @@ class Effect(Term):
 
         An effect on a speed whose formula calls the law needs a law of the gap.
         """
-        law = system.find(Law)
-        by_law = "law(" in str(cls.rules.get(system.order))
+        law, rule = system.find(Law), cls.rules.get(system.order)
         callable_law = law is not None and (law.of_gap or system.order > 1)
+        if rule is not None and rule.calls_law and not callable_law:
+            return False
         enough = int(batch.agent.sum(1).max()) >= cls.min_agents
-        return enough and (callable_law or not by_law) and cls.finds(system.terms)
+        return enough and cls.finds(system.terms)
 
     @classmethod
     def probes(cls, batch: Batch, system: System) -> list[Probe]:
