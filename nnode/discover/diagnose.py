@@ -248,7 +248,7 @@ def diagnose(
         effects=effects_named,
         leads=hypotheses,
         agents=agents,
-        drivers=_drivers(engine, selection.fit, notes),
+        drivers=_drivers(engine, selection.fit, options.seed, notes),
         data_faults=[],
         not_testable=[absence.name for absence in absent_effects if not absence.testable],
         absences=absent_effects,
@@ -321,17 +321,18 @@ def _bonferroni(estimates: list[IndividualEstimate]) -> list[IndividualEstimate]
     ]
 
 
-def _drivers(engine: Engine, fit: Fit, notes: list[str]) -> list[Variation]:
+def _drivers(engine: Engine, fit: Fit, seed: int, notes: list[str]) -> list[Variation]:
     """The variances between drivers and over time, under the model with all selected effects.
 
     Args:
+        seed: of the simulations that correct their bias.
         notes: a note is added to them if pushes explain a large part of the rates.
     """
     if not isinstance(engine, FollowersEngine):
         return []
     engine.fit_whitening(fit.system, torch.from_numpy(fit.row))
     assert engine.population is not None
-    drivers = [Variation(name, **row) for name, row in variations(engine.drivers()).items()]
+    drivers = [Variation(name, **row) for name, row in variations(engine.drivers(seed)).items()]
     push = next(row for row in drivers if row.name == "push")
     if push.at_bound == "high" or not engine.population.explains_rates:
         rate = "accelerations" if fit.system.order > 1 else "speeds"

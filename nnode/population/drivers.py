@@ -22,7 +22,14 @@ from nnode.population.estimate import (
     fit_deviations,
     fit_variances,
 )
-from nnode.population.followers import FLOOR, PAIRS, Followers, Paths, score_biases
+from nnode.population.followers import (
+    FLOOR,
+    PAIRS,
+    Biases,
+    Followers,
+    Paths,
+    simulated_biases,
+)
 from nnode.population.likelihood import Linearised, Marginal, PushNoise, marginal
 from nnode.simulation.rhs import formula_of
 
@@ -43,9 +50,6 @@ LONGEST, TOLERANCE = 0.3, 1e-2
 #: Tolerance of estimates that only have to show the best of several starts, whose log likelihoods
 #: usually differ by hundreds.
 ROUGH = 1.0
-#: Number of corrections for bias. The second one halves what the first leaves of the bias of v0 of
-#: ``idm``, and a third one changes little (table in docs/method.md).
-CORRECTIONS = 2
 #: Bounds of standard deviations of errors of positions, m, and of the correlation time of
 #: autocorrelated ones, s. Searches for the latter start at 1 s.
 ERRORS, ERROR_TIMES = (0.001, 1.0), (0.1, 5.0)
@@ -78,11 +82,27 @@ class Population:
         estimate: parameters, deviations, variances.
         bias: ``(P,)`` the bias that was subtracted from the parameters, in the scales in which
             they are varied.
+        spread_bias, spread_error: ``(Q,)`` the factor by which standard deviations between drivers
+            were divided, and the standard error of its logarithm.
     """
 
     model: Followers
     estimate: Estimate
     bias: np.ndarray
+    spread_bias: np.ndarray
+    spread_error: np.ndarray
+
+    @classmethod
+    def uncorrected(cls, model: Followers, estimate: Estimate) -> Population:
+        """An estimate without correction of its bias."""
+        n_parameters, n_random = len(estimate.theta), len(model.random)
+        return cls(
+            model=model,
+            estimate=estimate,
+            bias=np.zeros(n_parameters),
+            spread_bias=np.ones(n_random),
+            spread_error=np.zeros(n_random),
+        )
 
     @property
     def marginal(self) -> Marginal:
@@ -148,7 +168,7 @@ def fit_drivers(
         first: parameters by name, such as ``idm.T``, where a second search starts; the result with
             the larger likelihood is taken.
         seed: of the simulations that estimate the bias.
-        pairs: of these simulations, see :func:`nnode.population.followers.score_biases`; 0: the
+        pairs: of these simulations, see :func:`nnode.population.followers.simulated_biases`; 0: the
             estimates are not corrected. Estimates that did not converge are never corrected.
 
     Raises:
@@ -174,9 +194,7 @@ def fit_drivers(
         population = population if better is population else _with_random_effects(better)
     else:
         population = _with_lasting_errors(_with_named_effects(alike, names)) if names else alike
-    if pairs > 0 and population.estimate.converged:
-        return _bias_corrected(population, seed, pairs)
-    return population
+    return bias_corrected(population, seed, pairs) if pairs else population
 
 
 def _simulated_finitely(model: Followers) -> bool:
@@ -271,7 +289,7 @@ def refit(before: Population, system: System, paths: Paths, *, fixed: bool) -> P
     deviations = fit_deviations(
         model, PushNoise(), model.start, variances, agents=agents, start=start
     )
-    return replace(before, model=model, estimate=deviations, bias=np.zeros(len(model.start)))
+    return Population.uncorrected(model, deviations)
 
 
 def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
@@ -293,44 +311,57 @@ def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
     return [short[name] for name in drivers]
 
 
-def simulated_biases(population: Population, seed: int, pairs: int) -> np.ndarray:
-    """``(pairs, P)`` biases of the parameters in simulations of the model with corrected
-    parameters. The first correction is by simulations with the estimates.
+def corrected_biases(population: Population, seed: int, pairs: int) -> Biases:
+    """Biases of the estimates, by simulation.
 
-    The linearisation at the modes and the errors of smoothed leaders bias the estimates. Standard
-    deviations are not corrected: their bias is smaller than the Monte Carlo error of a correction.
+    The linearisation at the modes and the errors of smoothed leaders bias the estimates. The biases
+    of parameters are those in simulations of the model with once corrected estimates: they halve
+    what one correction leaves of the bias of v0 of ``idm``. A second correction of the standard
+    deviations would amplify their sampling errors (tables in docs/method.md).
 
     Args:
-        seed, pairs: see :func:`nnode.population.followers.score_biases`.
+        seed, pairs: see :func:`nnode.population.followers.simulated_biases`.
 
     Raises:
         SimulationError: drawn drivers leave the road.
     """
-    model, estimate = population.model, population.estimate
-    for _ in range(CORRECTIONS - 1):
-        biases = score_biases(model, PushNoise(), estimate, seed, pairs)
-        estimate = _corrected(population, biases)
-    return score_biases(model, PushNoise(), estimate, seed, pairs)
+    first = simulated_biases(population.model, population.estimate, seed, pairs)
+    corrected = _corrected(population, first)
+    again = simulated_biases(population.model, corrected, seed, pairs)
+    return Biases(again.theta, first.spread)
 
 
-def _bias_corrected(population: Population, seed: int, pairs: int) -> Population:
-    """The estimate, corrected for the bias of its parameters; the same if simulations diverge."""
+def bias_corrected(population: Population, seed: int, pairs: int) -> Population:
+    """The estimate, corrected for the bias of its parameters and of the standard deviations between
+    drivers; the same if it did not converge or if simulations diverge."""
     before = population.estimate
+    if not before.converged:
+        return population
     try:
-        corrected = _corrected(population, simulated_biases(population, seed, pairs))
+        biases = corrected_biases(population, seed, pairs)
+        corrected = _corrected(population, biases)
     except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
         log.warning("parameters are not corrected for their bias: simulated drivers left the road")
         return population
-    corrected = replace(corrected, converged=before.converged)
-    return replace(population, estimate=corrected, bias=before.theta - corrected.theta)
+    error = biases.spread.std(0, ddof=1) / math.sqrt(pairs) / biases.spread.mean(0)
+    return replace(
+        population,
+        estimate=replace(corrected, converged=before.converged),
+        bias=before.theta - corrected.theta,
+        spread_bias=before.variances.spread / corrected.variances.spread,
+        spread_error=error,
+    )
 
 
-def _corrected(population: Population, biases: np.ndarray) -> Estimate:
-    """The deviations of drivers and starts with parameters corrected by the mean of biases."""
+def _corrected(population: Population, biases: Biases) -> Estimate:
+    """The deviations of drivers and starts with parameters and standard deviations between drivers
+    that are corrected by the mean of biases."""
     model, before = population.model, population.estimate
-    bias = np.clip(biases.mean(0), -LONGEST, LONGEST)
+    bias = np.clip(biases.theta.mean(0), -LONGEST, LONGEST)
     theta = np.clip(before.theta - bias, model.low, model.high)
-    return fit_deviations(model, PushNoise(), theta, before.variances)
+    spread = before.variances.spread / biases.spread.mean(0)
+    variances = replace(before.variances, spread=np.clip(spread, LEAST_SPREAD, MOST_SPREAD))
+    return fit_deviations(model, PushNoise(), theta, variances)
 
 
 def _estimated(
@@ -357,7 +388,7 @@ def _estimated(
         start=start,
         steps=steps,
     )
-    return Population(model=model, estimate=result, bias=np.zeros(len(result.theta)))
+    return Population.uncorrected(model, result)
 
 
 def _most_likely(model: Followers, starts: list[np.ndarray]) -> Population:

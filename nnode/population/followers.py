@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -34,8 +34,8 @@ from nnode.model.lane_rates import SAFE
 from nnode.model.system import System
 from nnode.model.term import Term
 from nnode.model.terms import LaneDynamics, parameter_values
-from nnode.population.estimate import Estimate, fit_deviations
-from nnode.population.likelihood import Linearised, Noise
+from nnode.population.estimate import Estimate, fit_deviations, fit_variances
+from nnode.population.likelihood import Linearised, PushNoise
 from nnode.simulation.kernels.followers import AHEAD
 from nnode.simulation.kernels.followers import simulate as simulate_compiled
 from nnode.simulation.linear import subdivided, trapezoidal
@@ -623,7 +623,9 @@ class Followers:
             SimulationError: a drawn driver passes the vehicle ahead, or his path blows up.
         """
         paths, (push, push_time, error, *lasting) = self.paths, estimate.variances.noise
-        agents = estimate.variances.spread * draw(estimate.agents.shape)
+        agents = draw(estimate.agents.shape)
+        # drawn drivers differ exactly as estimated, which reduces the Monte Carlo error
+        agents *= estimate.variances.spread / np.sqrt((agents**2).mean(0))
         shape = len(paths.ahead), len(paths.agent)
         pushes = push * _ornstein_uhlenbeck(draw(shape), paths.half / push_time)
 
@@ -674,15 +676,27 @@ def _ornstein_uhlenbeck(normal: np.ndarray, step: float) -> np.ndarray:
     return process
 
 
-def score_biases(
-    model: Followers, noise: Noise, estimate: Estimate, seed: int, pairs: int
-) -> np.ndarray:
-    """``(pairs, P)`` biases of the estimates, by simulation; their mean is the best estimate.
+class Biases(NamedTuple):
+    """Biases of estimates in simulations of the estimated model, a row per antithetic pair.
+
+    Attributes:
+        theta: ``(pairs, P)`` of the parameters, in the scales in which they are varied.
+        spread: ``(pairs, Q)`` estimated standard deviations between drivers, relative to those of
+            the simulated drivers.
+    """
+
+    theta: np.ndarray
+    spread: np.ndarray
+
+
+def simulated_biases(model: Followers, estimate: Estimate, seed: int, pairs: int) -> Biases:
+    """Biases of the estimates, by simulation; their mean is the best estimate.
 
     Simulated data of the estimated model are scored at the parameters that they were simulated
     with. The mean of a correct score is zero; the linearisation at the modes and the errors of
-    smoothed leaders shift it. A bias is the Gauss-Newton step of the mean score of an antithetic
-    pair of draws, in which the linear part of the score cancels.
+    smoothed leaders shift it. A bias of a parameter is the Gauss-Newton step of the mean score of
+    an antithetic pair of draws, in which the linear part of the score cancels. Variances are
+    estimated from the data as linearised there.
 
     Args:
         seed, pairs: see :func:`simulated_pairs`.
@@ -690,14 +704,18 @@ def score_biases(
     Raises:
         SimulationError: see :func:`simulated_pairs`.
     """
-    simulated = simulated_pairs(model, noise, estimate, seed, pairs)
-    return np.array(
-        [np.mean([modes.marginal.change for _, modes in pair], 0) for pair in simulated]
-    )
+    simulated = simulated_pairs(model, estimate, seed, pairs)
+    theta = [[modes.marginal.change for _, modes in pair] for pair in simulated]
+    spread = [
+        [fit_variances(modes.data, PushNoise(), modes.variances).spread for _, modes in pair]
+        for pair in simulated
+    ]
+    ratios = np.array(spread) / estimate.variances.spread
+    return Biases(np.array(theta).mean(1), ratios.mean(1))
 
 
 def simulated_pairs(
-    model: Followers, noise: Noise, estimate: Estimate, seed: int, pairs: int
+    model: Followers, estimate: Estimate, seed: int, pairs: int
 ) -> list[list[tuple[Followers, Estimate]]]:
     """Antithetic pairs of simulated data of an estimated model: the model with these data, and the
     deviations of their drivers.
@@ -716,22 +734,20 @@ def simulated_pairs(
     for attempt in range(ATTEMPTS * pairs):
         with suppress(SimulationError, np.linalg.LinAlgError):
             draws = antithetic_draws(seed + attempt)
-            simulated.append([_simulated_data(model, noise, estimate, draw) for draw in draws])
+            simulated.append([_simulated_data(model, estimate, draw) for draw in draws])
         if len(simulated) == pairs:
             return simulated
     raise SimulationError("most simulations of the estimated model have drivers who leave the road")
 
 
-def _simulated_data(
-    model: Followers, noise: Noise, estimate: Estimate, draw: Draw
-) -> tuple[Followers, Estimate]:
+def _simulated_data(model: Followers, estimate: Estimate, draw: Draw) -> tuple[Followers, Estimate]:
     """One of the data sets of :func:`simulated_pairs`.
 
     Raises:
         SimulationError: it cannot be used.
     """
     drawn = model.with_paths(model.simulated_paths(estimate, draw))
-    modes = fit_deviations(drawn, noise, estimate.theta, estimate.variances)
+    modes = fit_deviations(drawn, PushNoise(), estimate.theta, estimate.variances)
     if not modes.converged:
         raise SimulationError("the search for the deviations of drawn drivers does not converge")
     return drawn, modes

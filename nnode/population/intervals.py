@@ -9,6 +9,7 @@ likelihood ratio, from 0 on.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,12 @@ def deviation_intervals(population: Population) -> np.ndarray:
     """``(V, 2)`` intervals of 95 % of the standard deviations and times, in the order of
     :attr:`nnode.population.estimate.Variances.row`; NaN at a bound, if the likelihood is not
     concave, or of the time of a process whose standard deviation may be 0. The likelihood hardly
-    depends on such a process, which is therefore fixed for the intervals of the others."""
-    variances, data = population.estimate.variances, population.estimate.data
+    depends on such a process, which is therefore fixed for the intervals of the others.
+
+    The likelihood is that of the estimates before the correction of their bias, and the intervals
+    are corrected by the same factors."""
+    corrected, data = population.estimate.variances, population.estimate.data
+    variances = replace(corrected, spread=corrected.spread * population.spread_bias)
     logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
     theta, model = population.estimate.theta, population.model
     products: dict[tuple[float, ...], Products] = {}
@@ -76,8 +81,9 @@ def deviation_intervals(population: Population) -> np.ndarray:
         ).loglik
 
     noise, peak = NOISE[: len(variances.noise)], loglik(slice(None), logs)
+    drivers = slice(len(noise), len(noise) + len(variances.spread))
     ends, free = np.full((len(logs), 2), np.nan), at_bounds(logs, low, high, NEAR) == ""
-    for k in map(int, np.flatnonzero((low < high)[: len(noise) + len(variances.spread)])):
+    for k in map(int, np.flatnonzero((low < high)[: drivers.stop])):
         name = noise[k] if k < len(noise) else ""
         if name.endswith("_time") or peak - loglik(k, low[k]) >= DROP:
             continue
@@ -102,8 +108,12 @@ def deviation_intervals(population: Population) -> np.ndarray:
             )
             curvature[i, j] = curvature[j, i] = -cross / (4 * DIFFERENCE**2)
     if size and np.linalg.eigvalsh(curvature).min() > 0:
-        half = ndtri(0.5 + LEVEL / 2) * np.sqrt(np.diag(np.linalg.inv(curvature)))
+        error = np.zeros(len(logs))
+        error[drivers] = population.spread_error
+        deviation = np.sqrt(np.diag(np.linalg.inv(curvature)) + error[places] ** 2)
+        half = ndtri(0.5 + LEVEL / 2) * deviation
         ends[places] = np.exp(logs[places, None] + half[:, None] * np.array([-1.0, 1.0]))
+    ends[drivers] /= population.spread_bias[:, None]
     return ends
 
 

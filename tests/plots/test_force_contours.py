@@ -119,6 +119,12 @@ def test_social_force_is_antisymmetric_and_obeys_its_formula() -> None:
     )
 
 
+def test_a_network_is_not_antisymmetric() -> None:
+    dx, dv = np.array([1.0, 0.5]), np.array([2.0, 0.0])
+    force = evaluate_force(_network(), dx, dv)
+    assert not np.allclose(force, -evaluate_force(_network(), -dx, -dv), rtol=0.01)
+
+
 def test_parts_without_walls() -> None:
     system = Crowd([make_law("network_force", walls=False)])
     dx = np.ones((3, 2))

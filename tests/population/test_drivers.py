@@ -22,7 +22,7 @@ from nnode.population import followers
 from nnode.population.drivers import Population, fit_drivers, refit
 from nnode.population.followers import longest_step, paths_of
 from nnode.population.intervals import deviation_intervals, influence
-from nnode.population.likelihood import NOISE, PushNoise
+from nnode.population.likelihood import NOISE
 from tests.discover.platoons import DT, LENGTH, V0
 from tests.discover.platoons import platoons as following
 
@@ -172,13 +172,48 @@ def test_errors_that_may_not_exist_leave_the_intervals_of_the_others(
     assert np.isnan(ends[4]).all()
 
 
+def test_intervals_are_those_of_the_estimate_before_its_correction(
+    population: Population,
+) -> None:
+    before = population.estimate.variances
+    halved = replace(
+        population,
+        estimate=replace(
+            population.estimate, variances=replace(before, spread=before.spread / 2.0)
+        ),
+        spread_bias=np.array([2.0]),
+        spread_error=np.array([0.0]),
+    )
+    ends, corrected = deviation_intervals(population), deviation_intervals(halved)
+    np.testing.assert_allclose(corrected[:3], ends[:3])
+    np.testing.assert_allclose(corrected[3], ends[3] / 2.0)
+    less_certain = replace(halved, spread_error=np.array([0.5]))
+    low, high = deviation_intervals(less_certain)[3]
+    deviation = np.log(ends[3, 1] / ends[3, 0]) / (2 * 1.96)
+    expected = 2 * 1.96 * np.hypot(deviation, 0.5)
+    assert np.log(high / low) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.thorough
+def test_differences_in_a_speed_that_few_drivers_reach_are_underestimated() -> None:
+    table = benchmark_platoons("idm", "none", 0.15, 7606, 16)
+    paths = paths_of(list(nnode.sequences(table)), 0.2)
+    system = Traffic([make_law("idm")], leader="measured").double()
+    population = fit_drivers(system, paths, ["T", "v0"])
+    gap, speed = population.spread_bias
+    assert gap == pytest.approx(1.0, abs=0.1)
+    assert speed < 0.95
+    # they are corrected
+    _, differ = population.estimate.variances.spread
+    uncorrected = fit_drivers(system, paths, ["T", "v0"], pairs=0).estimate.variances.spread
+    assert differ * speed == pytest.approx(uncorrected[1])
+
+
 def test_simulations_with_a_driver_who_passes_the_vehicle_ahead_are_replaced(
     population: Population,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    simulated = partial(
-        followers.simulated_pairs, population.model, PushNoise(), population.estimate
-    )
+    simulated = partial(followers.simulated_pairs, population.model, population.estimate)
     (usual,) = simulated(seed=1, pairs=1)
     draws = followers.antithetic_draws
 

@@ -42,11 +42,12 @@ from nnode.population.drivers import (
     STEP,
     Population,
     at_steps,
+    bias_corrected,
+    corrected_biases,
     fit_all_random,
     fit_drivers,
     initial_variances,
     refit,
-    simulated_biases,
     with_smaller_errors,
 )
 from nnode.population.estimate import fit_deviations
@@ -261,13 +262,14 @@ class FollowersEngine(TrafficEngine):
         assert trial.population is not None
         return trial.population
 
-    def drivers(self) -> Population:
-        """The last estimate; where errors of positions are smaller than :data:`ERROR`, with errors
-        estimated as well, because larger ones would lengthen the pushes."""
+    def drivers(self, seed: int) -> Population:
+        """The last estimate, corrected for its bias; where errors of positions are smaller than
+        :data:`ERROR`, with errors estimated as well, because larger ones would lengthen the
+        pushes."""
         assert self.population is not None
         if self.population.model.paths.error > ERROR:
-            return self.population
-        return with_smaller_errors(self.population)
+            return bias_corrected(self.population, seed, PAIRS)
+        return bias_corrected(with_smaller_errors(self.population), seed, PAIRS)
 
     def log_likelihoods(self, *starts: System) -> tuple[np.ndarray, System]:
         """``(G,)`` log marginal likelihoods of the clusters under a law with parameters of its own,
@@ -300,8 +302,8 @@ class FollowersEngine(TrafficEngine):
         model = alike.with_random(alike.may_differ)
         variances = initial_variances(model)
         deviations = fit_deviations(model, PushNoise(), model.start, variances)
-        bias, engine = np.zeros(len(model.start)), copy.copy(self)
-        engine._set_population(Population(model=model, estimate=deviations, bias=bias))
+        engine = copy.copy(self)
+        engine._set_population(Population.uncorrected(model, deviations))
         return engine
 
     def set_likeliest(self, populations: Iterable[Population]) -> None:
@@ -313,7 +315,7 @@ class FollowersEngine(TrafficEngine):
         """Engines of paths simulated by a model, with deviations of drivers, pushes and measurement
         errors as estimated under it: an antithetic pair of draws."""
         refitted, engines = self._deviations_under(system, row), []
-        (pair,) = simulated_pairs(refitted.model, PushNoise(), refitted.estimate, seed, pairs=1)
+        (pair,) = simulated_pairs(refitted.model, refitted.estimate, seed, pairs=1)
         for model, modes in pair:
             engine = copy.copy(self)
             engine._paths_by_step = {
@@ -325,10 +327,10 @@ class FollowersEngine(TrafficEngine):
 
     def biases(self, system: System, row: Tensor, seed: int) -> np.ndarray:
         """``(R, K)`` biases of a model's parameters, in their units, see
-        :func:`~nnode.population.drivers.simulated_biases`."""
+        :func:`~nnode.population.drivers.corrected_biases`."""
         population = self._deviations_under(system, row)
         model, theta = population.model, population.estimate.theta
-        biases = simulated_biases(population, seed, PAIRS)
+        biases = corrected_biases(population, seed, PAIRS).theta
         return model.natural(theta) - model.natural(theta - biases)
 
     def _deviations_under(self, system: System, row: Tensor) -> Population:
