@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -118,102 +120,162 @@ def platoons(
         number: of platoons. vehicles: in each. error: of measured positions, m.
         nature: one of :data:`NATURES`.
     """
-    rng = np.random.default_rng(seed)
-    shape, sizes = (number, vehicles - 1), _sizes(law, effect)
-    own_v0, own_gap = (_factors(rng, spread, shape, nature) for _ in range(2))
+    rng, shape = np.random.default_rng(seed), (number, vehicles - 1)
+    size, root = (2, *shape), np.sqrt(2.0)
+    if nature == "skewed":
+        factors = rng.gamma(2.0, size=size) / root * spread + 1 - spread * root
+    else:
+        factors = np.exp(spread * rng.normal(size=size))
     mean, phase = rng.uniform(11, 17, (number, 1)), rng.random((number, 4))
     height, period = rng.normal(0, 1.3, (number, 4)), np.array([7.0, 13.0, 21.0, 34.0])
-    v0 = V0 * own_v0
-    truck, length, longer = _vehicles(rng, (number, vehicles), sizes)
-    factor = np.where(truck[:, 1:], sizes.get("vehicle_class", 1.0), 1.0)
-    v0, own_gap = (v0 * factor, own_gap) if law == "lin" else (v0, own_gap * factor)
-    gap = _equilibrium_gap(law, mean, v0, own_gap) * rng.uniform(0.9, 1.2, shape)
-    gap += longer + (0.0 if law == "lin" else length[:, :-1] - CAR)
+    drivers = _Drivers(law, _sizes(law, effect), factors, rng)
+    gap = drivers.equilibrium_gap(mean) * rng.uniform(0.9, 1.2, shape)
+    gap += drivers.longer + (0.0 if law == "lin" else drivers.length[:, :-1] - CAR)
     x = rng.uniform(0, 300, (number, 1)) - np.insert(gap.cumsum(1), 0, 0.0, 1)
     v, push = np.repeat(mean, vehicles, 1), PUSH[law] * rng.normal(size=shape)
-    late = round(sizes.get("reaction_delay", 0.0) / STEP)
+    delay = round(drivers.sizes.get("reaction_delay", 0.0) / STEP)
+    lag = drivers.sizes.get("inertia", STEP)
     mood, kick = np.zeros(shape), np.zeros((number, vehicles))
     past: list[tuple[np.ndarray, np.ndarray]] = []
     slow, rows = np.repeat(mean, vehicles - 1, 1), []
     for k in range(round(SECONDS / STEP) + 1):
         if k % round(DT / STEP) == 0:
-            kick = _error(rng, kick, nature)
+            shock = rng.normal(size=kick.shape)
+            kick = _next(kick, shock, DT, 1.0) if nature == "lasting" else shock
             rows.append(x + error * kick)
         angle = 2 * np.pi * (k * STEP / period + phase)
         lead = np.maximum(mean[:, 0] + (height * np.sin(angle)).sum(1), 2.0)
         v[:, 0] = lead
-        past = [*past, (x, v.copy())][-late - 1 :]
-        at, speed = past[0] if late else (x, v)
+        past = [*past, (x, v.copy())][-delay - 1 :]
         if nature == "moods":
             mood = _next(mood, rng.normal(size=shape), STEP, 30.0)
         clock = START * np.arange(number)[:, None] + k * STEP
-        wish = v0 * np.exp(0.08 * mood) * _slowed(x[:, 1:], clock, sizes)
-        late_by = sizes.get("inertia", STEP)
+        wish = drivers.v0 * np.exp(0.08 * mood) * drivers.slowed(x[:, 1:], clock)
+        wanted = drivers.wanted(*past[0], wish)
+        # laws of second order begin with the acceleration of the first moment
+        slow = wanted if k == 0 and law != "lin" else slow + STEP / lag * (wanted - slow)
         if law == "lin":
-            wanted = _wanted(at, speed, wish, longer, sizes)
-            slow = slow + STEP / late_by * (wanted - slow)
             after = np.maximum(slow + push, 0.0)
             for i, ahead in enumerate([lead, *after.T[:-1]]):  # views, which have their responses
-                after[:, i] += _response(ahead - slow[:, i], sizes)
+                after[:, i] += drivers.response(ahead - slow[:, i])
             v = np.column_stack([lead, after])
             x = x + STEP * v
         else:
-            wanted = _rate(law, at, speed, wish, own_gap, length[:, :-1] + longer, sizes)
-            slow = wanted if k == 0 else slow + STEP / late_by * (wanted - slow)
-            rate = slow + push
-            after = np.maximum(v[:, 1:] + STEP * np.clip(rate, -8.0, 5.0), 0.0)
+            after = np.maximum(v[:, 1:] + STEP * np.clip(slow + push, -8.0, 5.0), 0.0)
             x = x + STEP * np.column_stack([lead, (v[:, 1:] + after) / 2])
             v = np.column_stack([lead, after])
-        push = _next(push, _shock(rng, shape, nature), STEP, LASTS, PUSH[law])
-    columns = {"length": length} if law != "lin" or "leader_length" in sizes else {}
-    if "vehicle_class" in sizes:
-        columns["kind"] = np.where(truck, "truck", "car")
-    return _table(np.array(rows), columns)
+        shock = rng.normal(size=shape)
+        if nature == "heavy":
+            shock = rng.standard_t(4, size=shape) / np.sqrt(2.0)
+        push = _next(push, shock, STEP, LASTS, PUSH[law])
+    return _table(np.array(rows), drivers.columns())
 
 
-def _vehicles(
-    rng: np.random.Generator, shape: tuple[int, int], sizes: dict[str, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which vehicles are trucks, lengths, m, and by how much longer vehicles ahead count, m.
+class _Drivers:
+    """The followers of platoons.
 
-    There are trucks only where an effect depends on them.
+    Attributes:
+        sizes: of the hidden effects.
+        v0: ``(P, N - 1)`` desired speeds, m/s. gap: factors on T or on s_c.
+        truck: ``(P, N)`` which vehicles are trucks; there are some only where an effect depends on
+            them. length: of the vehicles, m.
+        longer: ``(P, N - 1)`` by how much longer vehicles ahead count, m.
     """
-    truck, length = np.zeros(shape, bool), np.full(shape, CAR)
-    if {"vehicle_class", "leader_length"} & set(sizes):
-        truck = rng.random(shape) < TRUCKS
-    if "leader_length" in sizes:
-        length[truck] = TRUCK
-    return truck, length, sizes.get("leader_length", 0.0) * (length - length.mean())[:, :-1]
 
+    def __init__(
+        self, law: str, sizes: dict[str, float], factors: np.ndarray, rng: np.random.Generator
+    ) -> None:
+        self.law, self.sizes = law, sizes
+        self.v0, self.gap = V0 * factors[0], factors[1]
+        number, followers = self.gap.shape
+        shape = number, followers + 1
+        self.truck, self.length = np.zeros(shape, bool), np.full(shape, CAR)
+        if {"vehicle_class", "leader_length"} & set(sizes):
+            self.truck = rng.random(shape) < TRUCKS
+        if "leader_length" in sizes:
+            self.length[self.truck] = TRUCK
+        away = (self.length - self.length.mean())[:, :-1]
+        self.longer = sizes.get("leader_length", 0.0) * away
+        factor = np.where(self.truck[:, 1:], sizes.get("vehicle_class", 1.0), 1.0)
+        if law == "lin":
+            self.v0 = self.v0 * factor
+        else:
+            self.gap = self.gap * factor
 
-def _slowed(x: np.ndarray, clock: np.ndarray, sizes: dict[str, float]) -> np.ndarray:
-    """Factors on desired speeds at places and times."""
-    zone = (x > ZONE[0]) & (x < ZONE[1])
-    period = (clock > PERIOD[0]) & (clock < PERIOD[1])
-    factor = np.where(zone, sizes.get("speed_zone", 1.0), 1.0)
-    return np.asarray(factor * np.where(period, sizes.get("speed_period", 1.0), 1.0))
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns of the table that vehicles have."""
+        columns = {}
+        if self.law != "lin" or "leader_length" in self.sizes:
+            columns["length"] = self.length
+        if "vehicle_class" in self.sizes:
+            columns["kind"] = np.where(self.truck, "truck", "car")
+        return columns
 
+    def equilibrium_gap(self, speed: np.ndarray) -> np.ndarray:
+        """Distances to the vehicle ahead, m, at which drivers keep a speed."""
+        share = speed / self.v0
+        if self.law == "idm":
+            wish = S0 + speed * T * self.gap
+            return CAR + wish / np.sqrt(np.maximum(1 - share**4, 0.2))
+        if self.law == "fvdm":
+            bend = np.tanh(S_C * self.gap / W)
+            optimal = np.minimum(share * (1 + bend) - bend, 0.9)
+            return CAR + S_C * self.gap + W * np.arctanh(optimal)
+        return LENGTH / np.maximum(1 - share, 0.15)
 
-def _shock(rng: np.random.Generator, shape: tuple[int, int], nature: str) -> np.ndarray:
-    """Random numbers of standard deviation 1."""
-    shock = rng.normal(size=shape)
-    return rng.standard_t(4, size=shape) / np.sqrt(2.0) if nature == "heavy" else shock
+    def slowed(self, x: np.ndarray, clock: np.ndarray) -> np.ndarray:
+        """Factors on desired speeds at places and times."""
+        zone = (x > ZONE[0]) & (x < ZONE[1])
+        period = (clock > PERIOD[0]) & (clock < PERIOD[1])
+        factor = np.where(zone, self.sizes.get("speed_zone", 1.0), 1.0)
+        return factor * np.where(period, self.sizes.get("speed_period", 1.0), 1.0)
+
+    def response(self, faster: np.ndarray) -> np.ndarray:
+        """To the vehicle ahead, which is faster by some m/s."""
+        opening = self.sizes.get("asymmetric_response", 0.0) * np.maximum(faster, 0.0)
+        return self.sizes.get("relative_speed", 0.0) * faster + opening
+
+    def wanted(self, x: np.ndarray, v: np.ndarray, v0: np.ndarray) -> np.ndarray:
+        """Speeds by ``lin``, m/s, which have no response yet, or accelerations by ``idm`` or
+        ``fvdm``, m/s².
+
+        Args:
+            v: of the step before, m/s. v0: desired speeds, m/s.
+        """
+        share = self.sizes.get("multi_anticipation", 0.0)
+        if self.law == "lin":
+            gap = np.maximum(x[:, :-1] - x[:, 1:] - self.longer, 0.6 * LENGTH)
+            total = v0 * (1 - (LENGTH + self.sizes.get("time_gap", 0.0) * v[:, :-1]) / gap)
+            if share:
+                total[:, 1:] += share * (v0[:, 1:] * (1 - LENGTH / gap[:, :-1]) - total[:, 1:])
+            return np.minimum(total, self.sizes.get("free_flow_speed", np.inf))
+        ahead, length = v[:, :-1], self.length[:, :-1] + self.longer
+        gap = np.maximum(x[:, :-1] - x[:, 1:] - length, 0.3)
+        total = self._rate(gap, ahead, v, v0) + self.response(ahead - v[:, 1:])
+        if share:
+            second = np.maximum((x[:, :-2] - x[:, 2:]) / 2 - CAR, 0.3)
+            total[:, 1:] += share * (self._rate(second, v[:, :-2], v, v0) - total[:, 1:])
+        return total
+
+    def _rate(
+        self, gap: np.ndarray, ahead: np.ndarray, v: np.ndarray, v0: np.ndarray
+    ) -> np.ndarray:
+        """Accelerations by ``idm`` or ``fvdm`` of the last vehicles, one per gap."""
+        first = v.shape[1] - gap.shape[1]
+        own, wish, factor = v[:, first:], v0[:, first - 1 :], self.gap[:, first - 1 :]
+        if self.law == "fvdm":
+            place = S_C * factor
+            bend = np.tanh(place / W)
+            optimal = wish * (np.tanh((gap - place) / W) + bend) / (1 + bend)
+            return KAPPA * (optimal - own) - LAM * (own - ahead)
+        away = own * (own - ahead) / (2 * np.sqrt(A * B))
+        wanted = S0 + np.maximum(own * T * factor + away, 0.0)
+        return A * (1 - (own / wish) ** 4 - (wanted / gap) ** 2)
 
 
 def _sizes(law: str, effect: str) -> dict[str, float]:
     """Of the effects that are hidden."""
     return {name: HIDDEN[law][name] for name in effect.split("+") if name != "none"}
-
-
-def _factors(
-    rng: np.random.Generator, spread: float, shape: tuple[int, int], nature: str
-) -> np.ndarray:
-    """Drivers' factors on a parameter."""
-    if nature != "skewed":
-        return np.asarray(np.exp(spread * rng.normal(size=shape)))
-    return np.asarray(
-        rng.gamma(2.0, size=shape) / np.sqrt(2.0) * spread + 1 - spread * np.sqrt(2.0)
-    )
 
 
 def _next(
@@ -225,82 +287,7 @@ def _next(
         shock: standard normal numbers. size: the standard deviation.
     """
     keep = np.exp(-step / lasts)
-    return np.asarray(keep * now + size * np.sqrt(1 - keep**2) * shock)
-
-
-def _error(rng: np.random.Generator, before: np.ndarray, nature: str) -> np.ndarray:
-    """The error of the next sample, of standard deviation 1."""
-    shock = rng.normal(size=before.shape)
-    return _next(before, shock, DT, 1.0) if nature == "lasting" else shock
-
-
-def _equilibrium_gap(
-    law: str, speed: np.ndarray, v0: np.ndarray, own_gap: np.ndarray
-) -> np.ndarray:
-    """Distances to the vehicle ahead, m, at which drivers keep a speed."""
-    share = speed / v0
-    if law == "idm":
-        wish = S0 + speed * T * own_gap
-        return np.asarray(CAR + wish / np.sqrt(np.maximum(1 - share**4, 0.2)))
-    if law == "fvdm":
-        bend = np.tanh(S_C * own_gap / W)
-        optimal = np.minimum(share * (1 + bend) - bend, 0.9)
-        return np.asarray(CAR + S_C * own_gap + W * np.arctanh(optimal))
-    return np.asarray(LENGTH / np.maximum(1 - share, 0.15))
-
-
-def _wanted(
-    x: np.ndarray, v: np.ndarray, v0: np.ndarray, longer: np.ndarray, sizes: dict[str, float]
-) -> np.ndarray:
-    """Speeds by ``lin``, m/s.
-
-    Args:
-        v: of the step before. longer: by how much a distance counts as shorter, m.
-    """
-    gap = np.maximum(x[:, :-1] - x[:, 1:] - longer, 0.6 * LENGTH)
-    wanted = v0 * (1 - (LENGTH + sizes.get("time_gap", 0.0) * v[:, :-1]) / gap)
-    if size := sizes.get("multi_anticipation"):
-        wanted[:, 1:] += size * (v0[:, 1:] * (1 - LENGTH / gap[:, :-1]) - wanted[:, 1:])
-    return np.minimum(wanted, sizes.get("free_flow_speed", np.inf))
-
-
-def _response(faster: np.ndarray, sizes: dict[str, float]) -> np.ndarray:
-    """To the vehicle ahead, which is faster by some m/s."""
-    opening = sizes.get("asymmetric_response", 0.0) * np.maximum(faster, 0.0)
-    return np.asarray(sizes.get("relative_speed", 0.0) * faster + opening)
-
-
-def _rate(
-    law: str,
-    x: np.ndarray,
-    v: np.ndarray,
-    v0: np.ndarray,
-    own_gap: np.ndarray,
-    length: np.ndarray,
-    sizes: dict[str, float],
-) -> np.ndarray:
-    """Accelerations by ``idm`` or ``fvdm``, m/s².
-
-    Args:
-        own_gap: factors of T or of s_c. length: that counts of the vehicle ahead, m.
-    """
-    own, ahead, gap = v[:, 1:], v[:, :-1], np.maximum(x[:, :-1] - x[:, 1:] - length, 0.3)
-
-    def rate(gap: np.ndarray, ahead: np.ndarray, at: slice) -> np.ndarray:
-        if law == "fvdm":
-            place = S_C * own_gap[:, at]
-            bend = np.tanh(place / W)
-            optimal = v0[:, at] * (np.tanh((gap - place) / W) + bend) / (1 + bend)
-            return np.asarray(KAPPA * (optimal - own[:, at]) - LAM * (own[:, at] - ahead))
-        away = own[:, at] * (own[:, at] - ahead) / (2 * np.sqrt(A * B))
-        wish = S0 + np.maximum(own[:, at] * T * own_gap[:, at] + away, 0.0)
-        return np.asarray(A * (1 - (own[:, at] / v0[:, at]) ** 4 - (wish / gap) ** 2))
-
-    total = rate(gap, ahead, slice(None)) + _response(ahead - own, sizes)
-    if size := sizes.get("multi_anticipation"):
-        second = np.maximum((x[:, :-2] - x[:, 2:]) / 2 - CAR, 0.3)
-        total[:, 1:] += size * (rate(second, v[:, :-2], slice(1, None)) - total[:, 1:])
-    return total
+    return keep * now + size * np.sqrt(1 - keep**2) * shock
 
 
 def _table(x: np.ndarray, columns: dict[str, np.ndarray]) -> pd.DataFrame:
@@ -340,16 +327,25 @@ def cases(
     return chosen
 
 
-def diagnosed(compare: bool = False, **case: Any) -> dict[str, Any]:
-    """The case with its diagnosis, and intervals of sizes and of differences between drivers.
+def evaluate(work: str, **case: Any) -> dict[str, Any]:
+    """The row of a case: a diagnosis, a comparison of laws, or a calibration.
 
     Args:
-        compare: whether laws are compared first, as diagnoses do by default.
+        work: a key of :data:`WORKS`.
     """
-    begun, table = time.monotonic(), platoons(**case)
-    laws: list[str] | None = None if compare else []
+    start = time.monotonic()
+    row = {**case, "hidden": case["effect"] != "none", **WORKS[work](case)}
+    return {**row, "seconds": round(time.monotonic() - start, 1)}
+
+
+def _diagnosed(case: dict[str, Any], laws: list[str] | None) -> dict[str, Any]:
+    """A diagnosis, and intervals of sizes and of differences between drivers.
+
+    Args:
+        laws: the laws that are compared first; None takes those of diagnoses by default.
+    """
     report = nnode.diagnose(
-        table,
+        platoons(**case),
         "traffic",
         model=case["law"],
         options=DiscoverOptions(page=False, replay=False, compare=laws),
@@ -365,60 +361,62 @@ def diagnosed(compare: bool = False, **case: Any) -> dict[str, Any]:
         }
         for each in report["drivers"]
     }
-    row = {**case, "hidden": bool(sizes), **judged(report, list(sizes))}
+    row = judged(report, list(sizes))
     for name, true in {**sizes, **_variations(case)}.items():
         interval = intervals.get(name, {})
-        row |= _beside(name, true, *(interval.get(end) for end in ("value", "low", "high")))
-    return {**row, "seconds": round(time.monotonic() - begun, 1)}
+        row |= _estimate(name, true, *(interval.get(end) for end in ("value", "low", "high")))
+    return row
 
 
-def compared(**case: Any) -> dict[str, Any]:
-    """The case with the comparison of all laws, of which the case's law should be the first."""
-    begun, sequences = time.monotonic(), list(nnode.sequences(platoons(**case)))
-    model, options = model_options(case["law"], "measured"), DiscoverOptions()
+def _compared(case: dict[str, Any]) -> dict[str, Any]:
+    """A comparison of all laws, of which the case's law should be the first."""
+    sequences, options = list(nnode.sequences(platoons(**case))), DiscoverOptions()
+    model = model_options(case["law"], "measured")
     laws = candidates(model, build_model(model), options)
     p_values = compare_laws(laws, case["law"], sequences, options)[0].p_values
     first, second, *_ = p_values
-    rejected = p_values[case["law"]] <= thresholds.STRICT
     return {
-        **case,
-        "hidden": case["effect"] != "none",
         "first": first,
         "second": second,
         "p second": p_values[second],
         "p true": p_values[case["law"]],
         "true law first": first == case["law"],
-        "true law rejected": rejected,
-        "seconds": round(time.monotonic() - begun, 1),
+        "true law rejected": p_values[case["law"]] <= thresholds.STRICT,
     }
 
 
-def calibrated(**case: Any) -> dict[str, Any]:
-    """The case with the estimates of a calibration, and whether their intervals contain the true
-    parameters and variances."""
-    begun = time.monotonic()
+def _calibrated(case: dict[str, Any]) -> dict[str, Any]:
+    """The estimates of a calibration, and whether their intervals contain the true parameters and
+    variances."""
     run = nnode.fit(platoons(**case), "traffic", model=case["law"], drivers="auto", heldout=0.0)
     assert run.drivers is not None
-    variability = run.drivers.variability
+    variability, variations = run.drivers.variability, _variations(case)
     parameters = run.parameters.rename(index=short_names(map(str, run.parameters.index)))
-    variations = _variations(case) | {"measurement": case["error"]}
-    row = {**case, "hidden": False}
+    row: dict[str, Any] = {}
     for table, true_values, what in (
         (parameters, TYPICAL[case["law"]], ""),
-        (variability, variations, ", variation"),
+        (variability, variations | {"measurement": case["error"]}, ", variation"),
     ):
         rows = table.reindex(list(true_values))[["estimate", "lower", "upper"]]
         for name, values in zip(true_values, rows.to_numpy(), strict=True):
-            row |= _beside(f"{name}{what}", true_values[name], *map(float, values))
+            row |= _estimate(f"{name}{what}", true_values[name], *map(float, values))
     others = set(variability.index[variability["unit"] == "%"])
-    row["false variation"] = bool(others - set(_variations(case)))
-    return {**row, "seconds": round(time.monotonic() - begun, 1)}
+    return row | {"false variation": bool(others - set(variations))}
 
 
-def _beside(
+#: What is done with a case.
+WORKS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "diagnose": partial(_diagnosed, laws=[]),
+    "default": partial(_diagnosed, laws=None),
+    "compare": _compared,
+    "calibrate": _calibrated,
+}
+
+
+def _estimate(
     name: str, true: float, value: float | None, low: float | None, high: float | None
 ) -> dict[str, Any]:
-    """An estimate beside the true value, and whether its interval contains it."""
+    """An estimate, the true value, and whether its interval contains it."""
     return {name: value, f"{name}, true": true, f"{name} covered": covers(low, high, true)}
 
 
@@ -434,25 +432,30 @@ def _variations(case: dict[str, Any]) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, required=True, help="of the first case")
-    parser.add_argument("--cases", type=int, default=24)
-    parser.add_argument("--spread", type=float, default=15.0, help="between drivers, percent")
-    parser.add_argument("--platoons", type=int, default=40)
-    parser.add_argument("--vehicles", type=int, default=6, help="in a platoon, its leader included")
-    parser.add_argument("--error", type=float, default=0.06, help="of measured positions, m")
+    for name, default, text in (
+        ("cases", 24, "number of cases"),
+        ("spread", 15.0, "between drivers, percent"),
+        ("platoons", 40, "in a case"),
+        ("vehicles", 6, "in a platoon, its leader included"),
+        ("error", 0.06, "of measured positions, m"),
+        ("processes", 2, "side by side"),
+    ):
+        parser.add_argument(f"--{name}", type=type(default), default=default, help=text)
     parser.add_argument("--pairs", action="store_true", help="two effects at once")
     parser.add_argument(
         "--effects", nargs="+", help="hidden in all cases, instead of in half of them"
     )
     works = parser.add_mutually_exclusive_group()
-    works.add_argument("--compare", action="store_true", help="only compare laws")
-    works.add_argument(
-        "--default", action="store_true", help="compare laws first, as diagnoses do by default"
-    )
-    works.add_argument("--calibrate", action="store_true", help="only calibrate, nothing hidden")
+    for work, text in (
+        ("compare", "only compare laws"),
+        ("default", "compare laws first, as diagnoses do by default"),
+        ("calibrate", "only calibrate, nothing hidden"),
+    ):
+        works.add_argument(f"--{work}", dest="work", action="store_const", const=work, help=text)
+    parser.set_defaults(work="diagnose")
     parser.add_argument("--nothing", action="store_true", help="nothing hidden in any case")
     parser.add_argument("--nature", default="plain", choices=NATURES)
     parser.add_argument("--laws", nargs="+", default=["lin", "idm"], choices=list(HIDDEN))
-    parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--table", type=Path, default=Path("runs/benchmark_drivers.csv"))
     given = parser.parse_args()
     for law in given.laws:
@@ -470,15 +473,22 @@ def main() -> None:
         effects=given.effects,
         nature=given.nature,
     )
-    work = calibrated if given.calibrate else compared if given.compare else diagnosed
-    if given.calibrate or given.nothing:
+    if given.work == "calibrate" or given.nothing:
         chosen = [case | {"effect": "none"} for case in chosen]
-    if given.default:
-        chosen = [case | {"compare": True} for case in chosen]
-    tasks = [Task(f"{case['law']}-{case['effect']}-s{case['seed']}", work, case) for case in chosen]
-    folder = given.table.with_suffix("")
+    tasks = [
+        Task(
+            f"{case['law']}-{case['effect']}-s{case['seed']}",
+            evaluate,
+            case | {"work": given.work},
+        )
+        for case in chosen
+    ]
     results = run_tasks(
-        tasks, folder, workers=given.processes, fingerprint=sources(), title="cases"
+        tasks,
+        given.table.with_suffix(""),
+        workers=given.processes,
+        fingerprint=sources(),
+        title="cases",
     )
     table = pd.DataFrame(list(results.values()))
     print(table.to_string(index=False))

@@ -1,15 +1,10 @@
-"""Scenes that JuPedSim simulates from a seed, and the right answer for each.
+"""The scenes of ``scenes.yaml`` that JuPedSim simulates.
 
-Two groups walk towards each other through a wide room, a corridor, a door or past a pillar. The
-right answers were written down before anything was run. Where nothing is hidden but another law,
-the right answer is to name nothing.
+Two groups walk towards each other through a wide room, a corridor, a door or past a pillar.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.discovery.worlds import Answer
+from benchmarks.discovery.scenes import SCENES, drawn, generator
 from benchmarks.programs.jupedsim import SAMPLE, STEP, facing, walked
 
 #: Sequences of a scene, people of a group, seconds before the recording and of the recording.
@@ -30,97 +25,9 @@ DOOR = 1.3
 #: Errors of measured places, m.
 ERROR = (0.005, 0.02)
 
-Draw = Callable[[np.random.Generator], tuple[str, dict[str, float], dict[str, float]]]
-
-
-def _social(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
-    person = {
-        "mass": 80.0,
-        "radius": 0.25,
-        "reaction_time": rng.uniform(0.4, 0.7),
-        "agent_scale": rng.uniform(80, 240),
-        "force_distance": rng.uniform(0.2, 0.4),
-        "obstacle_scale": rng.uniform(150, 400),
-    }
-    # no bodies: contacts are rare and stiff
-    return "SocialForceModel", {"body_force": 0.0, "friction": 0.0}, person
-
-
-def _centrifugal(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
-    person = {"mass": 1.0, "tau": rng.uniform(0.4, 0.7), "a_v": rng.uniform(0.3, 0.8)}
-    return (
-        "GeneralizedCentrifugalForceModel",
-        {"strength_neighbor_repulsion": rng.uniform(0.2, 0.5)},
-        person,
-    )
-
-
-def _free(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
-    model = {
-        "strength_neighbor_repulsion": rng.uniform(4, 8),
-        "range_neighbor_repulsion": rng.uniform(0.1, 0.3),
-    }
-    return "CollisionFreeSpeedModel", model, {"time_gap": rng.uniform(0.8, 1.3), "radius": 0.2}
-
-
-def _foreseeing(rng: np.random.Generator) -> tuple[str, dict[str, float], dict[str, float]]:
-    person = {
-        "time_gap": rng.uniform(0.8, 1.2),
-        "anticipation_time": rng.uniform(0.6, 1.4),
-        "reaction_time": rng.uniform(0.2, 0.4),
-    }
-    return "AnticipationVelocityModel", {}, person
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What JuPedSim simulates.
-
-    Attributes:
-        draw: its model, the model's parameters and those of a person.
-        answer: what is right to say.
-        corridor: walls near the groups; ``known``: they are measured, and the model has none.
-        pillar: radius of a pillar in the middle, which nobody measured, m.
-        door: both groups go through one in a wall across the room, which nobody measured.
-        speeds: of the two groups, desired, m/s.
-    """
-
-    draw: Draw
-    answer: Answer
-    corridor: bool = False
-    known: bool = False
-    pillar: float = 0.0
-    door: bool = False
-    speeds: tuple[float, float] = (1.3, 1.3)
-
-
-#: ``sf`` does not calibrate the range of its force.
-_RANGE = ("pair_repulsion",)
-#: Laws whose force turns with the view as well.
-_VIEW = ("field_of_view", *_RANGE)
-_OTHER, _SEEN = Answer(allowed=_RANGE), Answer(allowed=_VIEW)
-_FORESEEN = Answer(allowed=(*_VIEW, "anticipation"))
-SCENES: dict[str, Scene] = {
-    "sf": Scene(_social, _OTHER),
-    "gcfm": Scene(_centrifugal, _FORESEEN),
-    "cfsm": Scene(_free, _SEEN),
-    "avm": Scene(_foreseeing, _FORESEEN),
-    "sf_walls": Scene(
-        _social, replace(_OTHER, right=("wall_repulsion",)), corridor=True, known=True
-    ),
-    "sf_walls_withheld": Scene(_social, _OTHER, corridor=True),
-    "cfsm_walls_withheld": Scene(_free, _SEEN, corridor=True),
-    "sf_pillar": Scene(_social, replace(_OTHER, right=("obstacle",)), pillar=0.4),
-    "sf_speeds": Scene(_social, _OTHER, speeds=(1.0, 1.6)),
-    "gcfm_pillar": Scene(_centrifugal, replace(_FORESEEN, right=("obstacle",)), pillar=0.4),
-    # its two ends push like small obstacles; who meets nobody there does not show them
-    "sf_door": Scene(_social, replace(_OTHER, allowed=(*_RANGE, "obstacle")), door=True),
-    "cfsm_door": Scene(_free, replace(_SEEN, allowed=(*_VIEW, "obstacle")), door=True),
-}
-
 
 def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
-    """The table of a scene (sequence, time, agent, x, y), and the walls if they are known.
+    """The table of a scene (sequence, time, agent, x, y), and the walls if they are measured.
 
     Raises:
         ImportError: JuPedSim is not installed.
@@ -128,31 +35,31 @@ def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
     import shapely
 
     jupedsim = import_module("jupedsim")
-    scene = SCENES[name]
-    rng = np.random.default_rng(list(hashlib.sha256(f"{name} {seed}".encode()).digest()))
-    kind, values, person = scene.draw(rng)
-    half = HALF if scene.corridor else ROOM
-    room = shapely.box(-1.5 * GOAL, -half, 1.5 * GOAL, half)
-    if scene.pillar:
-        room = room.difference(shapely.Point(0, 0).buffer(scene.pillar, quad_segs=4))
-    if scene.door:
+    scene, rng = SCENES["jupedsim"][name], generator(name, seed)
+    kind = scene["kind"]
+    values = {
+        part: drawn(rng, entry) for part, entry in scene.items() if part in ("person", "model")
+    }
+    half, end = HALF if "corridor" in scene else ROOM, 1.5 * GOAL
+    room = shapely.box(-end, -half, end, half)
+    if "pillar" in scene:
+        room = room.difference(shapely.Point(0, 0).buffer(scene["pillar"], quad_segs=4))
+    if "door" in scene:
         wall = shapely.box(-0.15, -half, 0.15, half)
         room = room.difference(wall.difference(shapely.box(-1.0, -DOOR, 1.0, DOOR)))
     error = rng.uniform(*ERROR)
     rows: list[pd.DataFrame] = []
     with TemporaryDirectory() as folder:
         for number in range(SEQUENCES):
-            people = [{**person, **each} for each in _people(rng, scene, kind)]
-            goals = np.array(
-                [(-np.sign(p["position"][0]) * GOAL, p["position"][1]) for p in people]
-            )
+            people = [values["person"] | each for each in _people(rng, scene)]
+            goals = [(-np.sign(p["position"][0]) * GOAL, p["position"][1]) for p in people]
             sequence, order = walked(
                 jupedsim,
                 Path(folder) / f"{number}.sqlite",
-                getattr(jupedsim, kind)(**values),
+                getattr(jupedsim, kind)(**values["model"]),
                 getattr(jupedsim, f"{kind}AgentParameters"),
                 people,
-                goals,
+                np.array(goals),
                 room,
                 WARM + SECONDS,
                 every=round(SAMPLE / STEP),
@@ -173,22 +80,21 @@ def recorded(name: str, seed: int) -> tuple[pd.DataFrame, pd.DataFrame | None]:
             )
     table = pd.concat(rows, ignore_index=True)
     table[["x", "y"]] += error * rng.standard_normal((len(table), 2))
-    end = 1.5 * GOAL
-    walls = pd.DataFrame(
-        [(-end, -half, end, -half), (-end, half, end, half)], columns=["x1", "y1", "x2", "y2"]
-    )
-    return table, walls if scene.known else None
+    if "measured" not in scene:
+        return table, None
+    walls = [(-end, -half, end, -half), (-end, half, end, half)]
+    return table, pd.DataFrame(walls, columns=["x1", "y1", "x2", "y2"])
 
 
-def _people(rng: np.random.Generator, scene: Scene, kind: str) -> list[dict[str, Any]]:
+def _people(rng: np.random.Generator, scene: dict[str, Any]) -> list[dict[str, Any]]:
     """Places and speeds of both groups."""
-    found: list[dict[str, Any]] = []
-    while len(found) < 2 * GROUP:
-        side = -1.0 if len(found) < GROUP else 1.0
-        at = np.array([side * rng.uniform(3.0, 9.0), rng.uniform(-1.1, 1.1)])
-        if any(np.linalg.norm(at - other["position"]) < 1.2 for other in found):
+    people: list[dict[str, Any]] = []
+    while len(people) < 2 * GROUP:
+        side = -1.0 if len(people) < GROUP else 1.0
+        place = np.array([side * rng.uniform(3.0, 9.0), rng.uniform(-1.1, 1.1)])
+        if any(np.linalg.norm(place - other["position"]) < 1.2 for other in people):
             continue
-        speed = scene.speeds[int(side > 0)] * rng.uniform(0.95, 1.05)
-        values: dict[str, Any] = {"position": tuple(at), "desired_speed": speed}
-        found.append(values | (facing(-side, speed) if "Centrifugal" in kind else {}))
-    return found
+        speed = scene.get("speeds", (1.3, 1.3))[int(side > 0)] * rng.uniform(0.95, 1.05)
+        person: dict[str, Any] = {"position": tuple(place), "desired_speed": speed}
+        people.append(person | (facing(-side, speed) if "Centrifugal" in scene["kind"] else {}))
+    return people

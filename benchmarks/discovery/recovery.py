@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -13,11 +13,13 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 import torch
+import yaml
 from scipy.optimize import minimize
 
 from benchmarks.config import DiscoveryBenchmarkOptions
 from benchmarks.programs import jupedsim as people
-from benchmarks.programs import laws, sumo
+from benchmarks.programs import sumo
+from benchmarks.programs.laws import LAWS
 from nnode.calibrate.least_squares import Minimum
 from nnode.calibrate.problem import ResidualProblem, pooled
 from nnode.data.readers.sumo import SumoOptions, read_sumo
@@ -27,13 +29,12 @@ from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, law_from
 from nnode.model.system import System
 from nnode.simulation.fused import FusedSolver
 
+#: By name, see ``recovery.yaml``.
+CASES: dict[str, dict[str, Any]] = yaml.safe_load(
+    Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8")
+)
 #: SUMO's names of the parameters.
 _SUMO = {"v0": "maxSpeed", "T": "tau", "s0": "minGap", "a": "accel", "b": "decel"}
-_IDM = {"v0": 28.0, "T": 1.1, "s0": 2.3, "a": 1.4, "b": 2.0}
-_KRAUSS = {"v0": 21.0, "T": 1.1, "s0": 2.3, "a": 1.9, "b": 3.5}
-#: JuPedSim's people: mass, kg, desired speed, m/s, time to reach it, s.
-_MASS, _PACE, _TAU = 80.0, 1.3, 0.5
-_TOUCH = {"A": 2.0, "B": 0.3, "k": 150.0, "kappa": 50.0, "v0": _PACE, "tau": _TAU}
 #: Errors of measured positions, m: of vehicles, of people.
 ROAD, ROOM = 0.1, 0.01
 #: The searches start this share away from every parameter: up and down in turns, all up, all down.
@@ -68,219 +69,75 @@ class Recovered:
     path: float
 
 
-@dataclass(frozen=True)
-class Case:
-    """A law of another program, and the law of this package that is calibrated to its paths.
-
-    Attributes:
-        program: its name, and its law.
-        law: what it is called here.
-        recovered: simulates in a folder, and calibrates.
-    """
-
-    program: str
-    law: str
-    recovered: Callable[[Path], Recovered]
-
-
-def _by_sumo(
-    program: str,
-    follow: str,
-    name: str,
-    law: dict[str, Any],
-    typed: dict[str, float],
-    *,
-    ballistic: bool = False,
-    emergency: float = 9.0,
-    **scene: Any,
-) -> Case:
-    def recovered(folder: Path) -> Recovered:
-        values = {_SUMO[part]: value for part, value in typed.items()}
-        values |= {"emergencyDecel": emergency} | ({} if follow == "IDM" else {"sigma": 0.0})
-        home = sumo.sumo_home()
-        path = sumo.platoon(home, folder, follow, values, ballistic=ballistic, **scene)
-        (found,) = read_sumo(path, SumoOptions(path=str(path), dt=sumo.STEP))
-        # SUMO does not write them
-        found = replace(found, length=np.full(found.n_agents, sumo.LENGTH))
-        method = "ballistic" if ballistic else "semi_implicit"
-        return recover(law, typed, [found], dt=sumo.STEP, method=method, error=ROAD)
-
-    return Case(f"SUMO, {program}", name, recovered)
-
-
-def _by_jupedsim(
-    program: str,
-    kind: str,
-    name: str,
-    law: dict[str, Any],
-    typed: dict[str, float],
-    model: dict[str, float],
-    person: dict[str, float],
-    *,
-    preferred: bool = False,
-    parts: bool = False,
-    **scene: Any,
-) -> Case:
-    """A case of JuPedSim.
-
-    Args:
-        kind: JuPedSim's name of the model.
-        model, person: arguments of the model, and of every agent.
-        preferred: the law reads preferred velocities.
-        parts: paths are calibrated in pieces of 1 s. Who passes on which side changes abruptly, and
-            long paths have many local minima.
-    """
-
-    def recovered(folder: Path) -> Recovered:
-        jupedsim = import_module("jupedsim")
-        found = []
-        for seed in range(2):
-            whole = people.groups(
-                jupedsim,
-                folder / f"{seed}.sqlite",
-                getattr(jupedsim, kind)(**model),
-                getattr(jupedsim, f"{kind}AgentParameters"),
-                person,
-                seed=seed,
-                **scene,
-            )
-            if preferred:
-                assert whole.destination is not None
-                velocity = np.sign(whole.destination[:, :1]) * np.array([[_PACE, 0.0]])
-                whole = replace(whole, preferred=velocity)
-            found += people.pieces(whole, seconds=1.0) if parts else [whole]
-        return recover(law, typed, found, dt=people.STEP, error=ROOM)
-
-    return Case(f"JuPedSim, {program}", name, recovered)
-
-
-def _social_force(program: str, steps: str, typed: dict[str, float]) -> Case:
-    """``steps``: ``its`` if the law steps as JuPedSim does, else ``Euler's``."""
-    same = steps == "its"
-    return _by_jupedsim(
-        f"social force, {program}",
-        "SocialForceModel",
-        f"its formula, {steps} steps",
-        laws.stepping(laws.SOCIAL_FORCE, people.STEP if same else 0.0),
-        typed,
-        {"body_force": typed["k"] * _MASS, "friction": typed["kappa"] * _MASS},
-        {
-            "mass": _MASS,
-            "desired_speed": typed["v0"],
-            "reaction_time": typed["tau"],
-            "agent_scale": typed["A"] * _MASS,
-            "force_distance": typed["B"],
-            "radius": 0.3,
-        },
-        before=same,
-    )
-
-
-_KRAUSS_LAW = CAR_FOLLOWING_LAWS["krauss"]
-#: By name.
-CASES: dict[str, Case] = {
-    "idm_euler": _by_sumo("IDM, Euler", "IDM", "`idm`", CAR_FOLLOWING_LAWS["idm"], _IDM),
-    "idm_ballistic": _by_sumo(
-        "IDM, ballistic", "IDM", "`idm`", CAR_FOLLOWING_LAWS["idm"], _IDM, ballistic=True
-    ),
-    "idm_ballistic_rest": _by_sumo(
-        "IDM, ballistic", "IDM", "`idm`, a ≥ −v/dt", laws.IDM, _IDM, ballistic=True
-    ),
-    "krauss_moving": _by_sumo(
-        "KraussOrig1, Euler, never at rest nor at v0",
-        "KraussOrig1",
-        "`krauss`",
-        _KRAUSS_LAW,
-        _KRAUSS,
-        profile=sumo.SLOWLY,
-    ),
-    "krauss_stopping": _by_sumo(
-        "KraussOrig1, Euler", "KraussOrig1", "`krauss`", _KRAUSS_LAW, _KRAUSS
-    ),
-    "krauss_crawl": _by_sumo(
-        "KraussOrig1, Euler",
-        "KraussOrig1",
-        "`krauss`, last b dt at b dt",
-        laws.KRAUSS_ORIG,
-        _KRAUSS,
-    ),
-    "krauss_ballistic": _by_sumo(
-        "Krauss, ballistic, emergencyDecel = decel",
-        "Krauss",
-        "its formula",
-        laws.KRAUSS_BALLISTIC,
-        _KRAUSS,
-        ballistic=True,
-        emergency=_KRAUSS["b"],
-    ),
-    "krauss_default": _by_sumo(
-        "Krauss, Euler: SUMO's default", "Krauss", "`krauss`", _KRAUSS_LAW, _KRAUSS
-    ),
-    "force_contact": _social_force("people touch", "its", _TOUCH),
-    "force_euler": _social_force("people touch", "Euler's", _TOUCH),
-    "force_default": _social_force(
-        "its defaults: nobody touches",
-        "its",
-        {"A": 25.0, "B": 0.08, "k": 1500.0, "kappa": 3000.0, "v0": _PACE, "tau": _TAU},
-    ),
-    "centrifugal": _by_jupedsim(
-        "generalised centrifugal force",
-        "GeneralizedCentrifugalForceModel",
-        "its formula, its steps",
-        laws.stepping(laws.CENTRIFUGAL, people.STEP),
-        {"eta": 0.3, "v0": _PACE, "tau": _TAU, "a_v": 0.5},
-        {"strength_neighbor_repulsion": 0.3},
-        {
-            **{"mass": 1.0, "desired_speed": _PACE, "tau": _TAU, "a_v": 0.5},
-            **{"a_min": 0.2, "b_min": 0.2, "b_max": 0.4},
-        },
-        parts=True,
-        before=True,
-        apart=1.2,
-        speed=1.0,
-        oriented=True,
-        # JuPedSim turns desired directions slowly: goals so far away that they do not turn
-        goal=9000.0,
-    ),
-    "collision_free": _by_jupedsim(
-        "collision-free speed",
-        "CollisionFreeSpeedModel",
-        "`cfsm`",
-        PEDESTRIAN_LAWS["cfsm"],
-        {"T": 1.0, "l": 0.4, "a": 8.0, "D": 0.1},
-        {"strength_neighbor_repulsion": 8.0, "range_neighbor_repulsion": 0.1},
-        {"time_gap": 1.0, "desired_speed": _PACE, "radius": 0.2},
-        preferred=True,
-        parts=True,
-    ),
-}
-
-
 def cases(kind: str, options: DiscoveryBenchmarkOptions, first: int) -> dict[str, Any]:
     """All cases of installed programs; nothing depends on the seeds."""
     return {
         f"recovery-{name}": {"name": name}
         for name, case in CASES.items()
-        if find_spec(case.program.partition(",")[0].lower())
+        if find_spec(case["simulated"].partition(",")[0].lower())
     }
 
 
 def evaluate(name: str) -> dict[str, list[dict[str, Any]]]:
     """A row per parameter of a case."""
-    case = CASES[name]
-    with TemporaryDirectory() as folder:
-        found = case.recovered(Path(folder))
+    found, case = recovered(name), CASES[name]
     row: dict[str, Any] = {
-        "simulated by": case.program,
-        "law here": case.law,
+        "simulated by": case["simulated"],
+        "law here": case["here"],
         "paths, typed in (m)": found.forward,
         "paths, recovered (m)": found.path,
     }
     parameters = found.parameters.reset_index(names="parameter")
-    parameters["covered"] = (parameters["measured"] - parameters["typed"]).abs() < parameters[
-        "half"
-    ]
+    away = (parameters["measured"] - parameters["typed"]).abs()
+    parameters["covered"] = away < parameters["half"]
     return {"recovery": cast(list[dict[str, Any]], parameters.assign(**row).to_dict("records"))}
+
+
+def recovered(name: str) -> Recovered:
+    """Simulate a case with its program, and calibrate the law to the paths."""
+    case = CASES[name]
+    law = {**CAR_FOLLOWING_LAWS, **PEDESTRIAN_LAWS, **LAWS}[case["law"]]
+    with TemporaryDirectory() as folder:
+        if "follow" in case:
+            method = "ballistic" if case.get("ballistic") else "semi_implicit"
+            platoon = _by_sumo(Path(folder), case)
+            return recover(law, case["typed"], [platoon], dt=sumo.STEP, method=method, error=ROAD)
+        sequences = [part for seed in range(2) for part in _by_jupedsim(Path(folder), case, seed)]
+        return recover(law, case["typed"], sequences, dt=people.STEP, error=ROOM)
+
+
+def _by_sumo(folder: Path, case: dict[str, Any]) -> Sequence:
+    values = {_SUMO[name]: value for name, value in case["typed"].items()}
+    values |= {"emergencyDecel": case.get("emergency", 9.0)}
+    path = sumo.platoon(
+        sumo.sumo_home(),
+        folder,
+        case["follow"],
+        values if case["follow"] == "IDM" else values | {"sigma": 0.0},
+        ballistic=case.get("ballistic", False),
+        profile=sumo.SLOWLY if case.get("slowly") else sumo.PROFILE,
+    )
+    (platoon,) = read_sumo(path, SumoOptions(path=str(path), dt=sumo.STEP))
+    # SUMO does not write lengths
+    return replace(platoon, length=np.full(platoon.n_agents, sumo.LENGTH))
+
+
+def _by_jupedsim(folder: Path, case: dict[str, Any], seed: int) -> list[Sequence]:
+    jupedsim = import_module("jupedsim")
+    walked = people.groups(
+        jupedsim,
+        folder / f"{seed}.sqlite",
+        getattr(jupedsim, case["kind"])(**case["model"]),
+        getattr(jupedsim, f"{case['kind']}AgentParameters"),
+        case["person"],
+        seed=seed,
+        **case["groups"],
+    )
+    if case.get("preferred"):
+        assert walked.destination is not None
+        pace = np.array([[case["person"]["desired_speed"], 0.0]])
+        walked = replace(walked, preferred=np.sign(walked.destination[:, :1]) * pace)
+    return people.pieces(walked, case["pieces"]) if "pieces" in case else [walked]
 
 
 def recover(
@@ -311,39 +168,34 @@ def recover(
     problem = ResidualProblem(system, batch, solver)
     truth = problem.vector.row.numpy()
     moves = _moving(system, batch)
+    count = int(moves.sum())
     exact = _metres(problem, truth)[0][moves]
     turns, one = (-1.0) ** np.arange(len(truth)), np.ones(len(truth))
     # a limit on speed or acceleration that is nowhere reached changes nothing: of these starts
     # some lie below each
     starts = [truth * (1 + AWAY * way) for way in (turns, -turns, one, -one)]
     ends = [_best(problem, start) for start in starts]
-    paths = [np.sqrt((_metres(problem, end.row)[0] ** 2).sum() / moves.sum()) for end in ends]
+    paths = np.array([np.sqrt((_metres(problem, end.row)[0] ** 2).sum() / count) for end in ends])
     best = ends[int(np.argmin(paths))]
-    alike = np.array(
-        [end.row for end, path in zip(ends, paths, strict=True) if path < min(paths) + ROUNDED]
-    )
-    agreed = np.ptp(alike, axis=0) < WIDE * np.abs(truth)
+    rows = np.array([end.row for end in ends])[paths < paths.min() + ROUNDED]
+    agreed = np.ptp(rows, axis=0) < WIDE * np.abs(truth)
     noise, later = np.zeros(batch.x.shape), batch.valid.numpy().copy()
     later[0] = False
     noise[later] = np.random.default_rng(seed).standard_normal((later.sum(), batch.x.shape[-1]))
     noise *= error * moves.reshape(noise.shape)
-    measured = replace(batch, x=batch.x - torch.from_numpy(noise))
-    noisy = ResidualProblem(system, measured, solver)
-    again = min((_best(noisy, start) for start in starts), key=lambda end: float(end.cost))
-    count = int(moves.sum())
-    left, slopes = _metres(noisy, again.row)
-    half = (
-        NORMAL * np.sqrt((left**2).sum() / (count - len(truth))) * _standard_errors(slopes[moves])
-    )
-    half = np.where(agreed, half, np.inf)
+    noisy = ResidualProblem(system, replace(batch, x=batch.x - torch.from_numpy(noise)), solver)
+    end = min((_best(noisy, start) for start in starts), key=lambda end: float(end.cost))
+    left, slopes = _metres(noisy, end.row)
+    scale = np.sqrt((left**2).sum() / (count - len(truth)))
+    half = np.where(agreed, NORMAL * scale * _standard_errors(slopes[moves]), np.inf)
     parameters = pd.DataFrame(
         {
             "typed": truth,
             "found": best.row,
             "off": np.abs(best.row - truth) / np.abs(truth),
-            "measured": again.row,
+            "measured": end.row,
             "half": half,
-            "identified": half < WIDE * np.abs(again.row),
+            "identified": half < WIDE * np.abs(end.row),
         },
         index=[name.rpartition(".")[2] for name in problem.names],
     )
@@ -351,7 +203,7 @@ def recover(
         parameters=parameters,
         forward=float(np.sqrt((exact**2).sum() / count)),
         worst=float(np.abs(exact).max()),
-        path=float(min(paths)),
+        path=float(paths.min()),
     )
 
 
@@ -360,10 +212,10 @@ def _system(law: Mapping[str, Any], typed: Mapping[str, float], dim: int) -> Sys
     system: System = Traffic([term], leader="measured") if dim == 1 else Crowd([term])
     system.double()
     with torch.no_grad():
-        for name, value in typed.items():
-            getattr(term, name).fill_(value)
-    for name, parameter in term.named_parameters():
-        parameter.requires_grad_(name in typed)
+        for name, parameter in term.named_parameters():
+            parameter.requires_grad_(name in typed)
+            if name in typed:
+                parameter.fill_(typed[name])
     return system
 
 

@@ -11,9 +11,7 @@ nothing.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 import numpy as np
 
@@ -30,7 +28,6 @@ _RIDGES = (0.05, 0.5)
 _OWN = 1e-8
 
 
-@dataclass(frozen=True)
 class Library:
     """Columns to choose from.
 
@@ -45,25 +42,17 @@ class Library:
         y: ``(n,)`` the same of the target.
     """
 
-    columns: np.ndarray
-    target: np.ndarray
-    base: np.ndarray
-    cluster: np.ndarray
-    x: np.ndarray = field(init=False)
-    y: np.ndarray = field(init=False)
-    usable: np.ndarray = field(init=False)
-    scale: np.ndarray = field(init=False)
-
-    def __post_init__(self) -> None:
-        basis = np.linalg.svd(self.base, full_matrices=False)[0]
-        x = self.columns - basis @ (basis.T @ self.columns)
-        y = self.target - basis @ (basis.T @ self.target)
+    def __init__(
+        self, columns: np.ndarray, target: np.ndarray, base: np.ndarray, cluster: np.ndarray
+    ) -> None:
+        self.columns, self.target, self.base, self.cluster = columns, target, base, cluster
+        basis = np.linalg.svd(base, full_matrices=False)[0]
+        x = columns - basis @ (basis.T @ columns)
+        y = target - basis @ (basis.T @ target)
         norm, length = np.linalg.norm(x, axis=0), np.linalg.norm(y)
-        usable = norm > _OWN * np.linalg.norm(self.columns, axis=0)
-        object.__setattr__(self, "x", x[:, usable] / norm[usable])
-        object.__setattr__(self, "y", y / length)
-        object.__setattr__(self, "usable", usable)
-        object.__setattr__(self, "scale", length / norm[usable])
+        self.usable = norm > _OWN * np.linalg.norm(columns, axis=0)
+        self.x, self.y = x[:, self.usable] / norm[self.usable], y / length
+        self.scale = length / norm[self.usable]
 
     def folds(self, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Rows to fit and rows to predict; each cluster is predicted once, as a whole."""
@@ -75,14 +64,9 @@ class Library:
 
     def unscaled(self, theta: np.ndarray) -> np.ndarray:
         """``(p,)`` coefficients of the columns as they were given."""
-        found = np.zeros(len(self.usable))
-        found[self.usable] = theta * self.scale
-        return found
-
-
-def nothing(library: Library, seed: int) -> np.ndarray:
-    """Recalibration of the base model alone."""
-    return np.zeros(library.columns.shape[1])
+        unscaled = np.zeros(len(self.usable))
+        unscaled[self.usable] = theta * self.scale
+        return unscaled
 
 
 def lasso(library: Library, seed: int) -> np.ndarray:
@@ -130,27 +114,22 @@ def ensemble_sindy(library: Library, seed: int) -> np.ndarray:
         cv=library.folds(seed),
         error_score="raise",
     )
-    with warnings.catch_warnings(), _seeded(seed):
-        warnings.filterwarnings("ignore", "Sparsity parameter is too big")  # it may choose nothing
-        best = search.fit(library.x, library.y).best_estimator_.named_steps["stlsq"]
-        ensemble = EnsembleOptimizer(best, bagging=True).fit(library.x, library.y)
+    state = np.random.get_state()
+    np.random.seed(seed % 2**32)  # pysindy draws from NumPy's global generator
+    try:
+        with warnings.catch_warnings():
+            # it may choose nothing
+            warnings.filterwarnings("ignore", "Sparsity parameter is too big")
+            best = search.fit(library.x, library.y).best_estimator_.named_steps["stlsq"]
+            ensemble = EnsembleOptimizer(best, bagging=True).fit(library.x, library.y)
+    finally:
+        np.random.set_state(state)
     return library.unscaled(ensemble.coef_[0])
 
 
-@contextmanager
-def _seeded(seed: int) -> Iterator[None]:
-    """NumPy's global generator, which pysindy draws from, seeded and put back."""
-    state = np.random.get_state()
-    np.random.seed(seed % 2**32)
-    try:
-        yield
-    finally:
-        np.random.set_state(state)
-
-
-#: Baselines by name.
+#: Baselines by name; the first one only recalibrates the base model.
 BASELINES: dict[str, Callable[[Library, int], np.ndarray]] = {
-    "recalibration": nothing,
+    "recalibration": lambda library, seed: np.zeros(library.columns.shape[1]),
     "lasso": lasso,
     "lasso_bic": lasso_bic,
     "ensemble_sindy": ensemble_sindy,

@@ -10,7 +10,7 @@ import hashlib
 import time
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 import nnode
 from benchmarks.config import DiscoveryBenchmarkOptions
 from benchmarks.discovery.verdicts import verdicts
-from benchmarks.synthetic_cases.arms import first_seed
+from benchmarks.synthetic_cases.case import first_seed
 from nnode.errors import ConfigError
 from nnode.machine import cores, how_made
 from nnode.pages.page import Block, Heading, Provenance, TableBlock, write_page
@@ -62,29 +62,18 @@ _FOLDERS = (
 _PACKAGES = ("torch", "numba", "numpy", "scipy", "scikit-learn", "pysindy")
 
 
-class Kind(Protocol):
-    """A module of :data:`KINDS`."""
-
-    @staticmethod
-    def cases(kind: str, options: DiscoveryBenchmarkOptions, first: int) -> dict[str, Any]:
-        """Arguments by the case's unique key; ``first`` is the first seed."""
-        ...
-
-    @staticmethod
-    def evaluate(**arguments: Any) -> dict[str, list[dict[str, Any]]]:
-        """Rows of one case by table of :data:`TABLES`, plain JSON."""
-        ...
-
-
-def module_of(kind: str) -> Kind:
+def module_of(kind: str) -> Any:
     """The module of a kind.
+
+    Its ``cases(kind, options, first)`` are arguments by the case's unique key, where ``first`` is
+    the first seed; ``evaluate(**arguments)`` are rows of one case by table of :data:`TABLES`.
 
     Raises:
         ConfigError: an unknown kind.
     """
     if kind not in KINDS:
         raise ConfigError(f"benchmark_discovery.kinds: expected some of {', '.join(KINDS)}")
-    return cast(Kind, import_module(f"benchmarks.discovery.{KINDS[kind]}"))
+    return import_module(f"benchmarks.discovery.{KINDS[kind]}")
 
 
 def benchmark_discovery(config: DictConfig, folder: Path) -> None:
@@ -99,7 +88,13 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
         Interrupted: a signal asked to stop; finished cases are kept.
     """
     options = cast(DiscoveryBenchmarkOptions, OmegaConf.to_object(config.benchmark_discovery))
-    start, first, code = time.monotonic(), _first(options), sources()
+    start, code = time.monotonic(), sources()
+    first = options.first_seed if options.seeds_of is None else first_seed(options.seeds_of)
+    if options.seeds_of is not None and options.first_seed:
+        raise ConfigError(
+            f"benchmark_discovery.first_seed={options.first_seed} beside seeds_of: expected one of "
+            "them, because the seeds follow from the commit"
+        )
     workers = cores() if options.workers is None else options.workers
     if min(options.seeds, options.nothing_seeds, workers) < 1:
         raise ConfigError("seeds, nothing_seeds and workers must be at least 1")
@@ -118,7 +113,7 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
         cluster=options.cluster,
         title="cases",
     )
-    kept = {
+    tables_of = {
         key: case["tables"]
         for key, case in kept_results(folder, evaluate, code).items()
         if case["seeds_of"] == options.seeds_of
@@ -126,7 +121,11 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
     blocks: list[Block] = []
     for name, by in TABLES.items():
         rows = pd.DataFrame(
-            [{"key": key, **row} for key, tables in kept.items() for row in tables.get(name, ())]
+            [
+                {"key": key, **row}
+                for key, tables in tables_of.items()
+                for row in tables.get(name, ())
+            ]
         )
         if len(rows):
             counted = verdicts(rows, by)
@@ -137,7 +136,7 @@ def benchmark_discovery(config: DictConfig, folder: Path) -> None:
         origin = f"from the hash of the commit that froze the rules, {options.seeds_of}"
     seconds = time.monotonic() - start
     facts = {
-        "Cases": f"{len(kept)}, {origin}",
+        "Cases": f"{len(tables_of)}, {origin}",
         "Code": f"digest {code}",
         "Time": f"{seconds:.0f} s in this run with {workers} worker process(es)",
         **how_made(_PACKAGES),
@@ -164,22 +163,7 @@ def sources() -> str:
     digest = hashlib.sha256()
     for folder in _FOLDERS:
         top = root[folder.partition("/")[0]]
-        for path in sorted((top / folder).rglob("*.py")):
+        paths = [*(top / folder).rglob("*.py"), *(top / folder).rglob("*.yaml")]
+        for path in sorted(paths):
             digest.update(path.relative_to(top).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def _first(options: DiscoveryBenchmarkOptions) -> int:
-    """The first seed.
-
-    Raises:
-        ConfigError: given together with a commit, or an invalid hash.
-    """
-    if options.seeds_of is None:
-        return options.first_seed
-    if options.first_seed:
-        raise ConfigError(
-            f"benchmark_discovery.first_seed={options.first_seed} beside seeds_of: expected one of "
-            "them, because the seeds follow from the commit"
-        )
-    return first_seed(options.seeds_of)

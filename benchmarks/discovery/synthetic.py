@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,7 +13,9 @@ from unittest import mock
 
 from benchmarks.config import DiscoveryBenchmarkOptions
 from benchmarks.discovery.baselines import baselines_on_table
-from benchmarks.synthetic_cases import TABLE, WALLS, Case, arms, generate
+from benchmarks.synthetic_cases import ARMS, TABLE, WALLS, Case, generate
+from benchmarks.synthetic_cases.case import cases as hidden_cases
+from benchmarks.synthetic_cases.case import hidden
 from benchmarks.synthetic_cases.score import ERROR, coefficient_rows, score
 from nnode.app import discover
 from nnode.discover import thresholds
@@ -32,27 +35,27 @@ def cases(kind: str, options: DiscoveryBenchmarkOptions, first: int) -> dict[str
     Raises:
         ConfigError: unknown names, or packages of the baselines are missing.
     """
-    hidden = [h for domain in options.domains for arm in arms.ARMS for h in arms.hides(domain, arm)]
-    for option, known in (
-        ("effects", {name for h in hidden for name in h.effects}),
-        ("variants", {h.variant for h in hidden}),
+    pairs = list(product(options.domains, options.arms or ARMS))
+    every = [entry for domain in options.domains for arm in ARMS for entry in hidden(domain, arm)]
+    for option, expected in (
+        ("effects", {name for names, _ in every for name in names}),
+        ("variants", {variant for _, variant in every}),
     ):
-        strange = sorted(set(getattr(options, option) or ()) - known)
+        strange = sorted(set(getattr(options, option) or ()) - expected)
         if strange:
             raise ConfigError(
                 f"benchmark_discovery.{option}: {strange[0]} is hidden nowhere, expected some of "
-                f"{', '.join(sorted(known))}"
+                f"{', '.join(sorted(expected))}"
             )
-    found = {
+    grid = {
         f"{case.key}-{change.replace(' ', '-')}" if kind == "rules" else case.key: {
             "case": case.to_dict(),
             "baselines": case.seed < first + options.baseline_seeds,
             "change": change,
             "values": values,
         }
-        for domain in options.domains
-        for arm in options.arms or list(arms.ARMS)
-        for case in arms.cases(
+        for domain, arm in pairs
+        for case in hidden_cases(
             domain,
             arm,
             # cases with nothing hidden are many: they show how often chance names something
@@ -68,13 +71,13 @@ def cases(kind: str, options: DiscoveryBenchmarkOptions, first: int) -> dict[str
         for change, values in (changes() if kind == "rules" else [(UNCHANGED, {})])
     }
     missing = [name for name in ("pysindy", "sklearn") if find_spec(name) is None]
-    if missing and any(arguments["baselines"] for arguments in found.values()):
+    if missing and any(arguments["baselines"] for arguments in grid.values()):
         raise ConfigError(
             f"benchmark_discovery.baseline_seeds={options.baseline_seeds} needs "
             f"{' and '.join(missing)}: install pysindy and scikit-learn (the extra bench), or give "
             "0 for no baselines"
         )
-    return found
+    return grid
 
 
 def changes() -> Iterator[tuple[str, dict[str, float]]]:
@@ -104,26 +107,25 @@ def evaluate(
         baselines: scores of the baselines as well.
         change: name of a change of thresholds. values: their values, by name.
     """
-    hidden = Case(**case)
+    subject = Case(**case)
     classes = {effect.name: effect.confusable_group for effect in CATALOGUE.effects.values()}
     reports: dict[str, dict[str, Any]] = {}
     with TemporaryDirectory(prefix="nnode-case-") as made, TemporaryDirectory() as given:
-        truth = generate(hidden, Path(made))
-        for name in (TABLE, WALLS):
-            if (Path(made) / name).exists():
-                (Path(made) / name).rename(Path(given) / name)
+        truth = generate(subject, Path(made))
+        for path in Path(made).glob("*.csv"):
+            path.rename(Path(given) / path.name)
         model = truth["model"]
         options: dict[str, Any] = {
             "model": {"name": model["name"], "term": TERMS[model["name"]], **model["options"]},
-            "walls": Path(given) / WALLS if hidden.domain == "crowd" else None,
-            "seed": hidden.seed,
+            "walls": Path(given) / WALLS if subject.domain == "crowd" else None,
+            "seed": subject.seed,
         }
         table, start, failure = Path(given) / TABLE, time.monotonic(), ""
         try:
             with mock.patch.dict(vars(thresholds), values or {}):
                 reports["diagnosis"] = discover.diagnose_table(
                     table,
-                    hidden.domain,
+                    subject.domain,
                     **options,
                     options=DiscoverOptions(page=False, replay=False, compare=[]),
                 ).plain()
@@ -132,7 +134,7 @@ def evaluate(
             reports["diagnosis"] = {"verdict": ERROR}
         seconds = time.monotonic() - start
         if baselines and not failure:
-            reports |= baselines_on_table(table, hidden.domain, **options)
+            reports |= baselines_on_table(table, subject.domain, **options)
     rows = [
         {"method": method, "thresholds": change, **score(truth, report, classes)}
         for method, report in reports.items()
@@ -141,5 +143,5 @@ def evaluate(
     coefficients = coefficient_rows(truth["effects"], reports["diagnosis"].get("effects", []))
     return {
         "synthetic": rows,
-        "coefficients": [{"domain": hidden.domain, **row} for row in coefficients],
+        "coefficients": [{"domain": subject.domain, **row} for row in coefficients],
     }

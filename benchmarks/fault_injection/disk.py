@@ -15,8 +15,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from benchmarks.fault_injection.jobs import Job
+from benchmarks.fault_injection.jobs import Job, kept
 from benchmarks.fault_injection.kills import broken
 from benchmarks.fault_injection.row import Row
 from nnode.files import PARTIAL
@@ -48,19 +49,18 @@ def full_disks(jobs: list[Job], scratch: Path) -> Iterator[Row]:
         for limit in LIMITS:
             run = place / f"limit{limit}"
             shutil.copytree(finished, run)
-            _try(job, run, row, f"{limit} bytes", partial(_limit, limit))
+            _try(job, run, row, f"{limit} bytes", kept(finished), partial(_limit, limit))
             shutil.rmtree(run)
         yield row.ended()
         row = Row(f"{job.name}, disk in memory", facts={"refused": 0})
         for room in ROOM:
-            with _mounted(place / f"disk{room}") as where:
-                if where is None:
+            with _mounted(place / f"disk{room}") as disk:
+                if disk is None:
                     row.facts = {"mounting": "not allowed"}
                     break
-                shutil.copytree(finished, where / "run")
-                _fill(where, room)
-                output = place / "output.txt"
-                _try(job, where / "run", row, f"{room} bytes left", lambda: None, output)
+                shutil.copytree(finished, disk / "run")
+                _fill(disk, room)
+                _try(job, disk / "run", row, f"{room} bytes left", kept(finished))
         yield row.ended()
 
 
@@ -69,29 +69,29 @@ def _try(
     run: Path,
     row: Row,
     what: str,
-    before: Callable[[], None],
-    output: Path | None = None,
+    earlier: set[Any],
+    before: Callable[[], None] = lambda: None,
 ) -> None:
     """One run over finished results; the checks after it."""
     row.tried += 1
-    output = output or job.output(run)
-    child = job.start(run, before=before, resumed=_LONGER, output=output)
+    output = run.parents[1] / "output.txt"
+    child = job.start(run, before=before, longer=_LONGER, output=output)
     status = child.status(300)
     child.kill()
-    words = output.read_text()
+    words, losses = output.read_text(), broken(run)
     row.facts["refused"] += status != 0
     if status != 0 and not any(word in words for word in _WORDS):
-        row.losses.append(f"{what}: status {status} without a word of the disk: {words[-900:]}")
+        losses.append(f"status {status} without a word of the disk: {words[-900:]}")
     if "Traceback" in words:
-        row.losses.append(f"{what}: a traceback in place of words: {words[-1800:]}")
+        losses.append(f"a traceback in place of words: {words[-1800:]}")
     if status is None or status < 0:
-        row.losses.append(f"{what}: it ended by signal, or not at all ({status})")
-    row.losses += [f"{what}: {path} is left" for path in sorted(run.rglob(f"*{PARTIAL}"))]
-    row.losses += [f"{what}: {words}" for words in broken(run)]
+        losses.append(f"it ended by signal, or not at all ({status})")
+    losses += [f"{path} is left" for path in sorted(run.rglob(f"*{PARTIAL}"))]
     try:
-        assert job.kept(run) or job.name == "discover", "what was finished is gone"
+        assert kept(run) >= earlier, "what was finished is gone"
     except Exception as error:
-        row.losses.append(f"{what}: {type(error).__name__}: {error}")
+        losses.append(f"{type(error).__name__}: {error}")
+    row.losses += [f"{what}: {loss}" for loss in losses]
 
 
 def _limit(size: int) -> None:

@@ -24,7 +24,7 @@ def shared_folders(jobs: list[Job], scratch: Path, repeats: int) -> Iterator[Row
         place, row = scratch / job.name, Row(job.name)
         place.mkdir()
         job.start(place / "straight").status()
-        straight = job.results(place / "straight")
+        straight = job.ended(place / "straight")
         for number in range(repeats):
             run = place / f"run{number}"
             first = job.start(run)
@@ -37,7 +37,7 @@ def shared_folders(jobs: list[Job], scratch: Path, repeats: int) -> Iterator[Row
             if first.status(0) is None and (status != 1 or _REFUSED not in words):
                 row.losses.append(f"the second run was not refused: {status}, {words[-900:]}")
             if number % 2 == 0:
-                if first.status(300) != 0 or job.results(run) != straight:
+                if first.status(300) != 0 or job.ended(run) != straight:
                     row.losses.append("the first run did not come to its result beside a second")
                 if (run / LOCK).exists():
                     row.losses.append("the lock of a run that ended is left")
@@ -47,7 +47,7 @@ def shared_folders(jobs: list[Job], scratch: Path, repeats: int) -> Iterator[Row
             row.tried += 1
             if third.status(300) != 0:
                 row.losses.append(f"a killed run's lock blocked the next one: {job.words(run)}")
-            elif job.results(run) != straight:
+            elif job.ended(run) != straight:
                 row.losses.append("after a kill the result is another one")
             third.kill()
         yield row.ended()

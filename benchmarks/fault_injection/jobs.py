@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from benchmarks.fault_injection.child import Child, script
 from nnode.app.python.report import Report
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.prepare import prepare
-from nnode.data.readers.esimas import EsimasOptions
+from nnode.data.readers.esimas import EsimasOptions, read_esimas
+from nnode.data.sequences import Sequences
 from nnode.data.store import MANIFEST, Store
 from nnode.data.synthetic import traffic_recording
 from nnode.pages.page import Block, TableBlock
@@ -23,6 +24,8 @@ from nnode.program import configuration
 from studies.runner import Task, run_tasks
 from studies.traffic.tasks import fit, scan
 
+#: The last checkpoint of a training.
+LAST = Path("checkpoints") / "last.pt"
 #: Names of entries that say how long something took, or when, and columns of tables that do.
 _CLOCKS = ("seconds", "time taken", "laps")
 _TIMED = ("s", "duration", "minutes")
@@ -35,39 +38,37 @@ class Job:
     Attributes:
         name: of the script.
         first: the overrides of a run from the start.
-        again: those after a kill, given the run's folder; by default the same.
-        results: of its end, without anything that depends on the clock.
-        kept: what a kill must not take away: a number that never falls, or a set that never
-            shrinks.
+        results: the files of its end that are compared, as patterns.
         share: of the kills; jobs that take longer get fewer.
+        resumed: the overrides of a run after a kill that goes on from a checkpoint.
         before: done in the process before the script.
     """
 
     name: str
     first: list[str]
-    results: Callable[[Path], Any]
-    kept: Callable[[Path], Any]
-    share: int = 1
-    again: Callable[[Path], list[str] | None] = lambda folder: None
-    before: Callable[[], None] = field(default=lambda: None)
+    results: tuple[str, ...]
+    share: int
+    resumed: tuple[str, ...] = ()
+    before: Callable[[], None] = lambda: None
 
     def start(
         self,
         folder: Path,
         *,
         before: Callable[[], object] = lambda: None,
-        resumed: Collection[str] = (),
+        longer: Collection[str] = (),
         output: Path | None = None,
     ) -> Child:
         """Start it in a process of its own, or go on with what is in a run's folder.
 
         Args:
             before: done in the process as the last thing before the script.
-            resumed: further overrides of a run that goes on.
+            longer: further overrides of a run that goes on from a checkpoint.
             output: receives what it prints; by default a file beside the folder.
         """
-        again = self.again(folder)
-        given = self.first if again is None else [*again, *resumed]
+        last, given = folder / LAST, self.first
+        if self.resumed and last.exists():
+            given = [f"resume={last}", *self.resumed, *longer]
 
         def work() -> None:
             self.before()
@@ -85,6 +86,44 @@ class Job:
         """The last words of a run."""
         return self.output(folder).read_text()[-1500:]
 
+    def ended(self, folder: Path) -> dict[str, Any]:
+        """The content of the results by file, without anything that depends on the clock."""
+        paths = {path for pattern in self.results for path in folder.glob(pattern)}
+        return {path.relative_to(folder).as_posix(): _content(path) for path in sorted(paths)}
+
+
+def kept(folder: Path) -> set[Any]:
+    """What a kill must not take away: finished tasks, steps of a training, a prepared store."""
+    names: set[Any] = {path.name for path in (folder / "tasks").glob("*.json")}
+    if (folder / LAST).exists():
+        names |= set(range(int(load_checkpoint(folder / LAST).progress["step"])))
+    if (folder / MANIFEST).exists() and len(Store(folder)):
+        names.add(MANIFEST)
+    return names
+
+
+def _content(path: Path) -> Any:
+    if path.name == MANIFEST:
+        store = Store(path.parent)
+        sequences = [(s.name, s.time.tobytes(), s.x.tobytes()) for s in store]
+        return timeless(store.manifest), sequences
+    match path.suffix:
+        case ".pt":
+            checkpoint = load_checkpoint(path)
+            tensors = {name: value.tolist() for name, value in checkpoint.model.items()}
+            return tensors, timeless(checkpoint.history), checkpoint.split
+        case ".json":
+            content = json.loads(path.read_text(encoding="utf-8"))
+            # arguments and provenance of a result contain paths and times
+            return timeless(content.get("result", content.get("summary", content)))
+        case ".csv":
+            frame = pd.read_csv(path)
+            timed = [name for name in frame.columns if name in _TIMED or _of_clock(name)]
+            return frame.drop(columns=timed).to_csv(index=False)
+        case ".yaml":
+            return path.read_text(encoding="utf-8")
+    return None
+
 
 def timeless(value: Any) -> Any:
     """Plain results without what depends on the clock, comparable even where they hold NaN."""
@@ -97,55 +136,6 @@ def timeless(value: Any) -> Any:
 
 def _of_clock(name: str) -> bool:
     return any(word in name.lower() for word in _CLOCKS)
-
-
-def _model(path: Path) -> dict[str, Any]:
-    checkpoint = load_checkpoint(path)
-    tensors = {name: value.tolist() for name, value in checkpoint.model.items()}
-    return {"model": tensors, "history": timeless(checkpoint.history), "split": checkpoint.split}
-
-
-def _prepared(folder: Path) -> dict[str, Any]:
-    store = Store(folder)
-    return {
-        "manifest": timeless(store.manifest),
-        "sequences": [(s.name, s.time.tobytes(), s.x.tobytes()) for s in store],
-        "plots": sorted(p.name for p in (folder / "faults").glob("*")),
-    }
-
-
-def _trained(folder: Path) -> dict[str, Any]:
-    content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    models = {name: _model(folder / "checkpoints" / name) for name in ("last.pt", "best.pt")}
-    return {**models, "summary": timeless(content["summary"])}
-
-
-def _steps(folder: Path) -> float:
-    path = folder / "checkpoints" / "last.pt"
-    return float(load_checkpoint(path).progress["step"]) if path.exists() else -1.0
-
-
-def _tasks(folder: Path) -> dict[str, Any]:
-    kept = sorted((folder / "tasks").glob("*.json"))
-    found = {p.name: timeless(json.loads(p.read_text())["result"]) for p in kept}
-    tables = {}
-    for path in sorted(folder.glob("*.csv")):
-        frame = pd.read_csv(path)
-        timed = [name for name in frame.columns if name in _TIMED or _of_clock(name)]
-        tables[path.name] = frame.drop(columns=timed).to_csv(index=False)
-    return {"results": found, "tables": tables}
-
-
-def _names(folder: Path) -> set[str]:
-    return {path.name for path in (folder / "tasks").glob("*.json")}
-
-
-def _reported(folder: Path) -> dict[str, Any]:
-    return {
-        "report": timeless(json.loads((folder / "report.json").read_text(encoding="utf-8"))),
-        "checkpoint": _model(folder / "checkpoints" / "best.pt"),
-        "yaml": (folder / "model.yaml").read_text(encoding="utf-8"),
-    }
 
 
 class Small:
@@ -185,87 +175,50 @@ def jobs(raw: Path) -> list[Job]:
     _load_libraries()
     recorded = traffic_recording(raw / "esimas" / "sequence_datademo.mat", seed=0)
     source, table = f"data.source={raw}", raw / "lane.csv"
-    _lane(recorded, table)
+    first = Sequences(read_esimas(recorded)[:12]).to_dataframe()
+    first["agent"] = first["sequence"].astype(str) + "-" + first["agent"].astype(str)
+    first.to_csv(table, index=False)
+    training = "model=n2 optimizer=adadelta solver=fused solver.dt=0.1 trainer.max_epochs=6"
+    diagnosis = (
+        "model=lin model.leader=measured data=table data.domain=traffic "
+        "discover.effects=[relative_speed] discover.max_effects=1 discover.step=0.2 "
+        "discover.replay=false discover.page=false"
+    )
+    cases = (
+        "domains=[traffic] arms=[nothing] nothing_seeds=1 sizes=[4] noises=[0.05] workers=1 "
+        "variants=[white,autocorrelated,heterogeneous] baseline_seeds=0"
+    )
+    tasks = ("tasks/*.json", "*.csv")
     return [
-        Job(
-            "prepare_data",
-            ["data=demo_traffic", source],
-            _prepared,
-            lambda folder: 1.0 if (folder / MANIFEST).exists() and len(Store(folder)) else 0.0,
-            share=60,
-        ),
+        Job("prepare_data", ["data=demo_traffic", source], (MANIFEST, "faults/*"), 60),
         Job(
             "train",
-            [
-                "experiment=demo_traffic",
-                "model=n2",
-                "optimizer=adadelta",
-                "solver=fused",
-                "solver.dt=0.1",
-                "trainer.max_epochs=6",
-                "trainer.save_every=0.02",
-                source,
-            ],
-            _trained,
-            _steps,
+            ["experiment=demo_traffic", *training.split(), "trainer.save_every=0.02", source],
+            ("checkpoints/last.pt", "checkpoints/best.pt", "result.json"),
             50,
-            _resumed(source),
+            resumed=(source,),
         ),
         Job(
             "study",
             ["study=traffic", "study.workers=1"],
-            _tasks,
-            _names,
+            tasks,
             55,
             before=lambda: _small_study(raw),
         ),
         Job(
             "discover",
-            [
-                "model=lin",
-                "model.leader=measured",
-                "data=table",
-                f"data.path={table}",
-                "data.domain=traffic",
-                "discover.effects=[relative_speed]",
-                "discover.max_effects=1",
-                "discover.step=0.2",
-                "discover.replay=false",
-                "discover.page=false",
-            ],
-            _reported,
-            lambda folder: 0.0,
+            [*diagnosis.split(), f"data.path={table}"],
+            ("report.json", "checkpoints/best.pt", "model.yaml"),
             23,
         ),
         Job(
             "benchmark_discovery",
-            [
-                f"benchmark_discovery.{option}"
-                for option in (
-                    "domains=[traffic]",
-                    "arms=[nothing]",
-                    "nothing_seeds=1",
-                    "sizes=[4]",
-                    "variants=[white,autocorrelated,heterogeneous]",
-                    "noises=[0.05]",
-                    "baseline_seeds=0",
-                    "workers=1",
-                )
-            ],
-            _tasks,
-            _names,
+            [f"benchmark_discovery.{option}" for option in cases.split()],
+            tasks,
             12,
             before=_small_diagnosis,
         ),
     ]
-
-
-def _resumed(source: str) -> Callable[[Path], list[str] | None]:
-    def again(folder: Path) -> list[str] | None:
-        last = folder / "checkpoints" / "last.pt"
-        return [f"resume={last}", source] if last.exists() else None
-
-    return again
 
 
 def _small_study(raw: Path) -> None:
@@ -288,25 +241,6 @@ def _small_diagnosis() -> None:
         return whole(*given, options=options, **more)
 
     vars(discover)["diagnose_table"] = small
-
-
-def _lane(recorded: Path, table: Path) -> None:
-    """The demonstration's first sequences as a tidy table."""
-    from nnode.data.readers.esimas import read_esimas
-
-    found = read_esimas(recorded)[:12]
-    rows = [
-        {
-            "sequence": s.name.replace("/", "-"),
-            "time": t,
-            "agent": f"{s.name}-{n}",
-            "x": s.x[k, n, 0],
-        }
-        for s in found
-        for k, t in enumerate(s.time)
-        for n in range(s.n_agents)
-    ]
-    pd.DataFrame(rows).to_csv(table, index=False)
 
 
 def _load_libraries() -> None:

@@ -21,7 +21,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from benchmarks.fault_injection.jobs import Job
+from benchmarks.fault_injection.jobs import Job, kept
 from benchmarks.fault_injection.row import Row
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.store import MANIFEST, Store
@@ -62,17 +62,17 @@ def _killed(job: Job, place: Path, number: int, rng: random.Random) -> Row:
         if child.status() != 0:
             raise StudyError(f"{job.name} fails without any kill: {job.words(straight)}")
     seconds, events = time.monotonic() - begin, int(count.read_text())
-    results = job.results(straight)
+    results = job.ended(straight)
     while row.tried < number and not row.losses:
         folder = place / f"run{row.tried}"
         # a run that is asked for again, over finished results, must not lose them
-        again = True
-        while again and row.tried < number and not row.losses:
+        repeated = True
+        while repeated and row.tried < number and not row.losses:
             _until_the_end(job, folder, row, number, seconds, events, rng)
             if not row.losses:
                 row.facts["ends compared"] += 1
                 row.losses += _ended(job, folder, results)
-            again = rng.random() < 0.3
+            repeated = rng.random() < 0.3
         if not row.losses:
             shutil.rmtree(folder)
     return row.ended()
@@ -89,7 +89,7 @@ def _until_the_end(
 ) -> None:
     """Start a run again and again, and kill it at most a few times before it ends."""
     for attempt in range(_ROW + 1):
-        kept = job.kept(folder)
+        before = kept(folder)
         patience = 600.0
         last: int | None = None
         if attempt < _ROW and row.tried < number:
@@ -104,8 +104,8 @@ def _until_the_end(
             row.tried += 1
             row.losses += broken(folder)
             try:
-                if not job.kept(folder) >= kept:
-                    row.losses.append(f"{folder}: there was more than {job.kept(folder)}: {kept}")
+                if gone := before - kept(folder):
+                    row.losses.append(f"{folder}: {gone} was there before the kill")
             except Exception as error:
                 row.losses.append(f"{folder}: {type(error).__name__}: {error}")
         else:
@@ -117,7 +117,7 @@ def _until_the_end(
 def _ended(job: Job, folder: Path, straight: Any) -> list[str]:
     """What is wrong with the end of a run, in words."""
     try:
-        if job.results(folder) != straight:
+        if job.ended(folder) != straight:
             return [f"{folder} has other results than the run without kills, {job.name}/straight"]
     except Exception as error:
         return [f"{folder} has no result: {type(error).__name__}: {error}"]
@@ -126,14 +126,14 @@ def _ended(job: Job, folder: Path, straight: Any) -> list[str]:
 
 def broken(folder: Path) -> list[str]:
     """The results in a folder that are not whole, in words."""
-    found = []
+    losses = []
     for path in sorted(folder.rglob("*")):
         if path.is_file() and not any(part.startswith(".") for part in path.parts[-3:]):
             try:
                 read_whole(path)
             except Exception as error:
-                found.append(f"{path} is not whole: {type(error).__name__}: {error}")
-    return found
+                losses.append(f"{path} is not whole: {type(error).__name__}: {error}")
+    return losses
 
 
 def read_whole(path: Path) -> None:

@@ -46,26 +46,7 @@ def fault_injection(config: DictConfig, folder: Path) -> None:
     """
     options = cast(FaultInjectionConfig, OmegaConf.to_object(config))
 
-    campaigns: dict[str, Callable[[Path], Iterator[Row]]] = {
-        "kills": lambda scratch: kills(
-            _chosen("jobs", options.jobs, jobs(scratch / "raw")),
-            scratch,
-            options.kills,
-            options.seed,
-        ),
-        "disk": lambda scratch: full_disks(
-            _chosen("jobs", options.jobs, jobs(scratch / "raw")), scratch
-        ),
-        "folder": lambda scratch: shared_folders(
-            _chosen("jobs", options.jobs, jobs(scratch / "raw")), scratch, options.repeats
-        ),
-        "fuzz": lambda scratch: fuzz(
-            _chosen("targets", options.targets, targets(scratch)),
-            scratch,
-            options.inputs,
-            options.seed,
-        ),
-    }
+    campaigns = _campaigns(options)
     _check_names("campaigns", options.campaigns, campaigns)
     if min(options.kills, options.inputs, options.repeats) < 1:
         raise ConfigError("kills, inputs and repeats must be at least 1")
@@ -92,6 +73,24 @@ def fault_injection(config: DictConfig, folder: Path) -> None:
         raise StudyError(f"something was lost; {folder / REPORT} says what")
 
 
+def _campaigns(
+    options: FaultInjectionConfig,
+) -> dict[str, Callable[[Path], Iterator[Row]]]:
+    def chosen_jobs(scratch: Path) -> list[Job]:
+        return _chosen("jobs", options.jobs, jobs(scratch / "raw"))
+
+    def fuzzed(scratch: Path) -> Iterator[Row]:
+        some = _chosen("targets", options.targets, targets(scratch))
+        return fuzz(some, scratch, options.inputs, options.seed)
+
+    return {
+        "kills": lambda scratch: kills(chosen_jobs(scratch), scratch, options.kills, options.seed),
+        "disk": lambda scratch: full_disks(chosen_jobs(scratch), scratch),
+        "folder": lambda scratch: shared_folders(chosen_jobs(scratch), scratch, options.repeats),
+        "fuzz": fuzzed,
+    }
+
+
 def _keep(path: Path, campaign: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Put a campaign's rows into the report, in the place of its earlier ones; the report."""
     earlier = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.exists() else []
@@ -109,19 +108,21 @@ def _keep(path: Path, campaign: str, rows: list[dict[str, Any]]) -> dict[str, An
     return report
 
 
-def _chosen(option: str, names: list[str] | None, known: list[Tested]) -> list[Tested]:
+def _chosen(option: str, names: list[str] | None, every: list[Tested]) -> list[Tested]:
     """The jobs or targets of some names; None takes all."""
-    by_name = {each.name: each for each in known}
+    by_name = {each.name: each for each in every}
     _check_names(option, names or (), by_name)
     return [by_name[name] for name in names or by_name]
 
 
-def _check_names(option: str, names: Collection[str], known: Collection[str]) -> None:
+def _check_names(option: str, names: Collection[str], expected: Collection[str]) -> None:
     """Refuse names that there are not.
 
     Raises:
         ConfigError: with the names that there are.
     """
-    strange = sorted(set(names) - set(known))
+    strange = sorted(set(names) - set(expected))
     if strange:
-        raise ConfigError(f"{option}: {strange[0]} is unknown, expected some of {', '.join(known)}")
+        raise ConfigError(
+            f"{option}: {strange[0]} is unknown, expected some of {', '.join(expected)}"
+        )

@@ -1,23 +1,29 @@
-"""What is fuzzed: each reader and each loader, and the malformed files that it is given."""
+"""What is fuzzed: each reader and each loader, and the malformed files that it is given.
+
+``corpus`` contains the sound files.
+"""
 
 from __future__ import annotations
 
 import copy
+import gzip
 import io
 import json
+import pickle
+import shutil
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from hypothesis.strategies import SearchStrategy
 from omegaconf import MISSING
 from scipy.io import savemat
 
-from benchmarks.fault_injection import formats
 from benchmarks.fault_injection.damage import (
     damaged_bytes,
     damaged_formula,
@@ -26,13 +32,15 @@ from benchmarks.fault_injection.damage import (
     strange_checkpoint,
     strange_frame,
 )
-from benchmarks.fault_injection.formats import read_all
 from nnode.app.check import check_file
 from nnode.calibrate.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from nnode.calibrate.optimizers import AdadeltaOptions, build_optimizer
+from nnode.data.identity import identify
 from nnode.data.options import DataOptions
+from nnode.data.prepare import FORMATS
+from nnode.data.quality import drop_absent, find_faults
 from nnode.data.readers.esimas import EsimasOptions
-from nnode.data.readers.highd import TRACKS
+from nnode.data.readers.highd import RECORDING_META, TRACKS, TRACKS_META, HighDOptions
 from nnode.data.readers.juelich import JuelichOptions
 from nnode.data.readers.jupedsim import GEOMETRY, PEOPLE, WalkwayOptions
 from nnode.data.readers.ngsim import NgsimOptions
@@ -42,13 +50,16 @@ from nnode.data.readers.sumo import SumoOptions
 from nnode.data.readers.table import TABLE as TIDY
 from nnode.data.readers.table import WALLS, TableOptions
 from nnode.data.readers.vehicles import VehicleTableOptions
-from nnode.data.sequence import Sequence
+from nnode.data.sequence import Domain, Sequence
+from nnode.data.sequences import Sequences
 from nnode.data.store import MANIFEST, TABLE, Store, write_store
 from nnode.model import Traffic, build_model
 from nnode.model.laws import law_from
 from nnode.simulation.kernels import source
 from studies.runner import KEPT, Task, run_tasks
 
+#: Sound files.
+CORPUS = Path(__file__).with_name("corpus")
 #: Accelerations that can be read.
 _FORMULAS = (
     "a*(1 - (v/v0)**4 - ((s0 + max(v*T + v*dv/(2*sqrt(a*b)), 0))/gap)**2)",
@@ -56,8 +67,6 @@ _FORMULAS = (
     "(v0*log(max(gap, s0)/s0) - v)/T + softplus(v/v0)*min(a, b)*abs(v)/v0",
 )
 _QUANTITIES = {"v0": "30 m/s", "T": "1.2 s", "s0": "2 m", "a": "1.3 m/s²", "b": "1.7 m/s²"}
-
-
 #: Name of what evil files try to write.
 OUTSIDE = "outside"
 
@@ -79,82 +88,6 @@ class Target:
     read: Callable[[Path], Any]
 
 
-def _trajectories() -> pd.DataFrame:
-    rows = [
-        {
-            "sequence": s,
-            "time": 0.2 * k,
-            "agent": f"a{n}",
-            "x": 20.0 * n + 3.0 * k,
-            "y": 1.0 * n,
-            "length": 4.5,
-            "kind": "car",
-            "group": "",
-            "dest_x": 90.0,
-            "dest_y": 1.0 * n,
-        }
-        for s in ("one", "two")
-        for k in range(4)
-        for n in range(3)
-    ]
-    return pd.DataFrame(rows)
-
-
-def _vehicles() -> pd.DataFrame:
-    rows = [
-        {
-            "vehicle": n,
-            "time": 0.2 * k,
-            "x": 20.0 * n + 3.0 * k,
-            "lane": 1,
-            "speed": 15.0,
-            "length": 4.5,
-            "kind": 2,
-        }
-        for n in range(4)
-        for k in range(5)
-    ]
-    return pd.DataFrame(rows)
-
-
-def _pairs() -> pd.DataFrame:
-    rows = [
-        {
-            "pair": n,
-            "time": 0.2 * k,
-            "x_follower": 3.0 * k,
-            "v_follower": 15.0,
-            "x_leader": 20.0 + 3.0 * k,
-            "v_leader": 15.0,
-            "spacing": 15.5,
-            "follower": n,
-            "leader": 9,
-            "run": "a",
-            "split": "train",
-        }
-        for n in range(2)
-        for k in range(6)
-    ]
-    return pd.DataFrame(rows)
-
-
-def _platoon() -> bytes:
-    head = [
-        "Date,8,10,2019",
-        "Vehicle_order,A,B",
-        "Number_of_vehicles,2",
-        "ACC,1",
-        "Distance_setting,S",
-        "Time,Speed1,E1,N1,Speed2,E2,N2,IVS1",
-    ]
-    rows = [f"{5 + 0.1 * k:.1f},10,{k},0,10.1,{k - 20},0,{15 - 0.01 * k:.2f}" for k in range(9)]
-    return ("\n".join([*head, *rows]) + "\n").encode()
-
-
-def _csv(frame: pd.DataFrame) -> bytes:
-    return str(frame.to_csv(index=False)).encode()
-
-
 def _parquet(frame: pd.DataFrame) -> bytes:
     made = io.BytesIO()
     frame.to_parquet(made, index=False)
@@ -163,21 +96,20 @@ def _parquet(frame: pd.DataFrame) -> bytes:
 
 def _mat(*, packed: bool) -> bytes:
     cells = np.empty((1, 2), dtype=object)
-    for i in range(2):
-        x = 20.0 * np.arange(3)[:, None] + 3.0 * np.arange(4)
-        cells[0, i] = {"Xarr": x, "Tarr": 0.2 * np.arange(4)[None]}
+    x = 20.0 * np.arange(3)[:, None] + 3.0 * np.arange(4)
+    cells[0, 0] = cells[0, 1] = {"Xarr": x, "Tarr": 0.2 * np.arange(4)[None]}
     made = io.BytesIO()
     savemat(made, {"sequences": cells}, do_compression=packed)
     return made.getvalue()
 
 
-def _corridor() -> bytes:
-    lines = ["# framerate: 16", "# id frame x/m y/m z/m"]
-    lines += [f"{n} {k} {0.1 * k + n:.3f} {0.5 * n:.3f} 1.7" for n in (1, 2) for k in range(40)]
-    return ("\n".join(lines) + "\n").encode()
+def _walkway(path: Path) -> bytes:
+    with closing(sqlite3.connect(path)) as base:
+        base.executescript((CORPUS / "walkway.sql").read_text())
+    return path.read_bytes()
 
 
-def _checkpoint(scratch: Path) -> bytes:
+def _checkpoint(path: Path) -> bytes:
     options = {
         "term": "lin",
         "name": "lin",
@@ -198,16 +130,11 @@ def _checkpoint(scratch: Path) -> bytes:
         split={"train": ["demo/000"], "heldout": []},
         free_speed=25.0,
     )
-    save_checkpoint(checkpoint, scratch / "seed.pt")
-    return (scratch / "seed.pt").read_bytes()
+    save_checkpoint(checkpoint, path)
+    return path.read_bytes()
 
 
-def _open_checkpoint(path: Path) -> None:
-    checkpoint = load_checkpoint(path)
-    checkpoint.build()
-
-
-def _store(scratch: Path) -> tuple[bytes, bytes]:
+def _store(folder: Path) -> tuple[bytes, bytes]:
     items = [
         Sequence(
             name=f"r/{i}",
@@ -219,8 +146,51 @@ def _store(scratch: Path) -> tuple[bytes, bytes]:
         )
         for i in range(2)
     ]
-    write_store(scratch, items, {"domain": "crowd", "dt": 0.1})
-    return (scratch / MANIFEST).read_bytes(), (scratch / TABLE).read_bytes()
+    write_store(folder, items, {"domain": "crowd", "dt": 0.1})
+    return (folder / MANIFEST).read_bytes(), (folder / TABLE).read_bytes()
+
+
+def read_all(options: DataOptions, files: dict[str, Any]) -> None:
+    """Read files and look for faults, without the last resort for foreign errors."""
+    sequences: list[Sequence] = FORMATS[type(options)].read(files, options)
+    domain: Domain = "crowd" if options.domain == "crowd" else "traffic"
+    if domain == "crowd":
+        sequences, _ = drop_absent(sequences)
+    for sequence in sequences:
+        find_faults(sequence, domain)
+    identify(sequences, domain, options.agents)
+
+
+def _reads(*every: DataOptions, key: str | None = None, **others: Path) -> Callable[[Path], None]:
+    """A reader of a file, once with each of the options.
+
+    Args:
+        key: of the file among those that are read; by default its stem.
+        others: further files, which are sound.
+    """
+
+    def read(path: Path) -> None:
+        for options in every:
+            given = copy.copy(options)
+            if vars(given).get("path", MISSING) == MISSING:
+                vars(given)["path"] = str(path)
+            read_all(given, {**others, key or path.stem: path})
+
+    return read
+
+
+def _read_highd(path: Path) -> None:
+    files = {end: path.with_name(f"01{end}") for end in (TRACKS, TRACKS_META, RECORDING_META)}
+    read_all(HighDOptions(path=str(path), min_samples=2, dt=0.2), files)
+
+
+def _read_frame(path: Path) -> None:
+    """As a notebook gives it; what pickle makes of it is the campaign's own."""
+    Sequences.of(pickle.loads(path.read_bytes()))
+
+
+def _read_checkpoint(path: Path) -> None:
+    load_checkpoint(path).build()
 
 
 def _read_store(path: Path) -> None:
@@ -228,15 +198,16 @@ def _read_store(path: Path) -> None:
         item.velocity()
 
 
-def one(x: float) -> dict[str, Any]:
+def constant(x: float) -> dict[str, Any]:
     """A task whose kept result is damaged."""
     return {"x": x}
 
 
 def _read_kept(path: Path) -> None:
-    task = Task("one", one, {"x": 1.0})
-    found = run_tasks([task], path.parent.parent, workers=1, fingerprint="f")
-    assert found == {"one": {"x": 1.0}} or json.loads(path.read_text())["result"] == found["one"]
+    task = Task("one", constant, {"x": 1.0})
+    results = run_tasks([task], path.parent.parent, workers=1, fingerprint="f")
+    if results != {"one": {"x": 1.0}}:
+        assert json.loads(path.read_text())["result"] == results["one"]
 
 
 def _read_formula(path: Path) -> None:
@@ -250,122 +221,70 @@ def targets(scratch: Path) -> list[Target]:
     """All targets.
 
     Args:
-        scratch: receives the sound files, and the store whose files are damaged; evil files try to
-            write beside it.
+        scratch: receives what is damaged in its folder; evil files try to write beside it.
     """
     outside = scratch.with_name(OUTSIDE)
-    traffic = _trajectories().drop(columns=["y", "dest_y", "dest_x"])
-    crowd, walls = (
-        _trajectories().assign(x=lambda f: f["x"] / 15),
-        b"x1,y1,x2,y2\n0,0,5,0\n5,2,0,2\n",
-    )
-    of_traffic, of_crowd = TableOptions(domain="traffic"), TableOptions(domain="crowd")
-    (scratch / "crowd.csv").write_bytes(_csv(crowd))
+    sound = {path.name: path.read_bytes() for path in CORPUS.glob("*.*")}
+    shutil.copytree(CORPUS / "highd", scratch / "highd")
     manifest, table = _store(scratch / "manifest")
     (scratch / "table").mkdir()
     (scratch / "table" / MANIFEST).write_bytes(manifest)
-    (scratch / "kept" / KEPT).mkdir(parents=True)
-    run_tasks([Task("one", one, {"x": 1.0})], scratch / "kept", workers=1, fingerprint="f")
+    run_tasks([Task("one", constant, {"x": 1.0})], scratch / "kept", workers=1, fingerprint="f")
     kept = (scratch / "kept" / KEPT / "one.json").read_bytes()
-    checkpoint = _checkpoint(scratch)
-    pandas_only = JuelichOptions(frame_rate=None, unit=None, walls={"corridor": [0.0, 3.0]})
-    tracks = formats.highd(scratch / "highd")
-    (scratch / "room.txt").write_bytes(_corridor())
-    frames = [traffic, crowd, _vehicles(), _pairs()]
-    texts = [_csv(frame) for frame in frames]
-    texts += [_corridor(), formats.ngsim(), _platoon(), formats.flat_platoons()]
-
-    def reads(*every: DataOptions, key: str | None = None, **more: Path) -> Callable[[Path], None]:
-        """A reader of a file, once with each of the options.
-
-        Args:
-            key: of the file among those that are read; by default its stem.
-            more: further files, which are sound.
-        """
-
-        def read(path: Path) -> None:
-            for options in every:
-                given = copy.copy(options)
-                if vars(given).get("path", MISSING) == MISSING:
-                    vars(given)["path"] = str(path)
-                read_all(given, {**more, key or path.stem: path})
-
-        return read
-
+    checkpoint = _checkpoint(scratch / "seed.pt")
+    tracks = f"highd/01{TRACKS}"
+    tables = ["traffic.csv", "crowd.csv", "vehicles.csv", "pairs.csv"]
+    frames = [pd.read_csv(CORPUS / name, keep_default_na=False) for name in tables]
     windows = (None, 0.4)
-    area = WalkwayOptions(path=str(scratch / "room.txt"), t_seq=1.0)
-    fcd = SumoOptions(dt=0.5, min_samples=2)
     vehicles = [VehicleTableOptions(min_samples=2, window=window) for window in windows]
-    pairs = [PairOptions(), PairOptions(dt=0.4, window=0.8, min_samples=2)]
     ngsim = [NgsimOptions(min_samples=2, dt=0.1, window=window) for window in windows]
+    pairs = [PairOptions(), PairOptions(dt=0.4, window=0.8, min_samples=2)]
+    juelich = JuelichOptions(frame_rate=None, unit=None, walls={"corridor": [0.0, 3.0]})
+    traffic, crowd = TableOptions(domain="traffic"), TableOptions(domain="crowd")
+    area = WalkwayOptions(path=str(CORPUS / "corridor.txt"), t_seq=1.0)
+    of_area = _reads(area, key=GEOMETRY, **{PEOPLE: CORPUS / "corridor.txt"})
+    of_walls = _reads(crowd, key=WALLS, **{TIDY: CORPUS / "crowd.csv"})
+
+    def text(name: str, file: str, read: Callable[[Path], Any], *names: str) -> Target:
+        """A target of malformed text files from those of the corpus."""
+        return Target(name, file, damaged_text(*(sound[name] for name in names)), read)
+
+    def binary(name: str, file: str, read: Callable[[Path], Any], *contents: bytes) -> Target:
+        return Target(name, file, damaged_bytes(*contents), read)
+
+    of_openacc = _reads(OpenAccOptions(min_duration=0.3), key="platoon.csv")
+    checked = [*tables, "corridor.txt", "ngsim.csv", "openacc.csv", "openacc_flat.csv"]
+    mats = _mat(packed=False), _mat(packed=True)
+    sumo, fcd = _reads(SumoOptions(dt=0.5, min_samples=2)), sound["fcd.xml"]
     return [
-        Target(
-            "esimas",
-            "sequence_datademo.mat",
-            damaged_bytes(_mat(packed=False), _mat(packed=True)),
-            reads(EsimasOptions(), key="demo"),
-        ),
-        Target("juelich", "corridor.txt", damaged_text(_corridor()), reads(pandas_only)),
-        Target("table CSV", "table.csv", damaged_text(_csv(traffic)), reads(of_traffic, key=TIDY)),
-        Target(
-            "table CSV, crowd", "people.csv", damaged_text(_csv(crowd)), reads(of_crowd, key=TIDY)
-        ),
-        Target(
-            "table Parquet",
-            "table.parquet",
-            damaged_bytes(_parquet(traffic)),
-            reads(of_traffic, key=TIDY),
-        ),
-        Target("vehicles CSV", "cars.csv", damaged_text(_csv(_vehicles())), reads(*vehicles)),
-        Target(
-            "pairs CSV", "pairs.csv", damaged_text(_csv(_pairs())), reads(*pairs, key="pairs.csv")
-        ),
-        Target(
-            "OpenACC",
-            "platoon.csv",
-            damaged_text(_platoon(), formats.flat_platoons()),
-            reads(OpenAccOptions(min_duration=0.3), key="platoon.csv"),
-        ),
-        Target("NGSIM", "ngsim.csv", damaged_text(formats.ngsim()), reads(*ngsim)),
-        Target("highD, tracks", f"highd/01{TRACKS}", damaged_text(tracks), formats.read_highd),
-        Target("SUMO", "fcd.xml", damaged_text(*formats.sumo()), reads(fcd)),
-        Target(
+        binary("esimas", "sequence_datademo.mat", _reads(EsimasOptions(), key="demo"), *mats),
+        text("juelich", "corridor.txt", _reads(juelich), "corridor.txt"),
+        text("table CSV", "table.csv", _reads(traffic, key=TIDY), "traffic.csv"),
+        text("table CSV, crowd", "people.csv", _reads(crowd, key=TIDY), "crowd.csv"),
+        binary("table Parquet", "table.parquet", _reads(traffic, key=TIDY), _parquet(frames[0])),
+        text("vehicles CSV", "cars.csv", _reads(*vehicles), "vehicles.csv"),
+        text("pairs CSV", "pairs.csv", _reads(*pairs, key="pairs.csv"), "pairs.csv"),
+        text("OpenACC", "platoon.csv", of_openacc, "openacc.csv", "openacc_flat.csv"),
+        text("NGSIM", "ngsim.csv", _reads(*ngsim), "ngsim.csv"),
+        Target("highD, tracks", tracks, damaged_text((CORPUS / tracks).read_bytes()), _read_highd),
+        Target("SUMO", "fcd.xml", damaged_text(fcd, gzip.compress(fcd)), sumo),
+        binary(
             "JuPedSim",
             "walk.sqlite",
-            damaged_bytes(formats.walkway(scratch)),
-            reads(WalkwayOptions(t_seq=1.0), key=PEOPLE),
+            _reads(WalkwayOptions(t_seq=1.0), key=PEOPLE),
+            _walkway(scratch / "seed.sqlite"),
         ),
+        text("walkable area", "area.wkt", of_area, "area.wkt"),
+        Target("data frame", "frame.pickle", strange_frame(frames), _read_frame),
+        text("check", "checked.csv", lambda path: repr(check_file(path)), *checked),
+        text("walls CSV", "walls.csv", of_walls, "walls.csv"),
+        binary("checkpoint, bytes", "bytes.pt", _read_checkpoint, checkpoint),
         Target(
-            "walkable area",
-            "area.wkt",
-            damaged_text(formats.ROOM.encode()),
-            reads(area, key=GEOMETRY, **{PEOPLE: scratch / "room.txt"}),
+            "checkpoint, evil", "evil.pt", evil_checkpoint(checkpoint, outside), _read_checkpoint
         ),
-        Target("data frame", "frame.pickle", strange_frame(frames), formats.read_frame),
-        Target("check", "checked.csv", damaged_text(*texts), lambda path: repr(check_file(path))),
-        Target(
-            "walls CSV",
-            "walls.csv",
-            damaged_text(walls),
-            reads(of_crowd, key=WALLS, **{TIDY: scratch / "crowd.csv"}),
-        ),
-        Target("checkpoint, bytes", "bytes.pt", damaged_bytes(checkpoint), _open_checkpoint),
-        Target(
-            "checkpoint, evil", "evil.pt", evil_checkpoint(checkpoint, outside), _open_checkpoint
-        ),
-        Target("checkpoint, values", "values.pt", strange_checkpoint(checkpoint), _open_checkpoint),
+        Target("checkpoint, values", "values.pt", strange_checkpoint(checkpoint), _read_checkpoint),
         Target("formula", "law.txt", damaged_formula(*_FORMULAS), _read_formula),
         Target("store, manifest", f"manifest/{MANIFEST}", damaged_text(manifest), _read_store),
         Target("store, table", f"table/{TABLE}", damaged_bytes(table), _read_store),
         Target("kept result", f"kept/{KEPT}/one.json", damaged_text(kept), _read_kept),
     ]
-
-
-def quiet() -> None:
-    """One thread, and no words from the libraries, which would cost more than the reading."""
-    import logging
-    import warnings
-
-    torch.set_num_threads(1)
-    logging.disable(logging.CRITICAL)
-    warnings.simplefilter("ignore")

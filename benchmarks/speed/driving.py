@@ -13,8 +13,8 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +32,16 @@ from nnode.model.laws import CAR_FOLLOWING_LAWS, Law, law_from
 PLATOON, STEP, SECONDS = 20, 0.1, 60.0
 
 
-def law(name: str) -> Traffic:
+def system(name: str) -> Traffic:
     """``idm``; ``chained``: a law of first order that looks at the speed ahead in the same step."""
     if name == "idm":
         return Traffic([law_from("idm", CAR_FOLLOWING_LAWS["idm"])], leader="measured")
-    system = Traffic([Law("lin", v0=20.0, L=7.0)], leader="measured")
-    add_effects(system, [{"name": "relative_speed", "kappa": 0.3}])
-    return system
+    chained = Traffic([Law("lin", v0=20.0, L=7.0)], leader="measured")
+    add_effects(chained, [{"name": "relative_speed", "kappa": 0.3}])
+    return chained
 
 
-LAWS = ("idm", "chained")
+LAWS, OWN = ("idm", "chained"), "SUMO's"
 
 
 def scene(folder: Path, number: int) -> Path:
@@ -63,37 +63,35 @@ def scene(folder: Path, number: int) -> Path:
     )
     (folder / "a.rou.xml").write_text(f"<routes>{types}{routes}{cars}</routes>")
     network(sumo_home(), folder, nodes, edges)
-    found = folder / "a.sumocfg"
-    found.write_text(
+    scenario = folder / "a.sumocfg"
+    scenario.write_text(
         '<configuration><input><net-file value="a.net.xml"/><route-files value="a.rou.xml"/>'
         f'</input><time><step-length value="{STEP}"/><end value="{SECONDS}"/></time>'
         '<report><no-warnings value="true"/></report></configuration>'
     )
-    return found
+    return scenario
 
 
-def alone(program: str, scenario: Path, folder: Path) -> dict[str, Any]:
-    """SUMO with its own drivers."""
-    sumo = RunningSumo(program, scenario, folder / "fcd.xml.gz")
-    steps, started = 0, time.perf_counter()
-    try:
-        while sumo.continues(None):
-            sumo.step()
-            steps += 1
-    finally:
-        sumo.close()
-    return {"steps": steps, "steps_per_s": steps / (time.perf_counter() - started)}
-
-
-def measured(name: str, program: str, scenario: Path, folder: Path) -> dict[str, Any]:
-    """The same with vehicles driven by a law."""
-    found = drive(law(name), scenario, ["own"], folder, program=program)
+def measured(law: str, program: str, scenario: Path) -> dict[str, Any]:
+    """Steps per second while a law drives the vehicles, or SUMO itself."""
+    folder = scenario.parent
+    if law == OWN:
+        sumo = RunningSumo(program, scenario, folder / "fcd.xml.gz")
+        steps, start = 0, time.perf_counter()
+        try:
+            while sumo.continues(None):
+                sumo.step()
+                steps += 1
+        finally:
+            sumo.close()
+        return {"steps": steps, "steps_per_s": steps / (time.perf_counter() - start)}
+    driven = drive(system(law), scenario, ["own"], folder, program=program)
     return {
-        "steps": found.steps,
-        "steps_per_s": found.steps / found.wall,
-        "in_sumo": found.in_sumo / found.wall,
-        "driven": found.driven,
-        "collisions": found.collisions,
+        "steps": driven.steps,
+        "steps_per_s": driven.steps / driven.wall,
+        "in_sumo": driven.in_sumo / driven.wall,
+        "driven": driven.driven,
+        "collisions": driven.collisions,
     }
 
 
@@ -101,20 +99,13 @@ def rows(
     numbers: Sequence[int], laws: Sequence[str], programs: Sequence[str], repeats: int
 ) -> Iterator[dict[str, Any]]:
     """The best of some repeats for every case."""
-
-    def best(call: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        return max((call() for _ in range(repeats)), key=lambda row: row["steps_per_s"])
-
     for number in numbers:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            scenario = scene(folder, number)
-            for program in programs:
-                own = best(partial(alone, program, scenario, folder))
-                yield {"vehicles": number, "program": program, "law": "SUMO's", **own}
-                for kind in laws:
-                    more = best(partial(measured, kind, program, scenario, folder))
-                    yield {"vehicles": number, "program": program, "law": kind, **more}
+        with tempfile.TemporaryDirectory() as folder:
+            scenario = scene(Path(folder), number)
+            for program, law in product(programs, (OWN, *laws)):
+                repeated = [measured(law, program, scenario) for _ in range(repeats)]
+                best = max(repeated, key=lambda row: row["steps_per_s"])
+                yield {"vehicles": number, "program": program, "law": law, **best}
 
 
 def main() -> None:
@@ -127,17 +118,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark/driving.json"))
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    found = []
+    results = []
     for row in rows(asked.vehicles, asked.laws, asked.programs, asked.repeats):
-        found.append(row)
+        results.append(row)
         share = f", {100 * row['in_sumo']:.0f} % in SUMO" if "in_sumo" in row else ""
         print(
             f"{row['vehicles']} vehicles, {row['law']} law, {row['program']}: "
             f"{row['steps_per_s']:.0f} steps/s{share}",
             flush=True,
         )
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(asked.out, {"rows": found})
+    write_json(asked.out, {"rows": results})
     print(f"results: {asked.out}")
 
 

@@ -94,7 +94,6 @@ def main() -> None:
                 f"{100 * one['share_of_time']:.2f} % of its time; first call "
                 f"{one['pooled']['cold']['wall_s']:.1f} s"
             )
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
     write_json(asked.out, {"laws": found})
     print(f"results: {asked.out}")
 

@@ -11,8 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.synthetic_cases.case import ARMS, STRENGTHS, TABLE, TRUTH, WALLS, Case
+from benchmarks.synthetic_cases.subject import Subject
 
-__all__ = ["ARMS", "STRENGTHS", "TABLE", "TRUTH", "WALLS", "Case", "generate"]
+__all__ = ["ARMS", "STRENGTHS", "TABLE", "TRUTH", "WALLS", "Case", "generate", "subject_of"]
+
+
+def subject_of(case: Case) -> Subject:
+    """The platoons or crowds of a case; compiled code is loaded for one domain alone."""
+    if case.domain == "crowd":
+        from benchmarks.synthetic_cases.crowd.case import CrowdCase
+
+        return CrowdCase(case)
+    from benchmarks.synthetic_cases.traffic.case import TrafficCase
+
+    return TrafficCase(case)
 
 
 def generate(case: Case, folder: Path) -> dict[str, Any]:
@@ -23,17 +35,7 @@ def generate(case: Case, folder: Path) -> dict[str, Any]:
 
     Returns:
         The truth, as ``truth.json`` holds it.
-
-    Raises:
-        ConfigError: an effect that the domain does not know.
     """
     from benchmarks.synthetic_cases.files import write
 
-    # compiled code is loaded for one domain alone
-    if case.domain == "crowd":
-        from benchmarks.synthetic_cases.crowd.case import CrowdCase
-
-        return write(CrowdCase(case), folder)
-    from benchmarks.synthetic_cases.traffic.case import TrafficCase
-
-    return write(TrafficCase(case), folder)
+    return write(subject_of(case), folder)

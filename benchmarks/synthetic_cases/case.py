@@ -1,17 +1,18 @@
-"""One hidden truth, fully determined: what is hidden, how strongly, in which data, which seed."""
+"""Cases: what is hidden, how strongly, in which data, with which seed; the cases of each arm."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.synthetic_cases.catalogue import CATALOGUES
 from nnode.errors import ConfigError
 
 #: Share of the recalibrated model's excess cost that an oracle removes; ``full``: no driver noise.
@@ -27,11 +28,15 @@ ARMS: dict[str, str] = {
     "no_excitation": "an effect that these data cannot show: say that it is not testable",
     "fault": "a fault of the data and nothing else: locate it",
 }
-
+#: Kinds of data in which nothing is hidden, and the one that a domain has besides.
+NULLS = ("white", "autocorrelated", "windows", "heterogeneous")
+_OWN_NULL = {"traffic": "recording", "crowd": "slow"}
+#: Kinds of fault, see :mod:`benchmarks.synthetic_cases.faults`.
+FAULTS = ("identity_swap", "jump", "overlap")
+#: Runs of the variant ``recording``, whatever is asked for, and its noise, m.
+_RECORDINGS, _RECORDING_NOISE = 2, 0.1
 #: Standard deviation of measured positions (m) called low, by domain.
 LOW_NOISE = {"traffic": 0.05, "crowd": 0.01}
-#: That of the variant ``recording``, m.
-RECORDING_NOISE = 0.1
 
 #: Files of a case, in a folder of its own.
 TABLE, WALLS, TRUTH = "trajectories.csv", "walls.csv", "truth.json"
@@ -45,6 +50,7 @@ _WINDOWS: dict[tuple[str, str], tuple[float, int]] = {
     ("traffic", "recording"): (10.0, 8),
     ("crowd", "windows"): (3.0, 16),
 }
+_COMMIT = re.compile(r"[0-9a-f]{40}([0-9a-f]{24})?")
 
 
 class Window(NamedTuple):
@@ -70,8 +76,8 @@ class Case:
         domain: ``traffic`` or ``crowd``.
         arm: a key of :data:`ARMS`.
         effects: names of the hidden effects, of the catalogue or outside it.
-        variant: ``plain``; of nulls one of :data:`~benchmarks.synthetic_cases.arms.NULLS`; of
-            near misses ``smooth`` or ``heavy_tails``; of faults the kind of fault.
+        variant: ``plain``; of nulls one of :data:`NULLS`, of traffic also ``recording``, of crowds
+            ``slow``; of near misses ``smooth`` or ``heavy_tails``; of faults the kind of fault.
         strength: a key of :data:`STRENGTHS`.
         noise: standard deviation of measured positions, m; None takes :data:`LOW_NOISE`.
         n_sequences: number of runs, which share nothing; each is one sequence, or is cut into
@@ -79,8 +85,8 @@ class Case:
         seed: of everything random.
 
     Raises:
-        ConfigError: an unknown domain, arm or strength, a size that makes no sense, or windows of
-            data in which something is hidden.
+        ConfigError: an unknown domain, arm, strength or effect, a size that makes no sense, or
+            windows of data in which something is hidden.
     """
 
     domain: str
@@ -93,13 +99,14 @@ class Case:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, known in (("domain", _SIZES), ("arm", ARMS), ("strength", STRENGTHS)):
-            value = getattr(self, name)
-            if value not in known:
-                raise ConfigError(f"{name}={value}: expected one of {', '.join(known)}")
+        for name, expected in (("domain", _SIZES), ("arm", ARMS), ("strength", STRENGTHS)):
+            _check(name, getattr(self, name), expected)
+        for effect in self.effects:
+            _check(f"{self.domain} effect", effect, CATALOGUES[self.domain].effects)
         object.__setattr__(self, "effects", tuple(self.effects))
         if self.noise is None:
-            low = RECORDING_NOISE if self.variant == "recording" else LOW_NOISE[self.domain]
+            recording = self.variant == "recording"
+            low = _RECORDING_NOISE if recording else LOW_NOISE[self.domain]
             object.__setattr__(self, "noise", low)
         if self.n_sequences < 1:
             raise ConfigError(f"n_sequences={self.n_sequences}: expected at least one")
@@ -122,23 +129,15 @@ class Case:
         return self.domain, self.variant
 
     @property
-    def n_agents(self) -> int:
-        """Vehicles, the leader included, or people of a run."""
-        return self._size[0]
-
-    @property
-    def duration(self) -> float:
-        """Of a run, s."""
-        return self._size[1]
-
-    @property
-    def dt(self) -> float:
-        """Sampling interval, s."""
-        return self._size[2]
-
-    @property
-    def _size(self) -> tuple[int, float, float]:
+    def size(self) -> tuple[int, float, float]:
+        """Vehicles (the leader included) or people, duration (s) and sampling interval (s)."""
         return _OWN_SIZES.get(self._kind, _SIZES[self.domain])
+
+    @property
+    def n_steps(self) -> int:
+        """Steps between the samples of a run; one sample more is recorded."""
+        _, duration, dt = self.size
+        return round(duration / dt)
 
     @property
     def runs(self) -> list[str]:
@@ -157,24 +156,20 @@ class Case:
         ahead, whose last follower leads it, and from one window to the next they move by those
         that are left over: all vehicles of a stream hang together, as in a recording.
         """
+        n_agents, duration, dt = self.size
         if self._kind not in _WINDOWS:
-            whole = slice(0, self.n_steps + 1), slice(0, self.n_agents)
+            whole = slice(0, self.n_steps + 1), slice(0, n_agents)
             return [Window(name, i, *whole) for i, name in enumerate(self.runs)]
         seconds, agents = _WINDOWS[self._kind]
-        length, number = round(seconds / self.dt), round(self.duration / seconds)
-        groups, over = divmod(self.n_agents - 1, agents - 1)
-        found = []
+        length, number = round(seconds / dt), round(duration / seconds)
+        groups, over = divmod(n_agents - 1, agents - 1)
+        windows = []
         for (i, run), w, g in product(enumerate(self.runs), range(number), range(groups)):
             first = g * (agents - 1) + (over if w % 2 else 0)
             name = f"{run}w{w}" + (f"g{g}" if groups > 1 else "")
             samples = slice(w * length, (w + 1) * length)
-            found.append(Window(name, i, samples, slice(first, first + agents)))
-        return found
-
-    @property
-    def n_steps(self) -> int:
-        """Steps between the samples of a sequence; one sample more is recorded."""
-        return round(self.duration / self.dt)
+            windows.append(Window(name, i, samples, slice(first, first + agents)))
+        return windows
 
     def to_dict(self) -> dict[str, Any]:
         """The arguments, as plain JSON."""
@@ -195,23 +190,107 @@ class Case:
         Cases that differ in strength or noise alone share their roads, drivers and coefficients,
         so that a map over strength and noise compares like with like.
         """
-        content = {**self.to_dict(), "n_agents": self.n_agents, "duration": self.duration}
+        n_agents, duration, dt = self.size
         # the law is drawn; the entry keeps the seeds of earlier versions
-        content |= {"dt": self.dt, "law": None}
+        content = {**self.to_dict(), "n_agents": n_agents, "duration": duration}
+        content |= {"dt": dt, "law": None}
         del content["strength"], content["noise"]
         text = json.dumps([content, purpose], sort_keys=True).encode()
         return np.random.default_rng(list(hashlib.sha256(text).digest()))
 
 
-def check_effects(case: Case, known: Iterable[str]) -> None:
-    """Refuse effects that a domain does not know.
+def _check(name: str, value: str, expected: Collection[str]) -> None:
+    if value not in expected:
+        raise ConfigError(f"{name}={value}: expected one of {', '.join(expected)}")
+
+
+def hidden(domain: str, arm: str) -> list[tuple[tuple[str, ...], str]]:
+    """The effects and the variant of each case of an arm.
 
     Raises:
-        ConfigError: names the first unknown one and those that are known.
+        ConfigError: an unknown domain or arm.
     """
-    names = list(known)
-    for effect in case.effects:
-        if effect not in names:
-            raise ConfigError(
-                f"effect {effect} is unknown in {case.domain}, expected some of {', '.join(names)}"
-            )
+    _check("domain", domain, CATALOGUES)
+    _check("arm", arm, ARMS)
+    catalogue = CATALOGUES[domain]
+    match arm:
+        case "pair":
+            return [(tuple(pair), "plain") for pair in catalogue.pairs]
+        case "near_miss":
+            near = catalogue.near_misses.items()
+            cases = [((name,), variant) for variant, names in near for name in names]
+            return [*cases, ((), "heavy_tails")]
+        case "fault":
+            return [((), kind) for kind in FAULTS]
+        case "nothing":
+            return [((), variant) for variant in (*NULLS, _OWN_NULL[domain])]
+    names: Collection[str] = {
+        "single": catalogue.named,
+        "outside": catalogue.outside,
+        "no_excitation": catalogue.needs_excitation,
+    }[arm]
+    return [((name,), "plain") for name in names]
+
+
+def cases(
+    domain: str,
+    arm: str,
+    *,
+    seeds: Collection[int],
+    strengths: Collection[str] = ("medium",),
+    noises: Collection[float | None] = (None,),
+    sizes: Collection[int] = (20,),
+    effects: Collection[str] | None = None,
+    variants: Collection[str] | None = None,
+) -> list[Case]:
+    """Every case of an arm: what it hides × strengths × noise × number of sequences × seeds.
+
+    Strength has no meaning where nothing is hidden or nothing can be seen; such arms come with
+    the strength ``full`` only.
+
+    Args:
+        noises: standard deviations of measured positions (m); None takes the domain's low one.
+        sizes: numbers of runs.
+        effects: keeps the cases that hide at least one of these.
+        variants: keeps the cases of these variants.
+
+    Raises:
+        ConfigError: an unknown domain, arm or strength.
+    """
+    return [
+        Case(
+            domain=domain,
+            arm=arm,
+            effects=names,
+            variant=variant,
+            strength=strength,
+            noise=noise,
+            n_sequences=size,
+            seed=seed,
+        )
+        for names, variant in hidden(domain, arm)
+        if effects is None or set(effects) & set(names)
+        if variants is None or variant in variants
+        for strength, noise, size, seed in product(
+            strengths if names and arm != "no_excitation" else ["full"],
+            noises,
+            [_RECORDINGS] if variant == "recording" else sizes,
+            seeds,
+        )
+    ]
+
+
+def first_seed(commit: str) -> int:
+    """The first of the seeds that belong to a commit: nobody can look at their cases before it.
+
+    The first seven hexadecimal digits of the SHA-256 digest of the full hash, as a number.
+
+    Raises:
+        ConfigError: no full hash in small letters.
+    """
+    if not _COMMIT.fullmatch(commit):
+        raise ConfigError(
+            f"{commit!r} is no full hash of a commit: expected the 40 or 64 characters that "
+            "git rev-parse COMMIT prints"
+        )
+    return int(hashlib.sha256(commit.encode()).hexdigest()[:7], 16)

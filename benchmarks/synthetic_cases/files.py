@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.synthetic_cases.case import TABLE, TRUTH, WALLS, Case
-from benchmarks.synthetic_cases.faults import Fault, insert
-from benchmarks.synthetic_cases.strength import Subject
+from benchmarks.synthetic_cases.catalogue import CATALOGUES
+from benchmarks.synthetic_cases.faults import insert
+from benchmarks.synthetic_cases.subject import Subject
 from nnode.files import write_json, write_text
 
 
@@ -22,64 +23,64 @@ def write(subject: Subject, folder: Path) -> dict[str, Any]:
         The content of ``truth.json``.
     """
     case, truth = subject.case, subject.truth
-    x = subject.measured(truth)
-    faults: list[Fault] = []
-    if case.arm == "fault":
-        x, faults = insert(case, x)
     letter = "v" if case.domain == "traffic" else "p"
     # no agent is in two runs, and windows of a run share their agents
-    agents = [[f"{run}{letter}{i}" for i in range(case.n_agents)] for run in case.runs]
-    clock = subject.clocks[:, None] + case.dt * np.arange(case.n_steps + 1)
+    agents = [[f"{run}{letter}{i}" for i in range(case.size[0])] for run in case.runs]
+    clock = subject.clocks[:, None] + case.size[2] * np.arange(case.n_steps + 1)
     clock = np.asarray(np.round(clock, 6))
+    x = subject.measured()
+    faults: list[dict[str, Any]] = []
+    if case.arm == "fault":
+        x, faults = insert(case, x, agents, clock)
     write_text(folder / TABLE, _table(case, clock, agents, subject.columns(x)))
     if len(subject.walls):
         walls = pd.DataFrame(subject.walls, columns=["x1", "y1", "x2", "y2"])
         write_text(folder / WALLS, str(walls.to_csv(index=False)))
-    names, catalogue = case.names, subject.catalogue
-    outside = {name for name in case.effects if name not in catalogue.CATALOGUE}
+    catalogue = CATALOGUES[case.domain]
     costs = subject.costs(truth) if case.effects else None
 
-    def described(chosen: list[str]) -> list[dict[str, Any]]:
-        return [_described(name, catalogue.EFFECTS[name], truth.effects[name]) for name in chosen]
+    def described(names: Iterable[str]) -> list[dict[str, Any]]:
+        return [
+            {
+                "name": name,
+                "formula": (effect := catalogue.effects[name]).formula,
+                "coefficients": {
+                    key: {"value": value, "unit": effect.coefficients[key]["unit"]}
+                    for key, value in truth.effects[name].items()
+                },
+            }
+            for name in names
+        ]
 
-    content = {
+    content: dict[str, Any] = {
         "case": case.to_dict(),
         "key": case.key,
-        **subject.base(),
-        "effects": described([n for n in case.effects if n not in outside]),
-        "outside": described([n for n in case.effects if n in outside]),
-        "nuisance": described([n for n in truth.effects if n not in case.effects]),
-        "data_faults": [fault.to_dict(names, agents, clock) for fault in faults],
+        "model": subject.model,
+        "base": subject.base,
+        **({"edge": truth.smooth} if case.domain == "traffic" else {}),
+        "effects": described(n for n in case.effects if n in catalogue.named),
+        "outside": described(n for n in case.effects if n not in catalogue.named),
+        "nuisance": described(n for n in truth.effects if n not in case.effects),
+        "data_faults": faults,
         "noise": {
             "measurement": case.sigma,
             "amplitude": truth.amplitude,
             "unit": subject.unit,
             "correlation": subject.correlation,
         },
-        "strength": {
-            "share": subject.amplitude.share,
-            "reached": costs.share if costs is not None else None,
-            "misfit": subject.amplitude.misfit,
-            "spread": subject.amplitude.spread,
-            "alone": subject.amplitude.alone,
-        },
-        "cost": None
-        if costs is None
-        else {
+        "strength": subject.strength,
+        "cost": None,
+    }
+    if costs is not None:
+        content["strength"]["reached"] = costs.share
+        content["cost"] = {
             "unit": "m²",
             "floor": costs.floor,
-            "base": dict(zip(names, costs.base.tolist(), strict=True)),
-            "oracle": dict(zip(names, costs.oracle.tolist(), strict=True)),
-        },
-    }
+            "base": dict(zip(case.names, costs.base.tolist(), strict=True)),
+            "oracle": dict(zip(case.names, costs.oracle.tolist(), strict=True)),
+        }
     write_json(folder / TRUTH, content)
     return content
-
-
-def _described(name: str, effect: Any, values: Mapping[str, float]) -> dict[str, Any]:
-    """An effect with formula, coefficients and units."""
-    coefficients = {k: {"value": v, "unit": effect.units[k]} for k, v in values.items()}
-    return {"name": name, "formula": effect.formula, "coefficients": coefficients}
 
 
 def _table(
@@ -92,7 +93,7 @@ def _table(
         agents: N names by run.
         columns: ``(S, K + 1, N)`` or, where they do not change, ``(S, N)``.
     """
-    shape = (*clock.shape, case.n_agents)
+    shape = (*clock.shape, case.size[0])
     whole = {"time": clock[:, :, None], "agent": np.array(agents), **columns}
     spread = {
         name: np.broadcast_to(value if value.ndim == 3 else value[:, None], shape)

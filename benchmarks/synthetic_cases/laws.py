@@ -122,7 +122,7 @@ def _leader(rng: np.random.Generator, steps: int, fastest: float) -> np.ndarray:
     speed = [float(rng.uniform(0.3, 0.9) * fastest)]
     for rate in rates[: steps - 1]:
         speed.append(min(max(speed[-1] + STEP * rate, 0.0), fastest))
-    return np.asarray(np.concatenate([[0.0], np.cumsum(speed[:-1])]) * STEP)
+    return np.concatenate([[0.0], np.cumsum(speed[:-1])]) * STEP
 
 
 def _fading(

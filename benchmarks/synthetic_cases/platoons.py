@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.synthetic_cases.noise import ornstein_uhlenbeck
-from benchmarks.synthetic_cases.traffic.motion import LINEAR, Hidden, simulate
+from benchmarks.synthetic_cases.traffic.motion import Base, Hidden, simulate
 
 #: Sampling interval, s, and steps of Runge–Kutta's method in it.
 DT, SUBSTEPS = 0.2, 4
@@ -18,7 +18,7 @@ def waves(rng: np.random.Generator, number: int, seconds: float, mean: float) ->
         rng.uniform(low, high, (3, number, 1))
         for low, high in ((0.3, 1.5), (8, 40), (0, 2 * np.pi))
     )
-    return np.asarray(mean + (size * np.sin(2 * np.pi * t / period + phase)).sum(0))
+    return mean + (size * np.sin(2 * np.pi * t / period + phase)).sum(0)
 
 
 def platoons(
@@ -52,20 +52,16 @@ def platoons(
     shape = (number, vehicles, (speed.shape[1] + 1) // 2)
     kick = push * ornstein_uhlenbeck(rng, shape, step=step, correlation=correlation)
     x, _ = simulate(
-        LINEAR,
-        v0,
-        L,
+        Base(v0, L),
         hidden,
         np.ones((number, vehicles)),
-        lead,
-        speed,
-        start[:, None],
-        np.repeat(speed[:, :1], vehicles, 1)[:, None],
-        np.ascontiguousarray(kick.transpose(0, 2, 1)),
+        (lead, speed),
+        (start[:, None], np.repeat(speed[:, :1], vehicles, 1)[:, None]),
+        kick.transpose(0, 2, 1),
         np.zeros(number),
         -before,
         step,
         SUBSTEPS,
     )
     x = x[:, round(before / DT) :]
-    return np.asarray(x + error * rng.normal(size=x.shape))
+    return x + error * rng.normal(size=x.shape)

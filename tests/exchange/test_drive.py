@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from benchmarks.programs import sumo as by_sumo
-from benchmarks.programs.laws import IDM
+from benchmarks.programs.laws import LAWS
 from benchmarks.programs.sumo import SLOWLY
 from nnode.app.python.inputs import model_options
 from nnode.data.readers.sumo import SumoOptions, read_sumo
@@ -211,7 +211,11 @@ def case(
             for name in ("krauss", "gipps", "newell")
         ),
         # it brakes by v/dt at most, so that no step ends at rest
-        case("own", partial(model, {"term": "formula", "name": "own", "law": IDM}), "ballistic"),
+        case(
+            "own",
+            partial(model, {"term": "formula", "name": "own", "law": LAWS["sumo_idm"]}),
+            "ballistic",
+        ),
         case("a2", ACCELERATIONS, "semi_implicit", profile=SLOWLY, far=100.0),
         case("a2 ballistic", ACCELERATIONS, "ballistic", profile=SLOWLY, far=100.0),
         case("n4", SPEEDS, "euler", profile=SLOWLY, far=100.0),

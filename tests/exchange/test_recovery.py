@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import ModuleType
 
 import numpy as np
 import pytest
 
-from benchmarks.discovery.recovery import CASES, NORMAL, Recovered
+from benchmarks.discovery import recovery
+from benchmarks.discovery.recovery import NORMAL, Recovered
 
 pytestmark = pytest.mark.slow
 
@@ -31,8 +31,7 @@ FAR = 3.3
 
 @cache
 def recovered(name: str) -> Recovered:
-    with TemporaryDirectory() as folder:
-        return CASES[name].recovered(Path(folder))
+    return recovery.recovered(name)
 
 
 def check(result: Recovered, unknown: set[str], same: float = SAME) -> None:

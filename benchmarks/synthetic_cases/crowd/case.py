@@ -1,156 +1,281 @@
-"""Synthetic measured crowds in which an effect is hidden."""
+"""Synthetic measured crowds in which an effect is hidden: people who walk both ways in a corridor,
+alone and in groups."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.synthetic_cases.case import Case, check_effects
-from benchmarks.synthetic_cases.crowd import catalogue
-from benchmarks.synthetic_cases.crowd.catalogue import EFFECTS, Coefficients
-from benchmarks.synthetic_cases.crowd.motion import Hidden, simulate
-from benchmarks.synthetic_cases.crowd.replay import Windows, cost_by_sequence
-from benchmarks.synthetic_cases.crowd.scene import BURN_IN, SUBSTEPS, Scene, set_scene
-from benchmarks.synthetic_cases.strength import Costs, Range, Subject, set_strength
+from benchmarks.synthetic_cases.case import Case
+from benchmarks.synthetic_cases.catalogue import CATALOGUES
+from benchmarks.synthetic_cases.crowd.motion import Base, Hidden, People, simulate
+from benchmarks.synthetic_cases.noise import ornstein_uhlenbeck
+from benchmarks.synthetic_cases.subject import Range, Subject, Truth
 
-#: Standard deviation of people's accelerations, m/s².
-AMPLITUDES = Range(preferred=(0.02, 0.15), extreme=(0.005, 0.35), idle=(0.04, 0.15), probe=0.02)
-#: Standard deviation of eta where people differ and that is a nuisance.
-_NUISANCE = (0.15, 0.35)
-#: So many crowds show how large a misfit or a displacement is about; all show the share.
-_SOME = 8
-#: Steps between two samples when the truth is replayed.
-_FINE = 2
+#: Steps of Runge–Kutta's method between two samples, and when the truth is replayed.
+SUBSTEPS, _FINE = 10, 2
+#: Seconds that people walk before they are recorded, and length of a window that is replayed, s.
+BURN_IN, WINDOW = 1.0, 1.5
+#: Half the length of the walls, m.
+HALF_LENGTH = 11.0
+#: Seconds from the end of a sequence to the start of the next.
+_PAUSE = 2.0
+#: People begin within this distance of the middle, and at least so far from each other, m.
+_REACH, _APART = 8.0, 0.75
+#: Centres of people stay so far from each other, and from walls, by the base law, m; a start that
+#: leads elsewhere is drawn again, so many times at most.
+_CLOSEST, _GRAZE, _TRIES = 0.3, 0.1, 12
+#: Share of the people who begin in a lane of their direction.
+_LANES = 0.85
+#: Distance of group members, and of everyone from walls, at first, m.
+_SIDE_BY_SIDE, _FROM_WALL = 0.7, 0.5
+_GROUP_SIZES, _GROUP_SHARES = (1, 2, 3), (0.45, 0.4, 0.15)
+#: Share of those who cross to the other side of the corridor.
+_CROSSING = 0.25
+#: Destinations lie so far ahead of the corridor's middle, m; of those who cross, nearer.
+_AHEAD, _AHEAD_CROSSING = 25.0, 13.0
+#: Walkers' disturbances are correlated over this time, s. Of people in a corridor (Jülich, what the
+#: social force leaves) the correlation falls below 1/e within 0.1 s, and crosses zero after 0.2 s.
+_CORRELATION = (0.3, 0.6)
+#: The same where they last longer than a window of the diagnosis.
+_SLOW = (1.0, 2.0)
+#: Distance of people who all walk the same way, m.
+_LOOSE = 2.0
+
+Start = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
-@dataclass(frozen=True)
-class Truth:
-    """What acts in a case.
+class Motion(NamedTuple):
+    """Simulated crowds.
 
     Attributes:
-        effects: coefficients by effect; nuisances are part of it.
-        amplitude: standard deviation of people's accelerations, m/s².
-        bell: places act by a bell curve, not by an exponential.
+        x, v: ``(S, K + 1, N, 2)`` true positions (m) and velocities (m/s) at the samples.
+        some: which of the case's sequences they are.
     """
 
-    effects: dict[str, Coefficients]
-    amplitude: float = 0.0
-    bell: bool = False
-
-    @property
-    def hidden(self) -> Hidden:
-        """As the equations of motion take it."""
-        fields: dict[str, float] = {"bell": float(self.bell)}
-        for name, values in self.effects.items():
-            fields |= EFFECTS[name].acting(values)
-        return Hidden(**fields)
-
-    @property
-    def eta(self) -> float:
-        """Standard deviation of how vigorously people steer."""
-        return self.effects.get("walker_heterogeneity", {}).get("sigma", 0.0)
+    x: np.ndarray
+    v: np.ndarray
+    some: slice
 
 
 class CrowdCase(Subject):
-    """A case of crowds: draws what is hidden, sets its strength, and measures.
+    """A case of crowds.
 
     Attributes:
-        scene: the people and the corridor.
-
-    Raises:
-        ConfigError: an effect that crowds do not know.
+        people: before the burn-in; ``eta`` has mean 0 and variance 1.
+        width: of the corridor, m.
+        kick: ``(S, M + 1, N, 2)`` disturbance of accelerations, of variance 1.
     """
 
-    def __init__(self, case: Case) -> None:
-        check_effects(case, EFFECTS)
-        self.case, self.catalogue, self.unit = case, catalogue, "m/s²"
-        self.scene: Scene = set_scene(case)
-        self.clocks, self.correlation = self.scene.clocks, self.scene.correlation
-        self.walls = self.scene.segments
-        self._some = list(range(min(_SOME, case.n_sequences)))
-        rng = case.generator("effects")
-        effects = {name: EFFECTS[name].draw(rng, self.scene.width) for name in case.effects}
-        if case.variant == "heterogeneous":
-            effects["walker_heterogeneity"] = {"sigma": float(rng.uniform(*_NUISANCE))}
-        self.truth = Truth(effects, bell=case.variant == "smooth")
-        self.amplitude = set_strength(self, rng, AMPLITUDES)
+    unit = "m/s²"
+    range = Range(preferred=(0.02, 0.15), extreme=(0.005, 0.35), idle=(0.04, 0.15), probe=0.02)
+    some = slice(8)
+    tolerance = 1e-4
 
-    def simulate(self, truth: Truth, scene: Scene | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """``(S, K + 1, N, 2)`` positions (m) and velocities (m/s), burnt in."""
-        scene = self.scene if scene is None else scene
-        sequences, people = scene.group.shape
-        burn = round(BURN_IN / self.case.dt)
-        kick = np.zeros((sequences, 1, people, 2))
-        if truth.amplitude:
-            kick = truth.amplitude * scene.kick
+    def __init__(self, case: Case) -> None:
+        self.case, self.step = case, case.size[2] / SUBSTEPS
+        self._set_scene()
+        rng, catalogue = case.generator("effects"), CATALOGUES["crowd"]
+        effects = {name: catalogue.effects[name].draw(rng, self.width) for name in case.effects}
+        if case.variant == "heterogeneous":
+            effects |= {name: nuisance.draw(rng) for name, nuisance in catalogue.nuisance.items()}
+        self.truth = Truth(effects, smooth=float(case.variant == "smooth"))
+        self.set_strength(rng)
+
+    def simulate(self, truth: Truth, some: slice = slice(None)) -> Motion:
+        clocks = self.clocks[some]
         x, v = simulate(
-            scene.base,
-            truth.hidden,
-            scene.x,
-            scene.v,
-            scene.goal,
-            scene.group,
-            truth.eta * scene.eta,
-            scene.phase,
-            scene.points,
-            scene.segments,
-            kick,
-            scene.clocks - BURN_IN,
-            np.full(sequences, -BURN_IN),
-            scene.step,
-            (burn + self.case.n_steps) * SUBSTEPS,
+            self.law,
+            self._hidden(truth),
+            self._people(truth, some),
+            self.walls,
+            truth.amplitude * self.kick[some],
+            clocks - BURN_IN,
+            np.full(len(clocks), -BURN_IN),
+            self.step,
             SUBSTEPS,
         )
-        return x[:, burn:], v[:, burn:]
+        burn = round(BURN_IN / self.case.size[2])
+        return Motion(x[:, burn:], v[:, burn:], some)
 
-    def measured(self, truth: Truth) -> np.ndarray:
-        """``(S, K + 1, N, 2)`` positions with the error of their measurement, m."""
-        return np.asarray(self.simulate(truth)[0] + self.case.sigma * self.scene.error)
+    def errors(
+        self, motion: Motion, measured: np.ndarray, parameters: Any, truth: Truth | None = None
+    ) -> np.ndarray:
+        """``(S, W, k, N, 2)``, in W windows that start from the true states."""
+        dt = self.case.size[2]
+        sequences, samples, number_of_people = motion.x.shape[:3]
+        length = min(round(WINDOW / dt), samples - 1)
+        starts = np.arange(0, samples - length, length)
+        number, since = len(starts), np.tile(starts * dt, sequences)
+        substeps = 1 if truth is None else _FINE
+        people = self._people(truth or Truth({}), motion.some)
+        spread = People(*(np.repeat(part, number, axis=0) for part in people))
+        spread = spread._replace(
+            x=motion.x[:, starts].reshape(spread.x.shape),
+            v=motion.v[:, starts].reshape(spread.x.shape),
+        )
+        simulated, _ = simulate(
+            self.law._replace(**dict(zip(self.base, map(float, parameters), strict=True))),
+            Hidden() if truth is None else self._hidden(truth),
+            spread,
+            self.walls,
+            np.zeros((sequences * number, length * substeps + 1, number_of_people, 2)),
+            np.repeat(self.clocks[motion.some], number) + since,
+            since,
+            dt / substeps,
+            substeps,
+        )
+        shape = sequences, number, length + 1, number_of_people, 2
+        wanted = np.stack([measured[:, s + 1 : s + 1 + length] for s in starts], axis=1)
+        return simulated.reshape(shape)[:, :, 1:] - wanted
+
+    def squares(self, error: np.ndarray) -> np.ndarray:
+        return (error**2).sum(-1)
 
     def columns(self, x: np.ndarray) -> dict[str, np.ndarray]:
-        scene, runs = self.scene, np.array(self.case.runs)[:, None]
-        group = np.char.add(runs, np.char.add("g", scene.group.astype(str)))
+        people, runs = self.people, np.array(self.case.runs)[:, None]
+        group = np.char.add(runs, np.char.add("g", people.group.astype(str)))
         return {
             "x": np.round(x[..., 0], 5),
             "y": np.round(x[..., 1], 5),
-            "group": np.where(scene.group < 0, "", group),
-            "dest_x": np.round(scene.goal[..., 0], 4),
-            "dest_y": np.round(scene.goal[..., 1], 4),
+            "group": np.where(people.group < 0, "", group),
+            "dest_x": np.round(people.goal[..., 0], 4),
+            "dest_y": np.round(people.goal[..., 1], 4),
         }
 
-    def base(self) -> dict[str, Any]:
-        base = self.scene.base
-        options = {"B": base.B, "r": base.r, "tau": base.tau}
-        parameters = {"A": base.A, "k": base.k, "kappa": base.kappa}
-        return {"model": {"name": "sf", "options": options}, "base": parameters}
+    def _hidden(self, truth: Truth) -> Hidden:
+        return Hidden(**self.fields(truth), bell=truth.smooth)
 
-    def rescaled(self, name: str, values: Coefficients, factor: float) -> Coefficients:
-        return EFFECTS[name].rescaled(values, factor)
+    def _people(self, truth: Truth, some: slice) -> People:
+        """People who steer as vigorously as the truth says."""
+        sigma = truth.effects.get("walker_heterogeneity", {}).get("sigma", 0.0)
+        people = self.people._replace(eta=sigma * self.people.eta)
+        return People(*(part[some] for part in people))
 
-    def misfit(self, names: list[str]) -> float:
-        kept = {k: v for k, v in self.truth.effects.items() if k in names}
-        some = self.scene.only(self._some)
-        x, v = self.simulate(replace(self.truth, effects=kept, amplitude=0.0), some)
-        windows = Windows(some, x, v, x, self.case.dt)
-        error = windows.errors(windows.recalibrated(some.base))
-        return float(cost_by_sequence(error).mean())
+    def _set_scene(self) -> None:
+        """Everything random about a case's people, except what is hidden."""
+        case, rng = self.case, self.case.generator("law")
+        number, duration, dt = case.size
+        draws = {"A": (12, 22), "k": (300, 600), "kappa": (10, 40)}
+        self.base = {name: float(rng.uniform(*ends)) for name, ends in draws.items()}
+        self.law = Base(**self.base)
+        options = {"B": self.law.B, "r": self.law.r, "tau": self.law.tau}
+        self.model = {"name": "sf", "options": options}
+        self.width = float(rng.uniform(4, 5))
+        half, width = HALF_LENGTH, self.width
+        self.walls = np.array([[-half, 0.0, half, 0.0], [half, width, -half, width]])
+        rng = case.generator("people")
+        starts = [self._start(rng) for _ in range(case.n_sequences)]
+        x, v, goal, group = (np.array(parts) for parts in zip(*starts, strict=True))
 
-    def spread(self, probe: float) -> float:
-        truth, some = replace(self.truth, amplitude=probe), self.scene.only(self._some)
-        x, v = self.simulate(truth, some)
-        windows = Windows(some, x, v, x, self.case.dt)
-        return float(self._oracle(windows, truth).mean()) / probe**2
+        steps = (round(BURN_IN / dt) + case.n_steps) * SUBSTEPS
+        shape = (case.n_sequences, number)
+        rng = case.generator("walkers")
+        self.correlation = float(rng.uniform(*(_SLOW if case.variant == "slow" else _CORRELATION)))
+        kick = ornstein_uhlenbeck(
+            rng,
+            (*shape, 2, steps + 1),
+            step=self.step,
+            correlation=self.correlation,
+            heavy_tails=case.variant == "heavy_tails",
+        )
+        self.kick = np.ascontiguousarray(kick.transpose(0, 3, 1, 2))
+        eta = rng.standard_normal(shape)
+        eta = (eta - eta.mean()) / eta.std()
+        self.people = People(x, v, goal, group, eta, rng.uniform(0, 2 * np.pi, shape))
+        self.clocks = np.arange(case.n_sequences) * round(duration + _PAUSE, 6)
+        self.error = case.generator("measurement").standard_normal(
+            (shape[0], case.n_steps + 1, shape[1], 2)
+        )
 
-    def costs(self, truth: Truth) -> Costs:
-        x, v = self.simulate(truth)
-        measured = x + self.case.sigma * self.scene.error
-        windows = Windows(self.scene, x, v, measured, self.case.dt)
-        base = cost_by_sequence(windows.errors(windows.recalibrated(self.scene.base)))
-        floor = float(((measured - x) ** 2).sum(-1).mean())
-        return Costs(base, self._oracle(windows, truth), floor)
+    def _start(self, rng: np.random.Generator) -> Start:
+        """Positions, velocities, destinations ``(N, 2)`` and groups ``(N,)`` of a crowd."""
+        if self.case.arm == "no_excitation":
+            return _same_way(rng, self.case.size[0], self.width)
+        for _ in range(_TRIES + 1):
+            start = _both_ways(rng, self.case.size[0], self.width)
+            if self._comfortable(start):
+                break
+        return start
 
-    def _oracle(self, windows: Windows, truth: Truth) -> np.ndarray:
-        error = windows.errors(self.scene.base, truth.hidden, eta=truth.eta, substeps=_FINE)
-        return cost_by_sequence(error)
+    def _comfortable(self, start: Start) -> bool:
+        """Whether by the base law alone nobody bumps into somebody or grazes a wall."""
+        x0, v0, goal, group = (part[None] for part in start)
+        nobody, steps = np.zeros(group.shape), round((BURN_IN + self.case.size[1]) / 0.05)
+        (x,), _ = simulate(
+            self.law,
+            Hidden(),
+            People(x0, v0, goal, group, nobody, nobody),
+            self.walls,
+            np.zeros((1, steps + 1, *start[0].shape)),
+            np.zeros(1),
+            np.zeros(1),
+            0.05,
+            2,
+        )
+        distance = np.hypot(*(x[:, :, None] - x[:, None]).transpose(3, 0, 1, 2))
+        distance += np.where(np.eye(len(start[0]), dtype=bool), np.inf, 0.0)
+        y = x[..., 1]
+        clear = y.min() > _GRAZE and y.max() < self.width - _GRAZE
+        return bool(distance.min() > _CLOSEST and clear)
+
+
+def _both_ways(rng: np.random.Generator, number: int, width: float) -> Start:
+    """Two-way flow."""
+    x = np.empty((0, 2))
+    v, goal, group = [], [], []
+    lane = float(rng.choice([-1, 1]))
+    while len(x) < number:
+        size = min(int(rng.choice(_GROUP_SIZES, p=_GROUP_SHARES)), number - len(x))
+        way = float(rng.choice([-1, 1]))
+        place = _free_place(rng, x, size, way, width, lane)
+        crosses = size == 1 and rng.uniform() < _CROSSING
+        speed = float(np.clip(rng.normal(1.3, 0.2), 0.8, 1.8))
+        for start in place:
+            if crosses:
+                across = width - start[1] if abs(start[1] - width / 2) > 1 else start[1] + way
+                end = np.array([way * _AHEAD_CROSSING, across])
+            else:
+                end = np.array([way * _AHEAD, start[1] + rng.normal(0, 0.3)])
+            end[1] = np.clip(end[1], _FROM_WALL, width - _FROM_WALL)
+            angle = math.atan2(*(end - start)[::-1]) + rng.normal(0, 0.15)
+            pace = speed + rng.normal(0, 0.03)
+            v.append(pace * np.array([math.cos(angle), math.sin(angle)]))
+            goal.append(end)
+            group.append(len(x) if size > 1 else -1)
+        x = np.concatenate([x, place])
+    return x, np.array(v), np.array(goal), np.array(group)
+
+
+def _free_place(
+    rng: np.random.Generator, taken: np.ndarray, size: int, way: float, width: float, lane: float
+) -> np.ndarray:
+    """``(size, 2)`` people side by side, away from those that are there."""
+    margin, reach = 0.5 * (size - 1) * _SIDE_BY_SIDE + _FROM_WALL, _REACH
+    while True:
+        # people come from their side, so that most of them meet
+        along = -way * rng.uniform(-0.15 * reach, reach)
+        across = rng.uniform(margin, width - margin)
+        if rng.uniform() < _LANES:
+            # most people keep to a lane of their direction, as real crowds soon do
+            across = 0.5 * width + way * lane * abs(across - 0.5 * width)
+        offset = _SIDE_BY_SIDE * (np.arange(size) - 0.5 * (size - 1))
+        place = np.stack([along + rng.normal(0, 0.1, size), across + offset], axis=1)
+        distance = np.hypot(*(place[:, None] - taken[None]).transpose(2, 0, 1))
+        if distance.min(initial=np.inf) > _APART:
+            return place
+        # a full corridor becomes a longer one
+        reach *= 1.01
+
+
+def _same_way(rng: np.random.Generator, number: int, width: float) -> Start:
+    """People far apart, side by side, in one direction and at one speed."""
+    rows = np.arange(number) // 2
+    lane = np.where(np.arange(number) % 2 == 0, -0.5, 0.5)
+    first = -HALF_LENGTH + 1 + rng.uniform(0, 1)
+    x = np.stack([first + _LOOSE * rows, 0.5 * width + _LOOSE * lane], axis=1)
+    v = np.tile([float(rng.uniform(1.1, 1.4)), 0.0], (number, 1))
+    goal = x + np.array([2 * _AHEAD, 0.0])
+    return x, v, goal, np.full(number, -1)

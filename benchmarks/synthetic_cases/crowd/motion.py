@@ -1,5 +1,7 @@
 """People in a corridor: accelerations, and Runge–Kutta of fourth order.
 
+Places, velocities and forces in the plane are complex numbers, x + i y.
+
 The right-hand sides are written down here once more on purpose: data that share code with the
 models that are tested on them could not show a mistake in either.
 """
@@ -15,6 +17,8 @@ from numba import njit
 #: Farther away than this many ranges B beyond contact a person's force, or a wall point's, whose
 #: share is smaller, is not worth counting.
 _RANGES, _WALL_RANGES = 11.0, 8.0
+#: Largest distance of the points of walls, m.
+WALL_SPACING = 0.25
 #: Reach of alignment, of sliding friction and of the density's kernel, m.
 ALIGNMENT_REACH, FRICTION_REACH, KERNEL = 2.0, 0.5, 1.0
 #: Distance within which somebody who comes towards counts, and how sharply that ends, m.
@@ -75,283 +79,261 @@ class Hidden(NamedTuple):
     tiring: float = 0.0  # -tiring (time since the sequence began) e
 
 
+class People(NamedTuple):
+    """S crowds of N people.
+
+    Attributes:
+        x, v: ``(S, N, 2)`` at the start, m and m/s.
+        goal: ``(S, N, 2)`` destinations, m.
+        group: ``(S, N)`` number of the social group, -1 for those who walk alone.
+        eta: ``(S, N)`` how much more vigorously than others they steer.
+        phase: ``(S, N)`` of their gait, rad.
+    """
+
+    x: np.ndarray
+    v: np.ndarray
+    goal: np.ndarray
+    group: np.ndarray
+    eta: np.ndarray
+    phase: np.ndarray
+
+
 @njit(cache=True, error_model="numpy")
-def _contact(
-    base: Base, reach: float, dx: float, dy: float, ux: float, uy: float
-) -> tuple[float, float]:
-    """Force at the offset (dx, dy) of bodies of radius sum ``reach`` that slip at (ux, uy)."""
-    d2, far = dx * dx + dy * dy, reach + _RANGES * base.B
-    if d2 > far * far:
-        return 0.0, 0.0
-    d = math.sqrt(d2) + 1e-12
-    overlap = reach - d
-    nx, ny = dx / d, dy / d
+def _length(vector: complex) -> float:
+    return math.sqrt(vector.real * vector.real + vector.imag * vector.imag) + 1e-12
+
+
+@njit(cache=True, error_model="numpy")
+def _dot(a: complex, b: complex) -> float:
+    return a.real * b.real + a.imag * b.imag
+
+
+@njit(cache=True, error_model="numpy")
+def _contact(base: Base, reach: float, offset: complex, slip: complex) -> complex:
+    """Force at an offset of bodies of radius sum ``reach`` that slip at this velocity."""
+    far = reach + _RANGES * base.B
+    if _dot(offset, offset) > far * far:
+        return 0j
+    d = _length(offset)
+    overlap, n = reach - d, offset / d
     push = base.A * math.exp(overlap / base.B)
     if overlap <= 0.0:
-        return push * nx, push * ny
-    push += base.k * overlap
-    slide = base.kappa * overlap * (-ux * ny + uy * nx)
-    return push * nx - slide * ny, push * ny + slide * nx
+        return push * n
+    return n * complex(push + base.k * overlap, base.kappa * overlap * _dot(1j * n, slip))
 
 
 @njit(cache=True, error_model="numpy")
 def _walls(
-    base: Base,
-    fx: Hidden,
-    x: float,
-    y: float,
-    u: float,
-    w: float,
-    points: np.ndarray,
-    segments: np.ndarray,
-) -> tuple[float, float]:
-    """Acceleration by walls, of a person at (x, y) with the velocity (u, w)."""
-    ax, ay = 0.0, 0.0
+    base: Base, fx: Hidden, x: complex, v: complex, points: np.ndarray, segments: np.ndarray
+) -> complex:
+    """Acceleration by walls."""
+    a = 0j
     far = base.r + _WALL_RANGES * base.B
-    for p in range(len(points)):
-        dx, dy = x - points[p, 0], y - points[p, 1]
-        if abs(dx) < far and abs(dy) < far:
-            fx_, fy_ = _contact(base, base.r, dx, dy, u, w)
-            ax += fx_
-            ay += fy_
-    number = max(len(points), 1)
-    ax, ay = ax / number, ay / number
+    for point in points:
+        offset = x - point
+        if abs(offset.real) < far and abs(offset.imag) < far:
+            a += _contact(base, base.r, offset, v)
+    a /= max(len(points), 1)
     if fx.A_w != 0.0:
-        for q in range(len(segments)):
-            x1, y1, x2, y2 = segments[q]
-            along = ((x - x1) * (x2 - x1) + (y - y1) * (y2 - y1)) / (
-                (x2 - x1) ** 2 + (y2 - y1) ** 2
-            )
-            along = min(max(along, 0.0), 1.0)
-            dx, dy = x - x1 - along * (x2 - x1), y - y1 - along * (y2 - y1)
-            d = math.sqrt(dx * dx + dy * dy) + 1e-12
-            push = fx.A_w * math.exp((base.r - d) / fx.B_w)
-            ax += push * dx / d
-            ay += push * dy / d
-    return ax, ay
+        for start, end in segments:
+            way = end - start
+            along = min(max(_dot(x - start, way) / _dot(way, way), 0.0), 1.0)
+            offset = x - start - along * way
+            d = _length(offset)
+            a += fx.A_w * math.exp((base.r - d) / fx.B_w) * offset / d
+    return a
 
 
 @njit(cache=True, error_model="numpy")
 def _others(
     base: Base, fx: Hidden, i: int, x: np.ndarray, v: np.ndarray, e: np.ndarray, group: np.ndarray
-) -> tuple[float, float]:
+) -> complex:
     """Acceleration of person i by everyone else."""
     n = len(x)
-    ax, ay = 0.0, 0.0
+    a, weighted, towards = 0j, 0j, 0j
     # most effects need nothing but the base force of each pair
     looks = fx.lambda_ != 1.0 or fx.theta != 0.0 or fx.A_2 != 0.0 or fx.friction != 0.0
     looks = looks or fx.side != 0.0 or fx.align != 0.0 or fx.dense != 0.0
-    met, weights, wx, wy, rho, mates, gx, gy = 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0
+    met, weights, rho, mates = 0.0, 0.0, 0.0, 0
     for j in range(n):
         if j == i:
             continue
-        dx, dy = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1]
-        ux, uy = v[j, 0] - v[i, 0], v[j, 1] - v[i, 1]
-        px, py = _contact(base, 2 * base.r, dx - fx.T_a * ux, dy - fx.T_a * uy, ux, uy)
+        offset, slip = x[i] - x[j], v[j] - v[i]
+        push = _contact(base, 2 * base.r, offset - fx.T_a * slip, slip)
         if group[j] == group[i] and group[i] >= 0:
             mates += 1
-            gx -= dx
-            gy -= dy
+            towards -= offset
         if not looks:
-            ax += px / n
-            ay += py / n
+            a += push / n
             continue
-        d = math.sqrt(dx * dx + dy * dy) + 1e-12
-        nx, ny = dx / d, dy / d
-        facing = e[i, 0] * e[j, 0] + e[i, 1] * e[j, 1]
-        ahead = -(e[i, 0] * nx + e[i, 1] * ny)
+        d = _length(offset)
+        normal = offset / d
+        facing, ahead = _dot(e[i], e[j]), -_dot(e[i], normal)
         if fx.lambda_ != 1.0:
-            weight = fx.lambda_ + (1.0 - fx.lambda_) * 0.5 * (1.0 + ahead)
-            px, py = weight * px, weight * py
+            push *= fx.lambda_ + (1.0 - fx.lambda_) * 0.5 * (1.0 + ahead)
         if fx.theta != 0.0:
             angle = fx.theta * 0.5 * (1.0 - facing)
-            c, s = math.cos(angle), math.sin(angle)
-            px, py = c * px - s * py, s * px + c * py
-        ax += px / n
-        ay += py / n
+            push *= complex(math.cos(angle), math.sin(angle))
+        a += push / n
         if fx.A_2 != 0.0:
-            push = fx.A_2 * math.exp((2 * base.r - d) / fx.B_2)
-            ax += push * nx
-            ay += push * ny
+            a += fx.A_2 * math.exp((2 * base.r - d) / fx.B_2) * normal
         if fx.friction != 0.0:
-            slip = -ux * ny + uy * nx
-            drag = fx.friction * math.exp((2 * base.r - d) / FRICTION_REACH) * slip
-            ax -= drag * ny
-            ay += drag * nx
+            drag = fx.friction * math.exp((2 * base.r - d) / FRICTION_REACH)
+            a += drag * _dot(1j * normal, slip) * 1j * normal
         if fx.side != 0.0:
             near = 1.0 / (1.0 + math.exp((d - ENCOUNTER) / ENCOUNTER_EDGE))
             met += max(ahead, 0.0) * max(-facing, 0.0) * near
         if fx.align != 0.0:
             weight = math.exp(-d / ALIGNMENT_REACH)
             weights += weight
-            wx += weight * ux
-            wy += weight * uy
+            weighted += weight * slip
         if fx.dense != 0.0:
             rho += math.exp(-d * d / (2 * KERNEL**2)) / (2 * math.pi * KERNEL**2)
     if weights > 0.0:
-        ax += fx.align * wx / weights
-        ay += fx.align * wy / weights
+        a += fx.align * weighted / weights
     if mates > 0:
-        ax += fx.cohesion * gx / mates
-        ay += fx.cohesion * gy / mates
-    turn = fx.side * (1.0 - math.exp(-met))
-    ax += turn * e[i, 1] - fx.dense * rho * v[i, 0]
-    ay += -turn * e[i, 0] - fx.dense * rho * v[i, 1]
-    return ax, ay
+        a += fx.cohesion * towards / mates
+    return a + (e[i] * complex(0.0, -fx.side * (1.0 - math.exp(-met))) - fx.dense * rho * v[i])
 
 
 @njit(cache=True, error_model="numpy")
 def _alone(
     base: Base,
     fx: Hidden,
-    x: np.ndarray,
-    v: np.ndarray,
-    e: np.ndarray,
-    goal: np.ndarray,
+    x: complex,
+    v: complex,
+    e: complex,
+    goal: complex,
     eta: float,
     phase: float,
     clock: float,
     since: float,
-) -> tuple[float, float]:
+) -> complex:
     """Acceleration of one person that nobody else has a part in."""
-    speed = math.sqrt(v[0] * v[0] + v[1] * v[1])
-    wx, wy = goal[0] - x[0], goal[1] - x[1]
-    way = math.sqrt(wx * wx + wy * wy) + 1e-12
-    eager = (1.0 + eta) / base.tau
-    ax = eager * (speed * wx / way - v[0]) + fx.a_x
-    ay = eager * (speed * wy / way - v[1]) + fx.a_y
+    speed, way = math.sqrt(_dot(v, v)), goal - x
+    a = (1.0 + eta) / base.tau * (speed * way / _length(way) - v) + complex(fx.a_x, fx.a_y)
     along = fx.pull * (fx.v_pref - speed) - fx.tiring * max(since, 0.0)
-    across = fx.sway * math.sin(2 * math.pi * fx.sway_f * clock + phase)
-    ax += along * e[0] + across * e[1]
-    ay += along * e[1] - across * e[0]
+    a += e * complex(along, -fx.sway * math.sin(2 * math.pi * fx.sway_f * clock + phase))
     if fx.A_o != 0.0:
-        dx, dy = x[0] - fx.x_o, x[1] - fx.y_o
-        d = math.sqrt(dx * dx + dy * dy) + 1e-12
-        fall = math.exp(-d / fx.B_o)
-        if fx.bell != 0.0:
-            fall = math.exp(-0.5 * (d / fx.B_o) ** 2)
-        ax += fx.A_o * fall * dx / d
-        ay += fx.A_o * fall * dy / d
+        offset = x - complex(fx.x_o, fx.y_o)
+        d = _length(offset)
+        fall = math.exp(-0.5 * (d / fx.B_o) ** 2) if fx.bell != 0.0 else math.exp(-d / fx.B_o)
+        a += fx.A_o * fall * offset / d
     if fx.spin != 0.0:
-        dx, dy = x[0] - fx.spin_x, x[1] - fx.spin_y
-        fall = math.exp(-0.5 * (dx * dx + dy * dy) / fx.spin_s**2) / fx.spin_s
-        ax -= fx.spin * fall * dy
-        ay += fx.spin * fall * dx
+        offset = x - complex(fx.spin_x, fx.spin_y)
+        fall = math.exp(-0.5 * _dot(offset, offset) / fx.spin_s**2) / fx.spin_s
+        a += fx.spin * fall * 1j * offset
     if fx.push != 0.0:
-        ay += fx.push * math.sin(2 * math.pi * clock / fx.push_T + fx.push_0)
+        a += 1j * (fx.push * math.sin(2 * math.pi * clock / fx.push_T + fx.push_0))
     if fx.wave != 0.0:
-        ay += fx.wave * math.sin(2 * math.pi * x[0] / fx.wave_L + fx.wave_0)
-    return ax, ay
+        a += 1j * (fx.wave * math.sin(2 * math.pi * x.real / fx.wave_L + fx.wave_0))
+    return a
 
 
 @njit(cache=True, error_model="numpy")
 def accelerations(
     base: Base,
     fx: Hidden,
-    x: np.ndarray,
-    v: np.ndarray,
-    goal: np.ndarray,
-    group: np.ndarray,
-    eta: np.ndarray,
-    phase: np.ndarray,
+    people: People,
     points: np.ndarray,
     segments: np.ndarray,
     clock: float,
     since: float,
-    out: np.ndarray,
-) -> None:
-    """``out`` (N, 2), m/s², of people at ``x`` (N, 2) m with velocities ``v`` (N, 2) m/s."""
+) -> np.ndarray:
+    """``(N,)`` m/s² of one crowd among the points ``(P,)`` and segments ``(W, 2)`` of walls."""
+    x, v, goal, group, eta, phase = people
     e = np.empty_like(v)
+    a = np.empty_like(v)
     for i in range(len(x)):
-        speed = math.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2) + 1e-12
-        e[i, 0], e[i, 1] = v[i, 0] / speed, v[i, 1] / speed
+        e[i] = v[i] / _length(v[i])
     for i in range(len(x)):
-        a0, a1 = _alone(base, fx, x[i], v[i], e[i], goal[i], eta[i], phase[i], clock, since)
-        b0, b1 = _others(base, fx, i, x, v, e, group)
-        c0, c1 = _walls(base, fx, x[i, 0], x[i, 1], v[i, 0], v[i, 1], points, segments)
-        out[i, 0] = a0 + b0 + c0
-        out[i, 1] = a1 + b1 + c1
+        alone = _alone(base, fx, x[i], v[i], e[i], goal[i], eta[i], phase[i], clock, since)
+        a[i] = alone + _others(base, fx, i, x, v, e, group)
+        a[i] += _walls(base, fx, x[i], v[i], points, segments)
+    return a
 
 
 @njit(cache=True, error_model="numpy")
-def simulate(
+def _crowd(
     base: Base,
     fx: Hidden,
-    x0: np.ndarray,
-    v0: np.ndarray,
-    goal: np.ndarray,
-    group: np.ndarray,
-    eta: np.ndarray,
-    phase: np.ndarray,
+    people: People,
     points: np.ndarray,
     segments: np.ndarray,
+    kick: np.ndarray,
+    clock: float,
+    since: float,
+    step: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities ``(M + 1, N)`` of one crowd at every step."""
+    xs, vs = np.empty_like(kick), np.empty_like(kick)
+    xs[0], vs[0] = people.x, people.v
+    dx, dv = np.empty((2, 4, kick.shape[1]), kick.dtype)
+    for m in range(len(kick) - 1):
+        for q in range(4):
+            part = (0.0, 0.5, 0.5, 1.0)[q]
+            x, v = xs[m].copy(), vs[m].copy()
+            if q > 0:
+                x += part * step * dx[q - 1]
+                v += part * step * dv[q - 1]
+            t = (m + part) * step
+            now = People(x, v, people.goal, people.group, people.eta, people.phase)
+            a = accelerations(base, fx, now, points, segments, clock + t, since + t)
+            dx[q], dv[q] = v, a + (kick[m] + part * (kick[m + 1] - kick[m]))
+        xs[m + 1], vs[m + 1] = xs[m], vs[m]
+        for q in range(4):
+            weight = (1.0 / 6.0, 2.0 / 6.0, 2.0 / 6.0, 1.0 / 6.0)[q]
+            xs[m + 1] += step * weight * dx[q]
+            vs[m + 1] += step * weight * dv[q]
+    return xs, vs
+
+
+def simulate(
+    base: Base,
+    hidden: Hidden,
+    people: People,
+    walls: np.ndarray,
     kick: np.ndarray,
     clock: np.ndarray,
     since: np.ndarray,
     step: float,
-    steps: int,
     every: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities of S crowds of N people.
 
     Args:
-        x0, v0: ``(S, N, 2)`` m and m/s at the start.
-        goal: ``(S, N, 2)`` destinations, m.
-        group: ``(S, N)`` number of the social group, -1 for those who walk alone.
-        eta: ``(S, N)`` how much more vigorously than others they steer.
-        phase: ``(S, N)`` of their gait, rad.
-        points: ``(P, 2)`` of the walls, m.
-        segments: ``(W, 4)`` the walls, m.
-        kick: ``(S, M + 1, N, 2)`` disturbance of accelerations, m/s², linear between steps; or
-            ``(S, 1, N, 2)`` for one that is constant.
+        walls: ``(W, 4)`` the walls, m.
+        kick: ``(S, M + 1, N, 2)`` disturbance of accelerations, m/s², linear between steps.
         clock, since: ``(S,)`` time of the day, and time since the sequence began, at the start, s.
-        step, steps: s, and how many.
+        step: of Runge–Kutta's method, s.
         every: so many steps lie between the values returned.
 
     Returns:
-        ``(S, steps // every + 1, N, 2)`` positions (m) and velocities (m/s).
+        ``(S, M // every + 1, N, 2)`` positions (m) and velocities (m/s).
     """
-    sequences, people = x0.shape[0], x0.shape[1]
-    out_x = np.empty((sequences, steps // every + 1, people, 2))
-    out_v = np.empty_like(out_x)
-    dx, dv = np.empty((4, people, 2)), np.empty((4, people, 2))
-    offset = np.array([0.0, 0.5, 0.5, 1.0])
-    weight = np.array([1.0, 2.0, 2.0, 1.0]) / 6.0
-    for s in range(sequences):
-        x, v = x0[s].copy(), v0[s].copy()
-        out_x[s, 0], out_v[s, 0] = x, v
-        for m in range(steps):
-            for q in range(4):
-                part = offset[q]
-                xq, vq = x.copy(), v.copy()
-                if q > 0:
-                    xq += part * step * dx[q - 1]
-                    vq += part * step * dv[q - 1]
-                t = (m + part) * step
-                accelerations(
-                    base,
-                    fx,
-                    xq,
-                    vq,
-                    goal[s],
-                    group[s],
-                    eta[s],
-                    phase[s],
-                    points,
-                    segments,
-                    clock[s] + t,
-                    since[s] + t,
-                    dv[q],
-                )
-                if kick.shape[1] > 1:
-                    dv[q] += kick[s, m] + part * (kick[s, m + 1] - kick[s, m])
-                else:
-                    dv[q] += kick[s, 0]
-                dx[q] = vq
-            for q in range(4):
-                x += step * weight[q] * dx[q]
-                v += step * weight[q] * dv[q]
-            if (m + 1) % every == 0:
-                out_x[s, (m + 1) // every] = x
-                out_v[s, (m + 1) // every] = v
-    return out_x, out_v
+    plane = [in_plane(part) for part in people[:3]]
+    points, segments = in_plane(wall_points(walls)), in_plane(walls.reshape(-1, 2, 2))
+    paths = [
+        _crowd(
+            base, hidden, People(*own), points, segments, forces, float(time), float(start), step
+        )
+        for *own, forces, time, start in zip(
+            *plane, *people[3:], in_plane(kick), clock, since, strict=True
+        )
+    ]
+    x, v = (np.stack(parts)[:, ::every] for parts in zip(*paths, strict=True))
+    return np.stack([x.real, x.imag], -1), np.stack([v.real, v.imag], -1)
+
+
+def in_plane(vectors: np.ndarray) -> np.ndarray:
+    """Complex numbers from an array whose last axis has two coordinates."""
+    return np.ascontiguousarray(vectors, dtype=float).view(complex)[..., 0]
+
+
+def wall_points(walls: np.ndarray) -> np.ndarray:
+    """``(P, 2)`` points of walls, no farther apart than :data:`WALL_SPACING`."""
+    points = [np.empty((0, 2))]
+    for x1, y1, x2, y2 in walls:
+        number = math.ceil(math.hypot(x2 - x1, y2 - y1) / WALL_SPACING - 1e-9) + 1
+        points.append(np.linspace((x1, y1), (x2, y2), number))
+    return np.concatenate(points)

@@ -12,11 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-LINEAR, LOGARITHMIC = 0, 1
-LAWS = {"lin": LINEAR, "log": LOGARITHMIC}
-
 #: A logarithm needs a positive gap, m.
 _LEAST_GAP = 1e-3
+
+
+class Base(NamedTuple):
+    """The base law of the gap, W: linear, or logarithmic; v0 in m/s and L in m."""
+
+    v0: float
+    L: float
+    logarithmic: bool = False
 
 
 class Hidden(NamedTuple):
@@ -63,11 +68,11 @@ class Hidden(NamedTuple):
 
 
 @njit(cache=True)
-def base_speed(law: int, v0: float, L: float, gap: float) -> float:
-    """W in m/s of a gap in m."""
-    if law == 0:
-        return v0 * (1.0 - L / gap)
-    return v0 * math.log(max(gap, _LEAST_GAP) / L)
+def base_speed(base: Base, length: float, gap: float) -> float:
+    """W in m/s of a gap in m, with ``length`` in place of L."""
+    if base.logarithmic:
+        return base.v0 * math.log(max(gap, _LEAST_GAP) / length)
+    return base.v0 * (1.0 - length / gap)
 
 
 @njit(cache=True)
@@ -114,9 +119,7 @@ def _past(xs: np.ndarray, vs: np.ndarray, at: float, i: int) -> float:
 
 @njit(cache=True)
 def _rates(
-    law: int,
-    v0: float,
-    L: float,
+    base: Base,
     fx: Hidden,
     own: np.ndarray,
     x: np.ndarray,
@@ -139,18 +142,18 @@ def _rates(
     dw[n - 1] = 0.0
     for i in range(n - 2, -1, -1):
         ahead = dx[i + 1]
-        length = L + fx.h * ahead
+        length = base.L + fx.h * ahead
         f = own[i] * _factor(fx, x[i], clock, since)
         gap = x[i + 1] - x[i]
         if fx.T > 0.0:
             gap = _past(xs, vs, late, i + 1) - _past(xs, vs, late, i)
-        own_speed = min(f * base_speed(law, v0, length, gap), fx.v_max)
+        own_speed = min(f * base_speed(base, length, gap), fx.v_max)
         speed = own_speed
         if fx.c != 0.0 and i < n - 2:
             following = x[i + 2] - x[i + 1]
             if fx.T > 0.0:
                 following = _past(xs, vs, late, i + 2) - _past(xs, vs, late, i + 1)
-            other = min(f * base_speed(law, v0, length, following), fx.v_max)
+            other = min(f * base_speed(base, length, following), fx.v_max)
             speed += fx.c * (other - own_speed)
         if fx.bump_size != 0.0:
             speed += fx.bump_size * math.exp(-0.5 * ((gap - fx.bump_gap) / fx.bump_width) ** 2)
@@ -167,10 +170,8 @@ def _rates(
 
 
 @njit(cache=True)
-def simulate(
-    law: int,
-    v0: float,
-    L: float,
+def _platoon(
+    base: Base,
     fx: Hidden,
     own: np.ndarray,
     lead_x: np.ndarray,
@@ -178,24 +179,70 @@ def simulate(
     past_x: np.ndarray,
     past_v: np.ndarray,
     kick: np.ndarray,
+    clock: float,
+    since: float,
+    step: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities ``(M + 1, N)`` of one platoon at every step."""
+    before, steps = len(past_x) - 1, len(kick) - 1
+    # the past is part of the path, velocities per step, as interpolation wants them
+    xs, vs = np.empty((2, before + steps + 1, past_x.shape[1]))
+    xs[: before + 1], vs[: before + 1] = past_x, past_v * step
+    xs[before, -1] = lead_x[0]
+    w_now = past_v[before] - kick[0]
+    v = np.empty(kick.shape)
+    dx, dw = np.empty((2, 4, kick.shape[1]))
+    for k in range(steps + 1):
+        here = before + k
+        for j in range(4 if k < steps else 1):
+            part = (0.0, 0.5, 0.5, 1.0)[j]
+            half = 2 * k + int(2 * part)
+            x, w = xs[here].copy(), w_now.copy()
+            if j > 0:
+                x += part * step * dx[j - 1]
+                w += part * step * dw[j - 1]
+            x[-1] = lead_x[half]
+            noise = kick[k] + part * (kick[min(k + 1, steps)] - kick[k])
+            t = (k + part) * step
+            moment = here + part, step, clock + t, since + t
+            _rates(base, fx, own, x, w, noise, lead_v[half], xs, vs, *moment, dx[j], dw[j])
+            if j == 0:
+                vs[here], v[k] = dx[0] * step, dx[0]
+        if k < steps:
+            xs[here + 1] = xs[here] + step * _mean(dx)
+            w_now += step * _mean(dw)
+            xs[here + 1, -1] = lead_x[half]
+    return xs[before:], v
+
+
+@njit(cache=True)
+def _mean(stages: np.ndarray) -> np.ndarray:
+    """Runge and Kutta's mean of the rates of four stages."""
+    a, b = 1.0 / 6.0, 2.0 / 6.0
+    return a * stages[0] + b * stages[1] + b * stages[2] + a * stages[3]
+
+
+def simulate(
+    base: Base,
+    hidden: Hidden,
+    own: np.ndarray,
+    lead: tuple[np.ndarray, np.ndarray],
+    past: tuple[np.ndarray, np.ndarray],
+    kick: np.ndarray,
     clock: np.ndarray,
     since: float,
     step: float,
-    every: int,
+    every: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities of S platoons of N vehicles, the leader last.
 
     Args:
-        law: :data:`LINEAR` or :data:`LOGARITHMIC`.
-        v0, L: m/s and m.
-        fx: what is hidden.
         own: ``(S, N)`` factor on W of each vehicle.
-        lead_x, lead_v: ``(S, 2 M + 1)`` the leader's position (m) and speed (m/s) at the whole
-            and half steps.
-        past_x, past_v: ``(S, P + 1, N)`` positions and velocities at the P steps before the
-            start and at the start; earlier than that, vehicles are where they were at first.
-        kick: ``(S, M + 1, N)`` disturbance of the velocities, m/s, linear between steps; or
-            ``(S, 1, N)`` for one that is constant.
+        lead: ``(S, 2 M + 1)`` the leaders' positions (m) and speeds (m/s) at the whole and half
+            steps.
+        past: ``(S, P + 1, N)`` positions and velocities at the P steps before the start and at
+            the start; earlier than that, vehicles are where they were at first.
+        kick: ``(S, M + 1, N)`` disturbance of the velocities, m/s, linear between steps.
         clock: ``(S,)`` time of the day at the start, s.
         since: time at the start since the recording's beginning, s; negative before it.
         step: of Runge–Kutta's method, s.
@@ -204,76 +251,10 @@ def simulate(
     Returns:
         ``(S, M // every + 1, N)`` positions (m) and velocities (m/s).
     """
-    sequences, vehicles = past_x.shape[0], past_x.shape[2]
-    before = past_x.shape[1] - 1
-    steps = (lead_x.shape[1] - 1) // 2
-    out_x = np.empty((sequences, steps // every + 1, vehicles))
-    out_v = np.empty_like(out_x)
-    xs = np.empty((before + steps + 1, vehicles))
-    vs = np.empty_like(xs)  # per step, as interpolation wants them
-    x, w, noise = np.empty(vehicles), np.empty(vehicles), np.empty(vehicles)
-    dx, dw = np.empty((4, vehicles)), np.empty((4, vehicles))
-    offset = np.array([0.0, 0.5, 0.5, 1.0])
-    weight = np.array([1.0, 2.0, 2.0, 1.0]) / 6.0
-    for s in range(sequences):
-        xs[: before + 1] = past_x[s]
-        vs[: before + 1] = past_v[s] * step
-        xs[before, vehicles - 1] = lead_x[s, 0]
-        w_now = past_v[s, before].copy()
-        if kick.shape[1] > 1:
-            w_now -= kick[s, 0]
-        for k in range(steps + 1):
-            here = before + k
-            stages = 4 if k < steps else 1
-            for j in range(stages):
-                part = offset[j]
-                half = 2 * k + int(2 * part)
-                for i in range(vehicles):
-                    x[i] = xs[here, i]
-                    w[i] = w_now[i]
-                    if j > 0:
-                        x[i] += part * step * dx[j - 1, i]
-                        w[i] += part * step * dw[j - 1, i]
-                    if kick.shape[1] > 1:
-                        later = kick[s, min(k + 1, steps), i]
-                        noise[i] = kick[s, k, i] + part * (later - kick[s, k, i])
-                    else:
-                        noise[i] = kick[s, 0, i]
-                x[vehicles - 1] = lead_x[s, half]
-                t = (k + part) * step
-                _rates(
-                    law,
-                    v0,
-                    L,
-                    fx,
-                    own[s],
-                    x,
-                    w,
-                    noise,
-                    lead_v[s, half],
-                    xs,
-                    vs,
-                    here + part,
-                    step,
-                    clock[s] + t,
-                    since + t,
-                    dx[j],
-                    dw[j],
-                )
-                if j == 0:
-                    for i in range(vehicles):
-                        vs[here, i] = dx[0, i] * step
-            if k % every == 0:
-                out_x[s, k // every] = xs[here]
-                out_v[s, k // every] = dx[0]
-            if k < steps:
-                for i in range(vehicles - 1):
-                    gain = 0.0
-                    push = 0.0
-                    for j in range(4):
-                        gain += weight[j] * dx[j, i]
-                        push += weight[j] * dw[j, i]
-                    xs[here + 1, i] = xs[here, i] + step * gain
-                    w_now[i] += step * push
-                xs[here + 1, vehicles - 1] = lead_x[s, half]
-    return out_x, out_v
+    arrays = [np.ascontiguousarray(a, dtype=float) for a in (own, *lead, *past, kick)]
+    paths = [
+        _platoon(base, hidden, *each, float(time), since, step)  # type: ignore[call-arg]
+        for *each, time in zip(*arrays, clock, strict=True)
+    ]
+    x, v = (np.stack(parts)[:, ::every] for parts in zip(*paths, strict=True))
+    return x, v

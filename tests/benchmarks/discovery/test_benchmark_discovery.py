@@ -14,7 +14,7 @@ from benchmarks.config import DiscoveryBenchmarkConfig, DiscoveryBenchmarkOption
 from benchmarks.discovery import synthetic
 from benchmarks.discovery.run import benchmark_discovery
 from benchmarks.discovery.verdicts import share
-from benchmarks.synthetic_cases.arms import first_seed
+from benchmarks.synthetic_cases.case import first_seed
 from nnode.app import discover
 from nnode.discover import thresholds
 from nnode.errors import ConfigError, DataError

@@ -10,7 +10,8 @@ import pytest
 
 from benchmarks.config import DiscoveryBenchmarkOptions
 from benchmarks.discovery import jupedsim_scenes, sumo_scenes, worlds
-from benchmarks.discovery.worlds import Answer, allowed
+from benchmarks.discovery.scenes import SCENES
+from benchmarks.discovery.worlds import allowed, answered
 from benchmarks.programs.sumo import STEP
 from benchmarks.synthetic_cases.laws import RANGES
 from nnode.app import discover
@@ -28,20 +29,25 @@ def test_the_true_law_s_effects_are_allowed() -> None:
     assert set(RANGES) == set(LAWS["traffic"])
 
 
-def test_answers_are_names_of_the_catalogue() -> None:
-    for domain, module in (("traffic", sumo_scenes), ("crowd", jupedsim_scenes)):
-        scenes: dict[str, Any] = vars(module)["SCENES"]
-        for scene in scenes.values():
-            assert {*scene.answer.right, *scene.answer.allowed} <= set(CATALOGUE.effects)
-            assert set(scene.answer.first) <= set(LAWS[domain])
-        kind = "sumo" if domain == "traffic" else "jupedsim"
-        assert len(worlds.cases(kind, DiscoveryBenchmarkOptions(seeds=2), 5)) == 2 * len(scenes)
+@pytest.mark.parametrize("program", worlds.PROGRAMS)
+def test_answers_are_names_of_the_catalogue(program: str) -> None:
+    domain, _ = worlds.PROGRAMS[program]
+    for scene in SCENES[program].values():
+        answer = scene["answer"]
+        names = {*answer.get("right", ()), *answer.get("allowed", ())}
+        assert names <= set(CATALOGUE.effects)
+        assert set(answer.get("first", ())) <= set(LAWS[domain])
+    found = worlds.cases(program, DiscoveryBenchmarkOptions(seeds=2), 5)
+    assert len(found) == 2 * len(SCENES[program])
+
+
+def test_half_of_the_laws_worlds_are_given_to_each_of_two_laws() -> None:
     laws = worlds.cases("laws", DiscoveryBenchmarkOptions(seeds=2), 5)
     assert [laws[f"laws-idm-s{seed}"]["law"] for seed in (5, 6)] == ["lin", "idm"]
 
 
-PILLAR = Answer(right=("obstacle",), allowed=("anticipation",))
-LATE = Answer(right=("reaction_delay", "inertia"), unknown=True)
+PILLAR = {"right": ("obstacle",), "allowed": ("anticipation",)}
+LATE = {"right": ("reaction_delay", "inertia"), "unknown": True}
 
 
 @pytest.mark.parametrize(
@@ -55,14 +61,14 @@ LATE = Answer(right=("reaction_delay", "inertia"), unknown=True)
         (LATE, [("multi_anticipation", "inertia")], "named", True, ""),
         (LATE, [], "unknown", True, ""),
         (LATE, [], "none", False, ""),
-        (worlds.NOTHING, [], "none", True, ""),
+        ({}, [], "none", True, ""),
     ],
 )
 def test_right_answers(
-    answer: Answer, effects: list[tuple[str, ...]], verdict: str, right: bool, false: str
+    answer: dict[str, Any], effects: list[tuple[str, ...]], verdict: str, right: bool, false: str
 ) -> None:
     named = [{"name": n, "alternatives": [{"name": o} for o in more]} for n, *more in effects]
-    row = answer.judge({"verdict": verdict, "effects": named, "leads": []})
+    row = answered({"verdict": verdict, "effects": named, "leads": []}, **answer)
     assert (row["right"], row["false_names"]) == (right, false)
 
 

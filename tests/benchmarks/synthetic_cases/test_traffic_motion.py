@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from benchmarks.synthetic_cases.traffic.motion import LAWS, Hidden, inside, simulate
+from benchmarks.synthetic_cases.traffic.motion import Base, Hidden, inside, simulate
 
 V0 = {"lin": 30.0, "log": 12.0}
 L = 8.0
@@ -23,27 +23,21 @@ def drive(
     duration: float = 60.0,
     step: float = 0.05,
     own: float = 1.0,
-    clock: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """``(M + 1, N)`` positions and velocities of one platoon, followers 20 m apart at first."""
     half = np.arange(2 * round(duration / step) + 1) * step / 2
     x = place(half)[0] - gap * np.arange(vehicles)[::-1].astype(float)
     v = np.full(vehicles, float(speed(half)[0]))
     moved, rates = simulate(
-        LAWS[law],
-        V0[law],
-        L,
+        Base(V0[law], L, law == "log"),
         hidden,
         np.full((1, vehicles), own),
-        place(half)[None],
-        speed(half)[None],
-        x[None, None],
-        v[None, None],
-        np.zeros((1, 1, vehicles)),
-        np.array([clock]),
+        (place(half)[None], speed(half)[None]),
+        (x[None, None], v[None, None]),
+        np.zeros((1, len(half) // 2 + 1, vehicles)),
+        np.zeros(1),
         0.0,
         step,
-        1,
     )
     return moved[0], rates[0]
 

@@ -143,10 +143,10 @@ def test_an_encoding_of_xml_that_is_not_read(tmp_path: Path, encoding: str) -> N
 
 
 def test_clocks_of_ngsim_out_of_range(tmp_path: Path) -> None:
-    from benchmarks.fault_injection.formats import ngsim
+    from benchmarks.fault_injection.targets import CORPUS
 
-    path = tmp_path / "a.csv"
-    path.write_bytes(ngsim().replace(b",1113433135100,", b",1e308,", 1))
+    path, sound = tmp_path / "a.csv", (CORPUS / "ngsim.csv").read_bytes()
+    path.write_bytes(sound.replace(b",1113433135100,", b",1e308,", 1))
     with pytest.raises(DataError, match=r"line 2: Global_Time and Frame_ID put frame 0 at 1e\+308"):
         read(NgsimOptions, path)
 
