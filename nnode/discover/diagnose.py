@@ -326,13 +326,20 @@ def _drivers(engine: Engine, fit: Fit, seed: int, notes: list[str]) -> list[Vari
 
     Args:
         seed: of the simulations that correct their bias.
-        notes: a note is added to them if pushes explain a large part of the rates.
+        notes: notes are added to them if the estimation does not converge, and if pushes explain a
+            large part of the rates.
     """
     if not isinstance(engine, FollowersEngine):
         return []
     engine.fit_whitening(fit.system, torch.from_numpy(fit.row))
     assert engine.population is not None
-    drivers = [Variation(name, **row) for name, row in variations(engine.drivers(seed)).items()]
+    population = engine.drivers(seed)
+    if not population.estimate.converged:
+        notes.append(
+            "The estimation of the differences between drivers did not converge. They are not "
+            "corrected for their bias."
+        )
+    drivers = [Variation(name, **row) for name, row in variations(population).items()]
     push = next(row for row in drivers if row.name == "push")
     if push.at_bound == "high" or not engine.population.explains_rates:
         rate = "accelerations" if fit.system.order > 1 else "speeds"

@@ -53,3 +53,14 @@ def test_a_period_of_the_whole_record_is_another_desired_speed(memory: Effect) -
     basis, _ = torch.linalg.qr(tangents)
     # not by another start of the memory, which is unknown
     assert float((column - basis @ (basis.T @ column)).norm()) < 0.2 * float(column.norm())
+
+
+def test_differences_between_drivers_are_corrected_if_the_estimation_converged() -> None:
+    engine, _ = estimated(Inertia(tau_v=0.3))
+    population = engine.population
+    assert population is not None
+    corrected = engine.drivers(0)
+    assert corrected.estimate.converged
+    assert (corrected.bias != 0).any()
+    engine.population = replace(population, estimate=replace(population.estimate, converged=False))
+    assert engine.drivers(0) is engine.population
