@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,10 +26,11 @@ from nnode.population.estimate import (
 from nnode.population.followers import (
     FLOOR,
     PAIRS,
-    Biases,
     Followers,
     Paths,
-    simulated_biases,
+    score_biases,
+    simulated_pairs,
+    spread_biases,
 )
 from nnode.population.likelihood import Linearised, Marginal, PushNoise, marginal
 from nnode.simulation.rhs import formula_of
@@ -168,7 +170,7 @@ def fit_drivers(
         first: parameters by name, such as ``idm.T``, where a second search starts; the result with
             the larger likelihood is taken.
         seed: of the simulations that estimate the bias.
-        pairs: of these simulations, see :func:`nnode.population.followers.simulated_biases`; 0: the
+        pairs: of these simulations, see :func:`nnode.population.followers.simulated_pairs`; 0: the
             estimates are not corrected. Estimates that did not converge are never corrected.
 
     Raises:
@@ -311,24 +313,37 @@ def full_names(drivers: Iterable[str], law: Iterable[str]) -> list[str]:
     return [short[name] for name in drivers]
 
 
+class Biases(NamedTuple):
+    """Biases of estimates in simulations, a row per antithetic pair.
+
+    Attributes:
+        theta: see :func:`nnode.population.followers.score_biases`.
+        spread: see :func:`nnode.population.followers.spread_biases`.
+    """
+
+    theta: np.ndarray
+    spread: np.ndarray
+
+
 def corrected_biases(population: Population, seed: int, pairs: int) -> Biases:
     """Biases of the estimates, by simulation.
 
     The linearisation at the modes and the errors of smoothed leaders bias the estimates. The biases
-    of parameters are those in simulations of the model with once corrected estimates: they halve
-    what one correction leaves of the bias of v0 of ``idm``. A second correction of the standard
-    deviations would amplify their sampling errors (tables in docs/method.md).
+    of parameters are computed again with once corrected estimates, which halves what one correction
+    leaves of the bias of v0 of ``idm``. A second correction of the standard deviations would
+    amplify their sampling errors (tables in docs/method.md).
 
     Args:
-        seed, pairs: see :func:`nnode.population.followers.simulated_biases`.
+        seed, pairs: see :func:`nnode.population.followers.simulated_pairs`.
 
     Raises:
         SimulationError: drawn drivers leave the road.
     """
-    first = simulated_biases(population.model, population.estimate, seed, pairs)
-    corrected = _corrected(population, first)
-    again = simulated_biases(population.model, corrected, seed, pairs)
-    return Biases(again.theta, first.spread)
+    simulated = simulated_pairs(population.model, population.estimate, seed, pairs)
+    first = Biases(score_biases(simulated), spread_biases(simulated))
+    once = _corrected(population, first)
+    again = simulated_pairs(population.model, once, seed, pairs)
+    return first._replace(theta=score_biases(again))
 
 
 def bias_corrected(population: Population, seed: int, pairs: int) -> Population:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -676,47 +676,38 @@ def _ornstein_uhlenbeck(normal: np.ndarray, step: float) -> np.ndarray:
     return process
 
 
-class Biases(NamedTuple):
-    """Biases of estimates in simulations of the estimated model, a row per antithetic pair.
+#: Antithetic pairs of simulated data: the model with these data, and the deviations of drivers.
+Simulated = list[list[tuple[Followers, Estimate]]]
 
-    Attributes:
-        theta: ``(pairs, P)`` of the parameters, in the scales in which they are varied.
-        spread: ``(pairs, Q)`` estimated standard deviations between drivers, relative to those of
-            the simulated drivers.
+
+def score_biases(simulated: Simulated) -> np.ndarray:
+    """``(pairs, P)`` biases of the parameters, in the scales in which they are varied; their mean
+    is the best estimate.
+
+    Simulated data are scored at the parameters that they were simulated with. The mean of a correct
+    score is zero; the linearisation at the modes and the errors of smoothed leaders shift it. A
+    bias is the Gauss-Newton step of the mean score of an antithetic pair of draws, in which the
+    linear part of the score cancels.
     """
-
-    theta: np.ndarray
-    spread: np.ndarray
-
-
-def simulated_biases(model: Followers, estimate: Estimate, seed: int, pairs: int) -> Biases:
-    """Biases of the estimates, by simulation; their mean is the best estimate.
-
-    Simulated data of the estimated model are scored at the parameters that they were simulated
-    with. The mean of a correct score is zero; the linearisation at the modes and the errors of
-    smoothed leaders shift it. A bias of a parameter is the Gauss-Newton step of the mean score of
-    an antithetic pair of draws, in which the linear part of the score cancels. Variances are
-    estimated from the data as linearised there.
-
-    Args:
-        seed, pairs: see :func:`simulated_pairs`.
-
-    Raises:
-        SimulationError: see :func:`simulated_pairs`.
-    """
-    simulated = simulated_pairs(model, estimate, seed, pairs)
-    theta = [[modes.marginal.change for _, modes in pair] for pair in simulated]
-    spread = [
-        [fit_variances(modes.data, PushNoise(), modes.variances).spread for _, modes in pair]
-        for pair in simulated
-    ]
-    ratios = np.array(spread) / estimate.variances.spread
-    return Biases(np.array(theta).mean(1), ratios.mean(1))
+    return np.array(
+        [np.mean([modes.marginal.change for _, modes in pair], 0) for pair in simulated]
+    )
 
 
-def simulated_pairs(
-    model: Followers, estimate: Estimate, seed: int, pairs: int
-) -> list[list[tuple[Followers, Estimate]]]:
+def spread_biases(simulated: Simulated) -> np.ndarray:
+    """``(pairs, Q)`` estimated standard deviations between drivers, relative to those of the
+    simulated drivers. Variances are estimated from the data as linearised at the modes."""
+    return np.array([np.mean([_spread_ratio(modes) for _, modes in pair], 0) for pair in simulated])
+
+
+def _spread_ratio(modes: Estimate) -> np.ndarray:
+    ratio: np.ndarray = (
+        fit_variances(modes.data, PushNoise(), modes.variances).spread / modes.variances.spread
+    )
+    return ratio
+
+
+def simulated_pairs(model: Followers, estimate: Estimate, seed: int, pairs: int) -> Simulated:
     """Antithetic pairs of simulated data of an estimated model: the model with these data, and the
     deviations of their drivers.
 
@@ -730,7 +721,7 @@ def simulated_pairs(
     Raises:
         SimulationError: fewer than one in :data:`ATTEMPTS` pairs can be used.
     """
-    simulated = list[list[tuple[Followers, Estimate]]]()
+    simulated: Simulated = []
     for attempt in range(ATTEMPTS * pairs):
         with suppress(SimulationError, np.linalg.LinAlgError):
             draws = antithetic_draws(seed + attempt)

@@ -266,10 +266,11 @@ class FollowersEngine(TrafficEngine):
         """The last estimate, corrected for its bias; where errors of positions are smaller than
         :data:`ERROR`, with errors estimated as well, because larger ones would lengthen the
         pushes."""
-        assert self.population is not None
-        if self.population.model.paths.error > ERROR:
-            return bias_corrected(self.population, seed, PAIRS)
-        return bias_corrected(with_smaller_errors(self.population), seed, PAIRS)
+        population = self.population
+        assert population is not None
+        if population.model.paths.error <= ERROR:
+            population = with_smaller_errors(population)
+        return bias_corrected(population, seed, PAIRS)
 
     def log_likelihoods(self, *starts: System) -> tuple[np.ndarray, System]:
         """``(G,)`` log marginal likelihoods of the clusters under a law with parameters of its own,
