@@ -30,7 +30,7 @@ from nnode.population.followers import (
     Paths,
     score_biases,
     simulated_pairs,
-    spread_biases,
+    variance_biases,
 )
 from nnode.population.likelihood import Linearised, Marginal, PushNoise, marginal
 from nnode.simulation.rhs import formula_of
@@ -84,26 +84,27 @@ class Population:
         estimate: parameters, deviations, variances.
         bias: ``(P,)`` the bias that was subtracted from the parameters, in the scales in which
             they are varied.
-        spread_bias, spread_error: ``(Q,)`` the factor by which standard deviations between drivers
-            were divided, and the standard error of its logarithm.
+        variance_bias, variance_error: ``(V,)`` the factors by which standard deviations and times
+            were divided, in the order of :attr:`~nnode.population.estimate.Variances.row`, and the
+            standard errors of their logarithms.
     """
 
     model: Followers
     estimate: Estimate
     bias: np.ndarray
-    spread_bias: np.ndarray
-    spread_error: np.ndarray
+    variance_bias: np.ndarray
+    variance_error: np.ndarray
 
     @classmethod
     def uncorrected(cls, model: Followers, estimate: Estimate) -> Population:
         """An estimate without correction of its bias."""
-        n_parameters, n_random = len(estimate.theta), len(model.random)
+        row = estimate.variances.row
         return cls(
             model=model,
             estimate=estimate,
-            bias=np.zeros(n_parameters),
-            spread_bias=np.ones(n_random),
-            spread_error=np.zeros(n_random),
+            bias=np.zeros_like(estimate.theta),
+            variance_bias=np.ones_like(row),
+            variance_error=np.zeros_like(row),
         )
 
     @property
@@ -318,11 +319,11 @@ class Biases(NamedTuple):
 
     Attributes:
         theta: see :func:`nnode.population.followers.score_biases`.
-        spread: see :func:`nnode.population.followers.spread_biases`.
+        variances: see :func:`nnode.population.followers.variance_biases`.
     """
 
     theta: np.ndarray
-    spread: np.ndarray
+    variances: np.ndarray
 
 
 def corrected_biases(population: Population, seed: int, pairs: int) -> Biases:
@@ -340,15 +341,15 @@ def corrected_biases(population: Population, seed: int, pairs: int) -> Biases:
         SimulationError: drawn drivers leave the road.
     """
     simulated = simulated_pairs(population.model, population.estimate, seed, pairs)
-    first = Biases(score_biases(simulated), spread_biases(simulated))
+    first = Biases(score_biases(simulated), variance_biases(simulated))
     once = _corrected(population, first)
     again = simulated_pairs(population.model, once, seed, pairs)
     return first._replace(theta=score_biases(again))
 
 
 def bias_corrected(population: Population, seed: int, pairs: int) -> Population:
-    """The estimate, corrected for the bias of its parameters and of the standard deviations between
-    drivers; the same if it did not converge or if simulations diverge."""
+    """The estimate, corrected for the bias of its parameters and variances; the same if it did not
+    converge or if simulations diverge."""
     before = population.estimate
     if not before.converged:
         return population
@@ -358,25 +359,25 @@ def bias_corrected(population: Population, seed: int, pairs: int) -> Population:
     except (SimulationError, np.linalg.LinAlgError):  # drawn drivers whose simulations blow up
         log.warning("parameters are not corrected for their bias: simulated drivers left the road")
         return population
-    error = biases.spread.std(0, ddof=1) / math.sqrt(pairs) / biases.spread.mean(0)
+    ratios = biases.variances
     return replace(
         population,
         estimate=replace(corrected, converged=before.converged),
         bias=before.theta - corrected.theta,
-        spread_bias=before.variances.spread / corrected.variances.spread,
-        spread_error=error,
+        variance_bias=before.variances.row / corrected.variances.row,
+        variance_error=ratios.std(0, ddof=1) / math.sqrt(pairs) / ratios.mean(0),
     )
 
 
 def _corrected(population: Population, biases: Biases) -> Estimate:
-    """The deviations of drivers and starts with parameters and standard deviations between drivers
-    that are corrected by the mean of biases."""
+    """The deviations of drivers and starts with parameters and variances that are corrected by the
+    mean of biases."""
     model, before = population.model, population.estimate
     bias = np.clip(biases.theta.mean(0), -LONGEST, LONGEST)
     theta = np.clip(before.theta - bias, model.low, model.high)
-    spread = before.variances.spread / biases.spread.mean(0)
-    variances = replace(before.variances, spread=np.clip(spread, LEAST_SPREAD, MOST_SPREAD))
-    return fit_deviations(model, PushNoise(), theta, variances)
+    variances = before.variances
+    row = np.clip(variances.row / biases.variances.mean(0), variances.low, variances.high)
+    return fit_deviations(model, PushNoise(), theta, variances.filled(row))
 
 
 def _estimated(

@@ -694,17 +694,17 @@ def score_biases(simulated: Simulated) -> np.ndarray:
     )
 
 
-def spread_biases(simulated: Simulated) -> np.ndarray:
-    """``(pairs, Q)`` estimated standard deviations between drivers, relative to those of the
-    simulated drivers. Variances are estimated from the data as linearised at the modes."""
-    return np.array([np.mean([_spread_ratio(modes) for _, modes in pair], 0) for pair in simulated])
+def variance_biases(simulated: Simulated) -> np.ndarray:
+    """``(pairs, V)`` estimated standard deviations and times, relative to the simulated ones, in the
+    order of :attr:`nnode.population.estimate.Variances.row`. They are estimated from the data as
+    linearised at the modes."""
+    return np.array([np.mean([_ratios(modes) for _, modes in pair], 0) for pair in simulated])
 
 
-def _spread_ratio(modes: Estimate) -> np.ndarray:
-    ratio: np.ndarray = (
-        fit_variances(modes.data, PushNoise(), modes.variances).spread / modes.variances.spread
-    )
-    return ratio
+def _ratios(modes: Estimate) -> np.ndarray:
+    estimated = fit_variances(modes.data, PushNoise(), modes.variances)
+    ratios: np.ndarray = estimated.row / modes.variances.row
+    return ratios
 
 
 def simulated_pairs(model: Followers, estimate: Estimate, seed: int, pairs: int) -> Simulated:

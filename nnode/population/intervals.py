@@ -9,7 +9,6 @@ likelihood ratio, from 0 on.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,7 +58,7 @@ def deviation_intervals(population: Population) -> np.ndarray:
     The likelihood is that of the estimates before the correction of their bias, and the intervals
     are corrected by the same factors."""
     corrected, data = population.estimate.variances, population.estimate.data
-    variances = replace(corrected, spread=corrected.spread * population.spread_bias)
+    variances = corrected.filled(corrected.row * population.variance_bias)
     logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
     theta, model = population.estimate.theta, population.model
     products: dict[tuple[float, ...], Products] = {}
@@ -81,9 +80,9 @@ def deviation_intervals(population: Population) -> np.ndarray:
         ).loglik
 
     noise, peak = NOISE[: len(variances.noise)], loglik(slice(None), logs)
-    drivers = slice(len(noise), len(noise) + len(variances.spread))
     ends, free = np.full((len(logs), 2), np.nan), at_bounds(logs, low, high, NEAR) == ""
-    for k in map(int, np.flatnonzero((low < high)[: drivers.stop])):
+    n_deviations = len(noise) + len(variances.spread)
+    for k in map(int, np.flatnonzero((low < high)[:n_deviations])):
         name = noise[k] if k < len(noise) else ""
         if name.endswith("_time") or peak - loglik(k, low[k]) >= DROP:
             continue
@@ -108,13 +107,11 @@ def deviation_intervals(population: Population) -> np.ndarray:
             )
             curvature[i, j] = curvature[j, i] = -cross / (4 * DIFFERENCE**2)
     if size and np.linalg.eigvalsh(curvature).min() > 0:
-        error = np.zeros(len(logs))
-        error[drivers] = population.spread_error
-        deviation = np.sqrt(np.diag(np.linalg.inv(curvature)) + error[places] ** 2)
+        error = population.variance_error[places]
+        deviation = np.sqrt(np.diag(np.linalg.inv(curvature)) + error**2)
         half = ndtri(0.5 + LEVEL / 2) * deviation
         ends[places] = np.exp(logs[places, None] + half[:, None] * np.array([-1.0, 1.0]))
-    ends[drivers] /= population.spread_bias[:, None]
-    return ends
+    return ends / population.variance_bias[:, None]
 
 
 def variations(population: Population) -> dict[str, dict[str, Any]]:

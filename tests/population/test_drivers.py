@@ -164,7 +164,7 @@ def test_errors_that_may_not_exist_leave_the_intervals_of_the_others(
         low=np.insert(low, 3, [0.001, 0.1]),
         high=np.insert(high, 3, [1.0, 5.0]),
     )
-    beside = replace(population, estimate=replace(population.estimate, variances=tiny))
+    beside = Population.uncorrected(population.model, replace(population.estimate, variances=tiny))
     ends, without = deviation_intervals(beside), deviation_intervals(population)
     np.testing.assert_allclose(ends[[0, 1, 5]], without[[0, 1, 3]], rtol=1e-3)
     assert ends[3, 0] == 0.0
@@ -181,13 +181,12 @@ def test_intervals_are_those_of_the_estimate_before_its_correction(
         estimate=replace(
             population.estimate, variances=replace(before, spread=before.spread / 2.0)
         ),
-        spread_bias=np.array([2.0]),
-        spread_error=np.array([0.0]),
+        variance_bias=np.where(np.arange(len(before.row)) == 3, 2.0, 1.0),
     )
     ends, corrected = deviation_intervals(population), deviation_intervals(halved)
     np.testing.assert_allclose(corrected[:3], ends[:3])
     np.testing.assert_allclose(corrected[3], ends[3] / 2.0)
-    less_certain = replace(halved, spread_error=np.array([0.5]))
+    less_certain = replace(halved, variance_error=np.full(len(before.row), 0.5))
     low, high = deviation_intervals(less_certain)[3]
     deviation = np.log(ends[3, 1] / ends[3, 0]) / (2 * 1.96)
     expected = 2 * 1.96 * np.hypot(deviation, 0.5)
@@ -200,7 +199,8 @@ def test_differences_in_a_speed_that_few_drivers_reach_are_underestimated() -> N
     paths = paths_of(list(nnode.sequences(table)), 0.2)
     system = Traffic([make_law("idm")], leader="measured").double()
     population = fit_drivers(system, paths, ["T", "v0"])
-    gap, speed = population.spread_bias
+    measurement, gap, speed = population.variance_bias[2:5]
+    assert measurement == 1.0  # fourth differences determine it
     assert gap == pytest.approx(1.0, abs=0.1)
     assert speed < 0.95
     # they are corrected
