@@ -695,9 +695,9 @@ def score_biases(simulated: Simulated) -> np.ndarray:
 
 
 def variance_biases(simulated: Simulated) -> np.ndarray:
-    """``(pairs, V)`` estimated standard deviations and times, relative to the simulated ones, in the
-    order of :attr:`nnode.population.estimate.Variances.row`. They are estimated from the data as
-    linearised at the modes."""
+    """``(pairs, V)`` estimated standard deviations and times relative to the simulated ones, as in
+    :attr:`nnode.population.estimate.Variances.row`. They are estimated from the data as linearised
+    at the modes."""
     return np.array([np.mean([_ratios(modes) for _, modes in pair], 0) for pair in simulated])
 
 
