@@ -282,7 +282,7 @@ def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves
     if selection.fit is not exploration.base:
         remaining = curves(engine, selection.fit, exploration.variables)
         remaining = significant_curves(engine, selection.fit, remaining, thresholds.STRICT)
-    return [curve for curve in remaining if curve.removed > thresholds.SMALLEST_SHARE]
+    return [c for c in remaining if c.relevant and c.removed > thresholds.SMALLEST_SHARE]
 
 
 def _used(

@@ -13,13 +13,12 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.sequence import Sequence, collate
-from nnode.discover import thresholds
 from nnode.discover.crowds.variables import crowd_variables
 from nnode.discover.crowds.whitening import Whitening
 from nnode.discover.crowds.windows import Windows
 from nnode.discover.eligibility import check_model
 from nnode.discover.outcome import Simulation
-from nnode.discover.residuals.engine import Squares, of_residuals
+from nnode.discover.residuals.engine import Squares, of_residuals, removes_enough
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
 from nnode.model.system import Crowd, System
@@ -63,7 +62,7 @@ class CrowdEngine:
         window: float = 1.5,
         clusters: np.ndarray | None = None,
     ) -> None:
-        self.sequences, self.smallest_share = list(sequences), thresholds.SMALLEST_SHARE
+        self.sequences = list(sequences)
         self.batch = collate(sequences)
         self.windows = Windows(sequences, window)
         window_of, place_of = self.windows.person.T
@@ -94,6 +93,9 @@ class CrowdEngine:
         squares = (self._projected_errors(system, row) ** 2).sum(-1)
         n_samples = squares.shape[1]
         return Squares(squares.ravel(), self.windows.sequence[window].repeat(n_samples))
+
+    def relevant(self, before: System, after: System, square: float) -> bool:
+        return removes_enough(self, before, after, square)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """The windows in sequence, each from the best-fitting start state."""

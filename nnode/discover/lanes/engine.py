@@ -17,11 +17,10 @@ from torch import Tensor, nn
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence, collate
-from nnode.discover import thresholds
 from nnode.discover.lanes.variables import traffic_variables
 from nnode.discover.lanes.whitening import PlatoonFilter
 from nnode.discover.outcome import Simulation
-from nnode.discover.residuals.engine import Squares, of_residuals
+from nnode.discover.residuals.engine import Squares, of_residuals, removes_enough
 from nnode.discover.residuals.variables import Variable
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.extend import effects_of, extended, without
@@ -75,7 +74,6 @@ class TrafficEngine:
         large: float = LARGE,
     ) -> None:
         self.sequences, self.large = sequences, large
-        self.smallest_share = thresholds.SMALLEST_SHARE
         self.names = [sequence.name for sequence in sequences]
         parts = [_windows(sequence, window) for sequence in sequences]
         self.batch = collate(part[0] for each in parts for part in each)
@@ -252,6 +250,9 @@ class TrafficEngine:
         """Squared errors of the followers' positions."""
         difference = self.deviations(system, row[None])[0][self.compared].numpy()
         return Squares(difference**2, self.sequence)
+
+    def relevant(self, before: System, after: System, square: float) -> bool:
+        return removes_enough(self, before, after, square)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """Whole sequences behind their leaders; of engines without windows."""

@@ -134,7 +134,6 @@ class FollowersEngine(TrafficEngine):
         if self.apart:
             sequences = at_steps(sequences)
         super().__init__(sequences, np.inf, clusters, large)
-        self.smallest_share = -np.inf
         self._paths_by_step, self._like = dict[tuple[int, int], Paths](), like
         self._label = np.arange(len(sequences)) if clusters is None else np.asarray(clusters)
         self.population: Population | None = None
@@ -160,6 +159,15 @@ class FollowersEngine(TrafficEngine):
         compared = self._observed.numpy() & (np.arange(self._observed.shape[1]) > 0)
         sequence = np.repeat(self._paths(STEP).sequence, compared.sum(1))
         return Squares(self._position_errors(system, row)[compared] ** 2, sequence)
+
+    def relevant(self, before: System, after: System, square: float) -> bool:
+        """Whether simulated paths with and without an effect differ by :data:`ERROR` (root mean
+        square). Pushes produce most of the errors, so their decrease shows no effect."""
+        without, with_effect = (
+            self._position_errors(system, ParameterVector(system).row)[self._observed.numpy()]
+            for system in (before, after)
+        )
+        return bool(np.sqrt(np.mean((with_effect - without) ** 2)) >= ERROR)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """The simulated followers of each sequence, with the deviations of :meth:`squares`."""

@@ -231,12 +231,12 @@ def significant_curves(
         if len(significant) == MOST:
             break
         try:
-            after = square_of(
-                engine, refine(engine, with_curve(fit, curve), tolerance=ROUGH).system
-            )
+            system = refine(engine, with_curve(fit, curve), tolerance=ROUGH).system
+            removed = 1 - square_of(engine, system) / before
+            relevant = engine.relevant(fit.system, system, before)
         except SimulationError:
             continue
-        significant.append(replace(curve, removed=1 - after / before))
+        significant.append(replace(curve, removed=removed, relevant=relevant))
     return sorted(significant, key=lambda curve: -curve.removed)
 
 

@@ -168,7 +168,7 @@ def search(
         elif doubtful is not None:
             # the whitening has changed since
             before = refine(engine, doubtful.fit.system)
-            retested = _candidate(step.chosen.score, step.chosen.fit, before, screen, 0.0)
+            retested = _candidate(step.chosen.score, step.chosen.fit, before, screen, True)
             if _curve_predicts_better(engine, before, retested, variables or []):
                 break
             doubtful = None
@@ -286,7 +286,7 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
     eligible = [
         c
         for c in candidates
-        if c.removed >= engine.smallest_share
+        if c.relevant
         and c.gain.gain > 0
         and c.presence_pvalue < thresholds.LEVEL
         and c.strength_excludes_neutral(screen.label(c.name))
@@ -330,8 +330,8 @@ def _ranked(
             fit = calibrated(engine, selection.fit, score, lowest_cost, starts)
         except SimulationError:
             continue
-        removed = (square - square_of(engine, fit.system)) / selection.square
-        candidates.append(_candidate(score, fit, selection.fit, screen, removed))
+        relevant = engine.relevant(selection.fit.system, fit.system, selection.square)
+        candidates.append(_candidate(score, fit, selection.fit, screen, relevant))
         # the linear score test can miss a strong, nonlinear effect
         followed = significant or len(candidates) > 1
         if not followed and not _significant_held_out(candidates[0], screen, len(selection.scores)):
@@ -361,7 +361,7 @@ def _with_refitted_variances(
         start = candidate.fit.system if population is None else population.system
         fit = refine(engine, start, tolerance=ROUGH)
         refitted.append(
-            _candidate(candidate.score, fit, selection.fit, selection.screen, candidate.removed)
+            _candidate(candidate.score, fit, selection.fit, selection.screen, candidate.relevant)
         )
     return refitted
 
@@ -396,12 +396,12 @@ def _hinted(hints: Sequence[System], system: System, name: str) -> list[System]:
     return starts
 
 
-def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, removed: float) -> Candidate:
+def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, relevant: bool) -> Candidate:
     """A fitted candidate, compared on the effect's clusters with the model without it."""
     label = screen.label(score.effect.name)
     losses = heldout(fit, label)
     gain = compare(heldout(before, label), losses)
-    return Candidate(score, fit, losses, gain, presence_pvalue(before, fit, label), removed)
+    return Candidate(score, fit, losses, gain, presence_pvalue(before, fit, label), relevant)
 
 
 def _j_test(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
@@ -423,7 +423,7 @@ def _refined(engine: Engine, candidates: list[Candidate], selection: Selection) 
     for candidate in candidates:
         fit = refine(engine, candidate.fit.system, tolerance=FINE)
         refined.append(
-            _candidate(candidate.score, fit, selection.fit, selection.screen, candidate.removed)
+            _candidate(candidate.score, fit, selection.fit, selection.screen, candidate.relevant)
         )
     return sorted(refined, key=lambda c: -c.gain.gain)
 
@@ -516,7 +516,7 @@ def _rivals_given_others(
     assert selection.screen is not None
     added = {accepted.chosen.name for accepted in selection.steps}
     chosen = _candidate(
-        step.chosen.score, selection.fit, before, selection.screen, step.chosen.removed
+        step.chosen.score, selection.fit, before, selection.screen, step.chosen.relevant
     )
     rivals = []
     for rival, _ in step.rivals:
@@ -527,7 +527,7 @@ def _rivals_given_others(
         except SimulationError:
             continue
         fit = refine(engine, fit.system, tolerance=FINE)
-        refitted = _candidate(rival.score, fit, before, selection.screen, rival.removed)
+        refitted = _candidate(rival.score, fit, before, selection.screen, rival.relevant)
         test = _j_test(refitted, chosen, selection.screen)
         if test.p_value > apart_at(chosen, refitted):
             rivals.append((refitted, test))

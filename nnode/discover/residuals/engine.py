@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence
+from nnode.discover import thresholds
 from nnode.discover.outcome import Simulation
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.system import System
@@ -58,8 +59,6 @@ class Engine(Protocol):
         unit: ``(n,)`` number of the unit: agents whose parameters are estimated jointly.
         people: of each unit, per direction the sequence and the place of its agent; one entry if
             all directions belong to one agent.
-        smallest_share: of the squared errors, from which an effect is named; -inf if the tests
-            themselves require a minimum effect size.
     """
 
     batch: Batch
@@ -71,7 +70,6 @@ class Engine(Protocol):
     component: np.ndarray
     unit: np.ndarray
     people: list[list[tuple[int, int]]]
-    smallest_share: float
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)`` residuals of R runs of one model; NaN if a run diverges.
@@ -120,6 +118,15 @@ class Engine(Protocol):
         """Squared errors of positions without whitening, for reports."""
         ...
 
+    def relevant(self, before: System, after: System, square: float) -> bool:
+        """Whether an effect changes the simulated paths enough to be named.
+
+        Args:
+            before, after: the calibrated models without and with it.
+            square: mean square error of positions of the model without any effect, m².
+        """
+        ...
+
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """The simulations whose errors are :meth:`squares`, of each sequence; None if nothing of it
         is compared. Not for engines with windows in lanes."""
@@ -140,6 +147,13 @@ def of_residuals(label: np.ndarray | None, sequence: np.ndarray) -> np.ndarray:
     clusters = sequence if label is None else np.asarray(label)[sequence]
     numbered: np.ndarray = np.unique(clusters, return_inverse=True)[1].reshape(-1)
     return numbered
+
+
+def removes_enough(engine: Engine, before: System, after: System, square: float) -> bool:
+    """Whether squared errors fall by :data:`~nnode.discover.thresholds.SMALLEST_SHARE` of
+    ``square``."""
+    removed = square_of(engine, before) - square_of(engine, after)
+    return removed >= thresholds.SMALLEST_SHARE * square
 
 
 def square_of(engine: Engine, system: System) -> float:

@@ -190,6 +190,7 @@ class Curves:
         shift: ``(K,)`` change of the model's parameters that the curve entails.
         removed: share of the squared errors of positions that it removes; NaN until computed, see
             :func:`nnode.discover.locate.curves.significant_curves`.
+        relevant: see :meth:`nnode.discover.residuals.engine.Engine.relevant`; False until computed.
     """
 
     variable: Variable
@@ -201,6 +202,7 @@ class Curves:
     p_value: float
     shift: np.ndarray
     removed: float = float("nan")
+    relevant: bool = False
 
     @property
     def clusters(self) -> int:

@@ -182,7 +182,7 @@ class Screen:
         self.fit, self.cluster, self.levels = fit, cluster, levels or {}
         self.residual = fit.residual
         self.variance = fit.cost / len(fit.residual)
-        self._basis = orthonormal(fit.tangents)
+        self._basis = orthonormal(fit.all_tangents)
         self._rng = np.random.default_rng(seed)
         #: ``(F, G)``; the first row is the data without flips
         self._signs = signs(int(cluster.max()) + 1, flips, self._rng)
