@@ -162,12 +162,14 @@ class FollowersEngine(TrafficEngine):
 
     def relevant(self, before: System, after: System, square: float) -> bool:
         """Whether simulated paths with and without an effect differ by :data:`ERROR` (root mean
-        square). Pushes produce most of the errors, so their decrease shows no effect."""
+        square), with the same drivers. Pushes produce most of the errors, and drivers may imitate
+        an effect, so the decrease of the errors shows no effect."""
         without, with_effect = (
-            self._position_errors(system, ParameterVector(system).row)[self._observed.numpy()]
+            self._simulated(system, ParameterVector(system).row[None])[1][:, 0, 0].T
             for system in (before, after)
         )
-        return bool(np.sqrt(np.mean((with_effect - without) ** 2)) >= ERROR)
+        change = (with_effect - without)[self._observed.numpy()]
+        return not np.sqrt(np.mean(change**2)) < ERROR
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """The simulated followers of each sequence, with the deviations of :meth:`squares`."""
@@ -432,7 +434,8 @@ class FollowersEngine(TrafficEngine):
             return errors
         variances = self.population.estimate.variances
         data = self.population.estimate.data
-        data = replace(data, residual=errors)
+        diverged = ~np.isfinite(errors).all(1)
+        data = replace(data, residual=np.where(diverged[:, None], 0.0, errors))
         products = PushNoise().products(data, variances.noise)
         unchanged = np.zeros(data.fixed.shape[-1])
         posterior = marginal(

@@ -31,7 +31,6 @@ class Candidate:
         losses: ``(G,)`` held-out costs of the effect's clusters.
         gain: over the model without it.
         presence_pvalue: of the one-sided score test on held-out clusters.
-        relevant: see :meth:`nnode.discover.residuals.engine.Engine.relevant`.
     """
 
     score: Score
@@ -39,7 +38,6 @@ class Candidate:
     losses: np.ndarray
     gain: Comparison
     presence_pvalue: float
-    relevant: bool
 
     @property
     def name(self) -> str:

@@ -168,7 +168,7 @@ def search(
         elif doubtful is not None:
             # the whitening has changed since
             before = refine(engine, doubtful.fit.system)
-            retested = _candidate(step.chosen.score, step.chosen.fit, before, screen, True)
+            retested = _candidate(step.chosen.score, step.chosen.fit, before, screen)
             if _curve_predicts_better(engine, before, retested, variables or []):
                 break
             doubtful = None
@@ -286,11 +286,11 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
     eligible = [
         c
         for c in candidates
-        if c.relevant
-        and c.gain.gain > 0
+        if c.gain.gain > 0
         and c.presence_pvalue < thresholds.LEVEL
         and c.strength_excludes_neutral(screen.label(c.name))
         and c.ordered
+        and engine.relevant(selection.fit.system, c.fit.system, selection.square)
     ]
     passing = [c for c in eligible if c.score.p_value <= thresholds.EACH]
     if not passing and not isinstance(engine, FollowersEngine):
@@ -330,8 +330,7 @@ def _ranked(
             fit = calibrated(engine, selection.fit, score, lowest_cost, starts)
         except SimulationError:
             continue
-        relevant = engine.relevant(selection.fit.system, fit.system, selection.square)
-        candidates.append(_candidate(score, fit, selection.fit, screen, relevant))
+        candidates.append(_candidate(score, fit, selection.fit, screen))
         # the linear score test can miss a strong, nonlinear effect
         followed = significant or len(candidates) > 1
         if not followed and not _significant_held_out(candidates[0], screen, len(selection.scores)):
@@ -360,9 +359,7 @@ def _with_refitted_variances(
         population = populations.get(candidate.name)
         start = candidate.fit.system if population is None else population.system
         fit = refine(engine, start, tolerance=ROUGH)
-        refitted.append(
-            _candidate(candidate.score, fit, selection.fit, selection.screen, candidate.relevant)
-        )
+        refitted.append(_candidate(candidate.score, fit, selection.fit, selection.screen))
     return refitted
 
 
@@ -396,12 +393,12 @@ def _hinted(hints: Sequence[System], system: System, name: str) -> list[System]:
     return starts
 
 
-def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen, relevant: bool) -> Candidate:
+def _candidate(score: Score, fit: Fit, before: Fit, screen: Screen) -> Candidate:
     """A fitted candidate, compared on the effect's clusters with the model without it."""
     label = screen.label(score.effect.name)
     losses = heldout(fit, label)
     gain = compare(heldout(before, label), losses)
-    return Candidate(score, fit, losses, gain, presence_pvalue(before, fit, label), relevant)
+    return Candidate(score, fit, losses, gain, presence_pvalue(before, fit, label))
 
 
 def _j_test(first: Candidate, second: Candidate, screen: Screen) -> Comparison:
@@ -422,9 +419,7 @@ def _refined(engine: Engine, candidates: list[Candidate], selection: Selection) 
     refined = []
     for candidate in candidates:
         fit = refine(engine, candidate.fit.system, tolerance=FINE)
-        refined.append(
-            _candidate(candidate.score, fit, selection.fit, selection.screen, candidate.relevant)
-        )
+        refined.append(_candidate(candidate.score, fit, selection.fit, selection.screen))
     return sorted(refined, key=lambda c: -c.gain.gain)
 
 
@@ -515,9 +510,7 @@ def _rivals_given_others(
     """
     assert selection.screen is not None
     added = {accepted.chosen.name for accepted in selection.steps}
-    chosen = _candidate(
-        step.chosen.score, selection.fit, before, selection.screen, step.chosen.relevant
-    )
+    chosen = _candidate(step.chosen.score, selection.fit, before, selection.screen)
     rivals = []
     for rival, _ in step.rivals:
         if rival.name in added:
@@ -527,7 +520,7 @@ def _rivals_given_others(
         except SimulationError:
             continue
         fit = refine(engine, fit.system, tolerance=FINE)
-        refitted = _candidate(rival.score, fit, before, selection.screen, rival.relevant)
+        refitted = _candidate(rival.score, fit, before, selection.screen)
         test = _j_test(refitted, chosen, selection.screen)
         if test.p_value > apart_at(chosen, refitted):
             rivals.append((refitted, test))

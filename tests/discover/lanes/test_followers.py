@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 import nnode
 from benchmarks.drivers import platoons
 from nnode.calibrate.parameters import ParameterVector
-from nnode.discover.lanes.followers import FollowersEngine
+from nnode.discover.lanes.followers import ERROR, FollowersEngine
+from nnode.discover.residuals.fit import evaluated
+from nnode.discover.statistics.score import Screen, traces
 from nnode.model import System, Traffic, make_law
 from nnode.model.effects import Effect
-from nnode.model.effects.lane import Inertia, MultiAnticipation, ReactionDelay, SpeedPeriod
+from nnode.model.effects.lane import (
+    Inertia,
+    MultiAnticipation,
+    ReactionDelay,
+    RelativeSpeed,
+    SpeedPeriod,
+)
 from nnode.model.extend import extended
 
 
@@ -64,3 +73,45 @@ def test_differences_between_drivers_are_corrected_if_the_estimation_converged()
     assert (corrected.bias != 0).any()
     engine.population = replace(population, estimate=replace(population.estimate, converged=False))
     assert engine.drivers(0) is engine.population
+
+
+@pytest.mark.parametrize(("c", "relevant"), [(0.0005, False), (0.2, True)])
+def test_effects_that_hardly_move_the_paths_are_not_relevant(c: float, relevant: bool) -> None:
+    engine, system = estimated(Inertia(tau_v=0.3))
+    larger, _ = extended(system, MultiAnticipation(c=c).double())
+    assert engine.relevant(system, larger, 1.0) is relevant
+    before, after = (
+        engine._simulated(model, ParameterVector(model).row[None])[1][:, 0, 0]
+        for model in (system, larger)
+    )
+    assert (np.sqrt(np.mean((after - before) ** 2)) >= ERROR) is np.bool_(relevant)
+
+
+def test_the_squares_of_paths_that_diverge_are_infinite(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine, system = estimated(Inertia(tau_v=0.3))
+    row, pseudo_residuals = ParameterVector(system).row, engine._pseudo_residuals
+    finite = engine.squares(system, row).means()
+
+    def diverging(*arguments: object) -> tuple[np.ndarray, object, np.ndarray]:
+        difference, model, states = pseudo_residuals(*arguments)
+        difference[0, 0, 20:] = np.nan  # of the first follower
+        return difference, model, states
+
+    monkeypatch.setattr(engine, "_pseudo_residuals", diverging)
+    means = engine.squares(system, row).means()
+    assert np.isinf(means[0])
+    np.testing.assert_allclose(means[1:], finite[1:])
+
+
+def test_an_effect_does_not_carry_a_parameter_beyond_its_bound() -> None:
+    """The response of ``helly`` to the speed difference is that of ``relative_speed``."""
+    table = platoons("idm", "none", 0.0, 77, number=6, vehicles=4)
+    engine = FollowersEngine(list(nnode.sequences(table)))
+    system = Traffic([make_law("helly")], leader="measured").double()
+    engine.fit_whitening(system, ParameterVector(system).row)
+    fit = evaluated(engine, system)
+    free = np.array([not name.endswith("c_v") for name in fit.names])
+    fit = replace(fit, free=free)  # as at a bound
+    (trace,) = traces(engine, fit, RelativeSpeed)
+    left = Screen(fit, engine.cluster).adjusted(trace.columns)
+    assert np.linalg.norm(left) < 0.01 * np.linalg.norm(trace.columns)
