@@ -65,7 +65,8 @@ from nnode.simulation.rhs import side_by_side
 
 #: Smallest standard deviation of errors of positions, m. Paths without measurement errors differ
 #: from the model's by some centimetres, because its zones have ends of finite width and simulators
-#: integrate differently. The table in docs/discovery.md shows what other values do.
+#: integrate differently. The table in docs/discovery.md shows what other values do. For the same
+#: reason, effects that move the simulated paths by less are not relevant.
 ERROR = 0.05
 #: Smallest standard deviation of the start of a memory in residuals, in its own unit. Residuals do
 #: not depend on these starts then. They are not measured, and the mean of their deviations is not

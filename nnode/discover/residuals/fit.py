@@ -60,11 +60,6 @@ class Fit:
         """``(n, F)`` derivatives with respect to the parameters that are free."""
         return self.jacobian[:, self.free]
 
-    @property
-    def all_tangents(self) -> np.ndarray:
-        """``(n, A)`` the same, also with respect to the parameters that are held at a bound."""
-        return self.jacobian[:, (self.jacobian**2).sum(0) > 0]
-
     def influence(self, cluster: np.ndarray) -> ClusterInfluence:
         """The influence of the clusters on the free parameters."""
         columns = self.tangents

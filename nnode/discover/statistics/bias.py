@@ -57,7 +57,7 @@ def mean_scores(
     """
     parts = []
     for engine, fit in simulated:
-        basis, effect_columns = orthonormal(fit.all_tangents), columns(engine, fit)
+        basis, effect_columns = orthonormal(fit.jacobian), columns(engine, fit)
         parts.append(
             group_sums(effect_columns - basis @ (basis.T @ effect_columns), label, fit.residual)
         )

@@ -182,7 +182,7 @@ class Screen:
         self.fit, self.cluster, self.levels = fit, cluster, levels or {}
         self.residual = fit.residual
         self.variance = fit.cost / len(fit.residual)
-        self._basis = orthonormal(fit.all_tangents)
+        self._basis = orthonormal(fit.jacobian)
         self._rng = np.random.default_rng(seed)
         #: ``(F, G)``; the first row is the data without flips
         self._signs = signs(int(cluster.max()) + 1, flips, self._rng)
@@ -192,7 +192,8 @@ class Screen:
         self._adjusted_residuals: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def adjusted(self, columns: np.ndarray) -> np.ndarray:
-        """``columns`` projected orthogonally to the tangents of the model's parameters."""
+        """``columns`` projected orthogonally to the tangents of all of the model's parameters, also
+        those at a bound."""
         adjusted: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
         return adjusted
 
