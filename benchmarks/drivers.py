@@ -361,7 +361,7 @@ def _diagnosed(case: dict[str, Any], laws: list[str] | None) -> dict[str, Any]:
         }
         for each in report["drivers"]
     }
-    row = judged(report, list(sizes))
+    row = judged(report, list(sizes)) | {"law_at_bounds": bool(report["law_at_bounds"])}
     for name, true in {**sizes, **_variations(case)}.items():
         interval = intervals.get(name, {})
         row |= _estimate(name, true, *(interval.get(end) for end in ("value", "low", "high")))

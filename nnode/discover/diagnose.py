@@ -13,7 +13,6 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from nnode.calibrate.intervals import at_bounds
 from nnode.data.clusters import least_number, level
 from nnode.data.sequence import Domain, Sequence
 from nnode.discover import thresholds
@@ -56,6 +55,7 @@ from nnode.discover.result import (
     Variation,
     Verdict,
 )
+from nnode.discover.statistics.bounds import reached_bounds, required_beyond_bounds
 from nnode.discover.statistics.combination import least_confirmation
 from nnode.discover.statistics.power import PowerSimulation
 from nnode.discover.statistics.random_effects import IndividualEstimate, estimate_individual
@@ -63,7 +63,6 @@ from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.system import System
-from nnode.model.term import physical_bounds
 from nnode.population.drivers import EXPLAINED
 from nnode.population.followers import drivers_differ, without_errors
 from nnode.population.intervals import variations
@@ -167,9 +166,7 @@ def diagnose(
     division, engine = exploration.division, exploration.engine
     base_system, selection = exploration.base_system, exploration.selection
     notes += [division.note] if division.note else []
-    imitations: list[NamedEffect] = []
-    if nearer is not None and selection.steps:
-        selection, imitations = _without_imitations(exploration, nearer, notes)
+    selection, imitations, law_at_bounds = _without_imitations(exploration, nearer, notes)
     numbers = _clusters(exploration, options, len(effects))
     testable = numbers.open >= numbers.least
     stages.begin("confirming")
@@ -186,6 +183,7 @@ def diagnose(
     kinds = [effect for effect in offered if issubclass(effect, IndividualEffect)]
     individual_estimates = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
     selection, unconfirmed = confirmation.confirmed(engine, selection)
+    law_at_bounds |= required_beyond_bounds(selection.fit, engine.cluster)
     unexplained = _unexplained(exploration, selection)
     assert selection.screen is not None
     power = PowerSimulation(selection.screen, options.alpha, numbers.sealed if testable else 0)
@@ -237,7 +235,7 @@ def diagnose(
             1 - square_of(engine, selection.fit.system) / square_of(engine, base_system),
             bool(named_individuals),
             testable,
-            bool(imitations),
+            bool(imitations or law_at_bounds),
             absent_effects,
         ),
         domain=domain,
@@ -260,7 +258,8 @@ def diagnose(
             "open": [sequences[i].name for i in division.exploration],
             "sealed": [sequences[i].name for i in division.confirmation],
         },
-        notes=[*notes, *_reached_bounds(base_system, extended)],
+        notes=notes,
+        law_at_bounds=sorted(law_at_bounds),
         not_offered=refused,
         seconds=clock.seconds,
         sealed=errors,
@@ -355,25 +354,33 @@ def _drivers(engine: Engine, fit: Fit, seed: int, notes: list[str]) -> list[Vari
 
 
 def _without_imitations(
-    exploration: _Exploration, nearer: BetterLaw, notes: list[str]
-) -> tuple[Selection, list[NamedEffect]]:
-    """Remove effects that a better-fitting law does not need; they become hypotheses.
+    exploration: _Exploration, nearer: BetterLaw | None, notes: list[str]
+) -> tuple[Selection, list[NamedEffect], set[str]]:
+    """Remove effects that imitate another law; they become hypotheses. They are those that a
+    better-fitting law does not need, and all if parameters of the diagnosed law end at bounds.
 
     Args:
         notes: the reason is added to them.
+
+    Returns:
+        The selection, the hypotheses, and the parameters at bounds.
     """
     engine, selection, division = exploration.engine, exploration.selection, exploration.division
-    steps, p_value = explained_by_law(
-        engine, selection, division.label[division.exploration], nearer
-    )
+    law_at_bounds = reached_bounds(exploration.base_system, selection.fit.system)
+    law_at_bounds |= required_beyond_bounds(selection.fit, engine.cluster)
+    steps = selection.steps if law_at_bounds else []
+    if nearer is not None and selection.steps and not law_at_bounds:
+        label = division.label[division.exploration]
+        steps, p_value = explained_by_law(engine, selection, label, nearer)
+        if steps:
+            names = ", ".join(step.chosen.name for step in steps)
+            notes.append(
+                f"{names}: {nearer.name} does without and predicts left-out clusters better than "
+                f"the model with it (one-sided p = {p_value:.2g}); a lead, no finding."
+            )
     imitations = [named(engine, selection.fit, step) for step in steps]
-    if steps:
-        names = ", ".join(step.chosen.name for step in steps)
-        notes.append(
-            f"{names}: {nearer.name} does without and predicts left-out clusters better than "
-            f"the model with it (one-sided p = {p_value:.2g}); a lead, no finding."
-        )
-    return without_steps(engine, selection, steps, exploration.base_system), imitations
+    remaining = without_steps(engine, selection, steps, exploration.base_system)
+    return remaining, imitations, law_at_bounds
 
 
 def _explore(
@@ -527,7 +534,7 @@ def _verdict(
     removed: float,
     individuals_named: bool,
     testable: bool,
-    imitated: bool,
+    law_is_wrong: bool,
     absences: list[Absence],
 ) -> Verdict:
     """The verdict.
@@ -535,7 +542,8 @@ def _verdict(
     Args:
         removed: share of the squared errors that the named effects removed.
         individuals_named: whether agent-specific parameters were confirmed.
-        imitated: whether effects were selected that a better-fitting law does not need.
+        law_is_wrong: whether effects were selected that a better-fitting law does not need, or
+            its own parameters are at bounds.
         absences: the effects that were not found.
     """
     if not testable:
@@ -548,36 +556,11 @@ def _verdict(
         return "indistinguishable" if any(step.rivals for step in selection.steps) else "named"
     if individuals_named:
         return "named"
-    if unexplained or imitated:
+    if unexplained or law_is_wrong:
         return "unknown"
     if absences and not any(absence.testable for absence in absences):
         return "not_testable"
     return "none"
-
-
-def _reached_bounds(base: System, extended: System) -> list[str]:
-    """A note on the law's parameters that are at bounds only in the extended model."""
-    reached = sorted(_at_bounds(extended) - _at_bounds(base))
-    if not reached:
-        return []
-    verb = "is at a bound of its" if len(reached) == 1 else "are at bounds of their"
-    return [
-        f"With the effects, {', '.join(reached)} {verb} admissible values: the effects replace "
-        "part of the law. Compare other laws."
-    ]
-
-
-def _at_bounds(system: System) -> set[str]:
-    """Addresses of the law's parameters at a bound of their admissible values."""
-    limits, prefix = physical_bounds(system), f"{system.term_list[0].name}."
-    values = {
-        name: float(x) for name, (x, _) in system.physical().items() if name.startswith(prefix)
-    }
-    return {
-        name
-        for name, x in values.items()
-        if at_bounds(x, limits[name].low, limits[name].high, 1e-6 + 1e-3 * abs(x)) != ""
-    }
 
 
 def _shift(before: System, after: System) -> dict[str, dict[str, Any]]:

@@ -396,6 +396,7 @@ class Diagnosis:
     seconds: dict[str, float]
     sealed: list[dict[str, Any]] = field(default_factory=list)  # name, before, after of each
     not_offered: dict[str, str] = field(default_factory=dict)  # effect to why it does not apply
+    law_at_bounds: list[str] = field(default_factory=list)  # parameters that show the law is wrong
     laws: Laws | None = None  # the comparison of base laws
     laws_again: Laws | None = None  # the comparison with the effects that the best of them lacks
 

@@ -485,6 +485,7 @@ class Followers:
             parameters[self.random] += agents[self.paths.agent].T
         return parameters
 
+    @np.errstate(over="ignore", invalid="ignore")  # of simulations that diverge
     def columns(
         self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray, n_starts: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:

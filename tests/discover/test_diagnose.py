@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from nnode.data.sequence import Sequence
-from nnode.discover.diagnose import _reached_bounds, _verdict, diagnose
+from nnode.discover.diagnose import _verdict, diagnose
 from nnode.discover.options import DiscoverOptions
 from nnode.discover.outcome import DiagnosisOutcome
+from nnode.discover.report.files import verdict
 from tests.discover.conftest import KAPPA, MANY
 from tests.discover.platoons import LENGTH, V0, lin, platoons, relative_speed
 
@@ -106,14 +107,19 @@ def test_structure_that_is_left_makes_the_verdict_unknown(
     assert _verdict(*given) == verdict
 
 
-def test_a_law_whose_parameters_reach_bounds_with_effects_is_noted() -> None:
-    base, extended = lin(), lin()
-    assert _reached_bounds(base, extended) == []
-    with torch.no_grad():
-        extended.terms[0].L.fill_(extended.terms[0].bounds["L"].low)
-    (note,) = _reached_bounds(base, extended)
-    assert note.startswith("With the effects, lin.L is at a bound of its admissible values")
-    assert _reached_bounds(extended, extended) == []
+def test_a_law_with_parameters_at_bounds_makes_effects_hypotheses(
+    hidden_reaction: tuple[list[Sequence], DiscoverOptions, DiagnosisOutcome],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sequences, options, _ = hidden_reaction
+    module = sys.modules[diagnose.__module__]
+    monkeypatch.setattr(module, "required_beyond_bounds", lambda fit, cluster: {"lin.L"})
+    found = diagnose(LAW, sequences, options)
+    d = found.diagnosis
+    assert (d.verdict, d.effects, d.law_at_bounds) == ("unknown", [], ["lin.L"])
+    assert [effect.name for effect in d.leads] == ["relative_speed"]
+    assert d.gap.after == d.gap.before
+    assert "lin.L ends at a bound of the admissible values, with relative_speed" in verdict(d)
 
 
 @pytest.mark.thorough

@@ -129,7 +129,7 @@ CROWD_EFFECTS: dict[str, dict[str, Any]] = {
     "walker_heterogeneity": {"people": {"6": [0.1, -0.2, 0.0, 0.3, 0.1, -0.1], "2": [0.2, 0.1]}},
 }
 #: Laws of people that are compiled every time; the others take seconds each and are thorough.
-OFTEN = ("sf", "nn", "nn_self", "cfsm", "sums")
+OFTEN = ("sf", "nn", "nn_self", "sums")
 #: Two sides of a room, and a wall in it; x1, y1, x2, y2 in m.
 WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 2.5, 0.0, 2.5], [1.0, 0.5, 2.5, 2.0]])
 
@@ -389,13 +389,8 @@ def test_every_law_of_people(law: str) -> None:
     check(crowd_of(law).double(), room(), "euler", compiled, threaded)
 
 
-@pytest.mark.parametrize(
-    "effect",
-    [
-        pytest.param(effect, marks=() if effect == "drift" else pytest.mark.thorough)
-        for effect in CROWD_EFFECTS
-    ],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("effect", CROWD_EFFECTS)
 def test_every_effect_on_people(effect: str) -> None:
     check(crowd_of("sf", effect).double(), room(), "euler", compiled)
 

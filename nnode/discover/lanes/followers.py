@@ -183,6 +183,7 @@ class FollowersEngine(TrafficEngine):
             simulations.append(Simulation(s, x[..., None], skip=1))
         return simulations
 
+    @np.errstate(over="ignore", invalid="ignore")  # of simulations that diverge
     def tangents(self, system: System, row: Tensor) -> Tensor:
         """``(K, n)`` derivatives of the residuals, by finite differences."""
         _, curve = _parts(system)

@@ -140,8 +140,8 @@ def verdict(d: Diagnosis) -> str:
         f"error above the noise floor ({amount(d.gap.noise_floor)} m²)"
     )
     unconfirmed = ""
+    hypotheses = _listed([effect.name for effect in d.leads])
     if d.leads:
-        hypotheses = _listed([effect.name for effect in d.leads])
         unconfirmed = f" {hypotheses} remains a hypothesis: {d.confirmation.reason}."
     match d.verdict:
         case "named":
@@ -166,6 +166,14 @@ def verdict(d: Diagnosis) -> str:
                 f"{_count(c.open, 'exploration cluster')} and "
                 f"{_count(c.sealed, 'confirmation cluster')}, and about {c.enough} clusters are "
                 f"needed (a cluster is formed by {c.why}). No effect is named."
+            )
+        case "unknown" if d.law_at_bounds:
+            ends = "ends at a bound" if len(d.law_at_bounds) == 1 else "end at bounds"
+            effects = f", with {hypotheses} added" if d.leads else ""
+            return (
+                f"The model {d.model} is not the law of these data: "
+                f"{_listed(d.law_at_bounds)} {ends} of the admissible values{effects}. No effect "
+                "of the catalogue explains the deviation."
             )
         case "unknown":
             variables = (

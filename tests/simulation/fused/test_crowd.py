@@ -66,6 +66,7 @@ def test_single_precision(name: str, people: list[Sequence]) -> None:
     compare(model, single(people), DT, FusedSolver(DT), single_precision=True, **close)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_many_blocks_and_threads(name: str) -> None:
     # more than fit into one block, and rows that are cut into pieces
@@ -108,7 +109,11 @@ def test_saturated_neurons(people: list[Sequence]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("nn", {}), ("sf", {"cutoff": 30.0})], ids=["dense", "lists"]
+    ("name", "options"),
+    [
+        pytest.param("nn", {}, id="dense"),
+        pytest.param("sf", {"cutoff": 30.0}, marks=pytest.mark.thorough, id="lists"),
+    ],
 )
 def test_padding_stands_still(name: str, options: dict[str, float], people: list[Sequence]) -> None:
     batch = single(people)

@@ -237,8 +237,9 @@ def networks(oneself: bool) -> Crowd:
     )
 
 
-# the gradient is compiled for as long as everything above
-@pytest.mark.parametrize("grad", [False, pytest.param(True, marks=pytest.mark.thorough)])
+# they are compiled for as long as everything above
+@pytest.mark.thorough
+@pytest.mark.parametrize("grad", [False, True])
 @pytest.mark.parametrize("oneself", [False, True])
 def test_networks_with_a_cutoff(oneself: bool, grad: bool) -> None:
     batch, model = hall(40), networks(oneself)

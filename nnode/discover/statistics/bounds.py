@@ -1,0 +1,68 @@
+"""Whether a law whose parameters are at bounds can be the law of the data.
+
+Effects that lead parameters of the law to their bounds replace a part of the law. And where the
+cost still falls significantly toward values that are not admissible, the law is wrong in a way that
+no admissible value describes. Both concern the law, whichever effects were selected.
+
+Source: Silvey 1959 (the Lagrange multiplier test).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nnode.calibrate.intervals import at_bounds
+from nnode.data.clusters import better, group_sums
+from nnode.discover import thresholds
+from nnode.discover.residuals.fit import Fit
+from nnode.discover.statistics.leverage import leverage_adjusted, orthonormal
+from nnode.model.system import System
+from nnode.model.term import physical_bounds
+
+
+def reached_bounds(before: System, after: System) -> set[str]:
+    """Names of the law's parameters that are at bounds only in the second model."""
+    return _at_bounds(after) - _at_bounds(before)
+
+
+def _at_bounds(system: System) -> set[str]:
+    limits, prefix = physical_bounds(system), f"{system.term_list[0].name}."
+    values = {
+        name: float(x) for name, (x, _) in system.physical().items() if name.startswith(prefix)
+    }
+    return {
+        name
+        for name, x in values.items()
+        if at_bounds(x, limits[name].low, limits[name].high, 1e-6 + 1e-3 * abs(x)) != ""
+    }
+
+
+def required_beyond_bounds(fit: Fit, cluster: np.ndarray) -> set[str]:
+    """Names of the law's parameters at bounds with a significant score toward values beyond: one-
+    sided p-values by sign flips of clusters, multiplied by the number of these parameters, are at
+    most :data:`~nnode.discover.thresholds.STRICT`.
+
+    Args:
+        fit: a calibrated model, whose first term is the law.
+        cluster: ``(n,)`` see :class:`~nnode.discover.residuals.engine.Engine`.
+    """
+    held = [
+        k
+        for k, name in enumerate(fit.names)
+        if name.startswith("terms.0.") and not fit.free[k] and fit.jacobian[:, k].any()
+    ]
+    if not held:
+        return set()
+    basis = orthonormal(fit.tangents)
+    residual = leverage_adjusted(fit.residual, basis, cluster)
+    columns = fit.jacobian[:, held]
+    # the cost falls against the gradient
+    outward = np.sign(columns.T @ fit.residual)
+    columns = outward * (columns - basis @ (basis.T @ columns))
+    scores = group_sums(columns * residual[:, None], cluster)
+    law = fit.system.term_list[0].name
+    return {
+        f"{law}.{fit.names[k].removeprefix('terms.0.')}"
+        for k, score in zip(held, scores.T, strict=True)
+        if len(held) * better(score) <= thresholds.STRICT
+    }
