@@ -192,7 +192,8 @@ def _diagnoses(
     """The diagnosis of the requested law, if it is not the nearest, and of the nearest law."""
     if nearest.name == job.name:
         return [(nearest, outcome)]
-    nearer = BetterLaw(nearest.name, outcome.searched)
+    named = frozenset(effect.name for effect in outcome.diagnosis.effects)
+    nearer = BetterLaw(nearest.name, outcome.searched, named)
     return [(job, _diagnose(job, nearer, calibrated_laws.get(job.name))), (nearest, outcome)]
 
 

@@ -55,7 +55,7 @@ from nnode.discover.result import (
     Variation,
     Verdict,
 )
-from nnode.discover.statistics.bounds import reached_bounds, required_beyond_bounds
+from nnode.discover.statistics.bounds import parameters_at_bounds
 from nnode.discover.statistics.combination import least_confirmation
 from nnode.discover.statistics.power import PowerSimulation
 from nnode.discover.statistics.random_effects import IndividualEstimate, estimate_individual
@@ -183,7 +183,7 @@ def diagnose(
     kinds = [effect for effect in offered if issubclass(effect, IndividualEffect)]
     individual_estimates = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
     selection, unconfirmed = confirmation.confirmed(engine, selection)
-    law_at_bounds |= required_beyond_bounds(selection.fit, engine.cluster)
+    law_at_bounds |= parameters_at_bounds(base_system, selection.fit, engine.cluster)
     unexplained = _unexplained(exploration, selection)
     assert selection.screen is not None
     power = PowerSimulation(selection.screen, options.alpha, numbers.sealed if testable else 0)
@@ -366,8 +366,7 @@ def _without_imitations(
         The selection, the hypotheses, and the parameters at bounds.
     """
     engine, selection, division = exploration.engine, exploration.selection, exploration.division
-    law_at_bounds = reached_bounds(exploration.base_system, selection.fit.system)
-    law_at_bounds |= required_beyond_bounds(selection.fit, engine.cluster)
+    law_at_bounds = parameters_at_bounds(exploration.base_system, selection.fit, engine.cluster)
     steps = selection.steps if law_at_bounds else []
     if nearer is not None and selection.steps and not law_at_bounds:
         label = division.label[division.exploration]

@@ -113,7 +113,7 @@ def test_a_law_with_parameters_at_bounds_makes_effects_hypotheses(
 ) -> None:
     sequences, options, _ = hidden_reaction
     module = sys.modules[diagnose.__module__]
-    monkeypatch.setattr(module, "required_beyond_bounds", lambda fit, cluster: {"lin.L"})
+    monkeypatch.setattr(module, "parameters_at_bounds", lambda base, fit, cluster: {"lin.L"})
     found = diagnose(LAW, sequences, options)
     d = found.diagnosis
     assert (d.verdict, d.effects, d.law_at_bounds) == ("unknown", [], ["lin.L"])

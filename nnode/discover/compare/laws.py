@@ -228,10 +228,12 @@ class BetterLaw:
 
     Attributes:
         system: calibrated on the same exploration clusters.
+        named: names of the effects that its diagnosis named.
     """
 
     name: str
     system: System
+    named: frozenset[str] = frozenset()
 
 
 def explained_by_law(
@@ -240,8 +242,8 @@ def explained_by_law(
     """Selected effects that a better-fitting law does not need: they imitate that law.
 
     There are none if that law does not predict left-out clusters better than the diagnosed one
-    with its effects. Effects that are built into laws, and those that the better law lacks too,
-    are not returned.
+    with its effects. Effects that are built into laws, and those that are named for the better
+    law too, are not returned.
 
     Args:
         label: ``(S,)`` clusters of the engine's sequences.
@@ -265,11 +267,10 @@ def explained_by_law(
             p_value = better(of_law - of_effects)
     if p_value > thresholds.LEVEL:
         return [], p_value
-    shared = {effect.name for effect in effects_of(nearer.system)}
     steps = [
         step
         for step in selection.steps
-        if not step.chosen.score.effect.built_into_laws and step.chosen.name not in shared
+        if not step.chosen.score.effect.built_into_laws and step.chosen.name not in nearer.named
     ]
     return steps, p_value
 

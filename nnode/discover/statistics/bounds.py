@@ -20,9 +20,22 @@ from nnode.model.system import System
 from nnode.model.term import physical_bounds
 
 
-def reached_bounds(before: System, after: System) -> set[str]:
-    """Names of the law's parameters that are at bounds only in the second model."""
-    return _at_bounds(after) - _at_bounds(before)
+def parameters_at_bounds(base: System, fit: Fit, cluster: np.ndarray) -> set[str]:
+    """Names of the law's parameters whose bounds show that the law is wrong: those that are at
+    bounds only with the effects, and those for which values beyond are required.
+
+    There are none in crowds: their parameters are biased until they are corrected by simulations
+    in which everybody reacts, and bounds are significant for laws that are true.
+
+    Args:
+        base: the calibrated model without effects.
+        fit: the calibrated model with effects.
+        cluster: ``(n,)`` see :class:`~nnode.discover.residuals.engine.Engine`.
+    """
+    if base.domain == "crowd":
+        return set()
+    reached = _at_bounds(fit.system) - _at_bounds(base)
+    return reached | required_beyond_bounds(fit, cluster)
 
 
 def _at_bounds(system: System) -> set[str]:

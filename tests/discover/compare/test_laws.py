@@ -161,6 +161,8 @@ def test_what_a_nearer_law_does_without_is_no_finding() -> None:
     assert [step.chosen.name for step in taken] == ["multi_anticipation"]
     assert p_value < 0.05
     assert explained_by_law(engine, added("inertia"), label, nearer)[0] == []
+    same = replace(nearer, named=frozenset({"multi_anticipation"}))
+    assert explained_by_law(engine, ahead, label, same)[0] == []
     # the other way round nothing is taken back: lin predicts no better than ovm
     far = BetterLaw("lin", base.system)
     assert explained_by_law(engine, replace(ahead, fit=other), label, far)[0] == []

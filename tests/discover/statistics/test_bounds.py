@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nnode.discover.residuals.fit import Fit
-from nnode.discover.statistics.bounds import reached_bounds, required_beyond_bounds
+from nnode.discover.statistics.bounds import parameters_at_bounds, required_beyond_bounds
 from tests.discover.platoons import lin
 
 CLUSTERS, SIZE = 24, 20
@@ -49,9 +49,12 @@ def test_effects_and_free_parameters_do_not_count() -> None:
 
 
 def test_bounds_that_are_reached_only_with_effects() -> None:
-    base, extended = lin(), lin()
-    assert reached_bounds(base, extended) == set()
+    fit = at_a_bound(0, -0.3)
+    assert parameters_at_bounds(fit.system, fit, CLUSTER) == set()
+    base, people = lin(), lin()
+    people.domain = "crowd"
     with torch.no_grad():
-        extended.terms[0].L.fill_(extended.terms[0].bounds["L"].low)
-    assert reached_bounds(base, extended) == {"lin.L"}
-    assert reached_bounds(extended, extended) == set()
+        fit.system.terms[0].L.fill_(base.terms[0].bounds["L"].low)
+    assert parameters_at_bounds(base, fit, CLUSTER) == {"lin.L"}
+    assert parameters_at_bounds(people, fit, CLUSTER) == set()
+    assert parameters_at_bounds(fit.system, fit, CLUSTER) == set()
