@@ -67,7 +67,7 @@ def evaluate(seed: int, name: str) -> dict[str, list[dict[str, Any]]]:
     if report["verdict"] == EQUALS and profiles:
         profile = profiles[0]
         # the advice counts exploration platoons
-        number = min(round(profile["platoons"] / (1 - options.sealed)), MOST)
+        number = min(round(profile["platoons"] / (1 - options.confirmation)), MOST)
         random = waves(rng, number, BEFORE + SECONDS, 16.0)
         clock = np.maximum(0.5 * DT / SUBSTEPS * np.arange(random.shape[1]) - BEFORE, 0.0)
         swing = np.sin(2 * np.pi * clock / profile["period"])

@@ -24,10 +24,10 @@ Content = dict[str, Any]
 #: What a report lacks that names nothing.
 EMPTY: Content = {
     "effects": [],
-    "leads": [],
+    "hypotheses": [],
     "gap": None,
     "screen": {"p_value": None},
-    "clusters": {"open": None},
+    "clusters": {"exploration": None},
     "data_faults": [],
     "not_testable": [],
 }
@@ -73,8 +73,8 @@ def judged(
     return {
         "verdict": verdict,
         "named": "+".join(equals),
-        "hypotheses": "+".join(item["name"] for item in report["leads"]),
-        "hypothesis": bool(report["leads"]),
+        "hypotheses": "+".join(item["name"] for item in report["hypotheses"]),
+        "hypothesis": bool(report["hypotheses"]),
         "exact": verdict == (NAMED if hidden else NONE) and set(counted) == set(hidden),
         "among_equals": verdict == EQUALS
         and _matched(hidden, counted, lambda name, other: other in equals[name]),
@@ -159,7 +159,7 @@ def score(truth: Content, report: Content, classes: Mapping[str, str]) -> Conten
         "screen_false": None
         if screen["p_value"] is None
         else significant and screen["effect"] not in {*to_name, *nuisance},
-        "clusters": report["clusters"]["open"],
+        "clusters": report["clusters"]["exploration"],
     }
 
 

@@ -296,7 +296,7 @@ def _print(outcome: DiagnosisOutcome, paths: Mapping[str, Path], seconds: float)
     for note in d.notes:
         print(note)
     print(sentence(d))
-    for effect in d.effects or d.leads:
+    for effect in d.effects or d.hypotheses:
         print(f"  {effect.name}: {interval(effect)}")
         print(f"    {effect.formula}; {effect.where}")
         for other in effect.alternatives:

@@ -1,6 +1,6 @@
 """Clusters: the sequences that are taken as independent of each other, and no finer ones.
 
-Folds, sign flips, jackknife, paired tests and sealed sets all go by cluster.
+Folds, sign flips, jackknife, paired tests and confirmation sets all go by cluster.
 
 - Sequences of a recording, or of recordings of one site (lanes of a road), that share an agent are
   one cluster.

@@ -168,7 +168,7 @@ def diagnose(
     notes += [division.note] if division.note else []
     selection, imitations, law_at_bounds = _without_imitations(exploration, nearer, notes)
     numbers = _clusters(exploration, options, len(effects))
-    testable = numbers.open >= numbers.least
+    testable = numbers.exploration >= numbers.least_exploration
     stages.begin("confirming")
     confirmation = ConfirmationSet(
         engine,
@@ -176,7 +176,7 @@ def diagnose(
         [used[i] for i in division.exploration],
         [used[i] for i in division.confirmation],
         division.label[division.confirmation],
-        numbers.sealed,
+        numbers.confirmation,
         options.alpha,
         options.seed,
     )
@@ -186,7 +186,9 @@ def diagnose(
     law_at_bounds |= parameters_at_bounds(base_system, selection.fit, engine.cluster)
     unexplained = _unexplained(exploration, selection)
     assert selection.screen is not None
-    power = PowerSimulation(selection.screen, options.alpha, numbers.sealed if testable else 0)
+    power = PowerSimulation(
+        selection.screen, options.alpha, numbers.confirmation if testable else 0
+    )
     absent_effects = absences(selection, power)
     corrected = confirmation.corrected(engine, selection)
     if unconfirmed:
@@ -210,7 +212,7 @@ def diagnose(
     if selection.steps or named_individuals:
         extended = confirmation.with_agents(engine, corrected, named_individuals)
     gap, errors, simulations = confirmation.gap(extended, named_individuals)
-    clock.lap("sealed")
+    clock.lap("confirm")
     effects_named = [
         *(confirmation.named(engine, corrected, step) for step in selection.steps),
         *(
@@ -244,7 +246,7 @@ def diagnose(
         screen=_first_screen(selection, numbers),
         confirmation=confirmation.confirmation(agents),
         effects=effects_named,
-        leads=hypotheses,
+        hypotheses=hypotheses,
         agents=agents,
         drivers=_drivers(engine, selection.fit, options.seed, notes),
         data_faults=[],
@@ -255,14 +257,14 @@ def diagnose(
         gap=gap,
         base=_shift(base_system, extended),
         split={
-            "open": [sequences[i].name for i in division.exploration],
-            "sealed": [sequences[i].name for i in division.confirmation],
+            "exploration": [sequences[i].name for i in division.exploration],
+            "confirmation": [sequences[i].name for i in division.confirmation],
         },
         notes=notes,
         law_at_bounds=sorted(law_at_bounds),
         not_offered=refused,
         seconds=clock.seconds,
-        sealed=errors,
+        confirmation_errors=errors,
     )
     return DiagnosisOutcome(
         diagnosis=diagnosis,
@@ -375,7 +377,7 @@ def _without_imitations(
             names = ", ".join(step.chosen.name for step in steps)
             notes.append(
                 f"{names}: {nearer.name} does without and predicts left-out clusters better than "
-                f"the model with it (one-sided p = {p_value:.2g}); a lead, no finding."
+                f"the model with it (one-sided p = {p_value:.2g}); it is a hypothesis."
             )
     imitations = [named(engine, selection.fit, step) for step in steps]
     remaining = without_steps(engine, selection, steps, exploration.base_system)
@@ -482,13 +484,15 @@ def _clusters(exploration: _Exploration, options: DiscoverOptions, effects: int)
     sufficient = next(
         number
         for number in count(2)
-        if least_confirmation() <= round(options.sealed * number) <= number - least_exploration
+        if least_confirmation()
+        <= round(options.confirmation * number)
+        <= number - least_exploration
     )
     return Clusters(
-        open=int(exploration.engine.cluster.max()) + 1,
-        sealed=0 if division.note else division.number(division.confirmation),
-        least=least_exploration,
-        least_sealed=least_confirmation(),
+        exploration=int(exploration.engine.cluster.max()) + 1,
+        confirmation=0 if division.note else division.number(division.confirmation),
+        least_exploration=least_exploration,
+        least_confirmation=least_confirmation(),
         enough=sufficient,
         why=division.why,
         simultaneous=exploration.simultaneity.plain(),
@@ -515,10 +519,10 @@ def _first_screen(selection: Selection, numbers: Clusters) -> FirstScreen:
         {"name": s.effect.name, "share": s.gain, "p_value": s.p_value, **s.amount}
         for s in selection.first[:SCREENED]
     ]
-    floor = 2.0 ** (1 - numbers.open)
+    floor = 2.0 ** (1 - numbers.exploration)
     if best is None:
-        return FirstScreen(None, "", numbers.open, floor)
-    return FirstScreen(best.p_value, best.effect.name, numbers.open, floor, strongest)
+        return FirstScreen(None, "", numbers.exploration, floor)
+    return FirstScreen(best.p_value, best.effect.name, numbers.exploration, floor, strongest)
 
 
 def _excess(engine: Engine, fit: Fit) -> float:

@@ -73,13 +73,15 @@ def divide(
     why = f"sequences of a site that {relation(index, options.gap)}"
     why += " or overlap in time" if together else ""
     number = int(label.max()) + 1
-    wanted = round(options.sealed * number)
+    wanted = round(options.confirmation * number)
     if number > 1:
         held = _drawn(label, max(wanted, 1), np.random.default_rng(options.seed))
         if held:
             out = np.isin(label, held)
             return Division(label, np.flatnonzero(~out).tolist(), np.flatnonzero(out).tolist(), why)
-    parts = split(index, SplitOptions(heldout=options.sealed, gap=options.gap, seed=options.seed))
+    parts = split(
+        index, SplitOptions(heldout=options.confirmation, gap=options.gap, seed=options.seed)
+    )
     note = (
         "All sequences are connected. The confirmation sequences are a block of time and are not "
         "independent of the exploration sequences."

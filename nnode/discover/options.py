@@ -18,7 +18,7 @@ from nnode.model.effects.own import VARIABLE
 class DiscoverOptions:
     """Options of the diagnosis."""
 
-    sealed: float = 0.3  # share of the clusters that are used only for the confirmation
+    confirmation: float = 0.3  # share of the clusters that are used only for the confirmation
     gap: float = 5.0  # s; sequences without identifiers that are closer in time are one cluster
     alpha: float = 0.05  # rate of false alarms over all effects
     seed: int = 0  # seed of the split, of resampling and of a network's start weights
@@ -52,7 +52,7 @@ def check_options(options: DiscoverOptions, domain: Domain, order: int = 1) -> l
         ConfigError: a number outside its range, an effect that the domain's catalogue does
             not have (names the nearest), or one that no engine can look for.
     """
-    for name, value in (("sealed", options.sealed), ("alpha", options.alpha)):
+    for name, value in (("confirmation", options.confirmation), ("alpha", options.alpha)):
         if not 0 < value < 1:
             raise ConfigError(f"discover.{name}={value} must lie between 0 and 1")
     if options.max_effects < 0:

@@ -43,8 +43,9 @@ class DiagnosisOutcome:
         exploration, confirmation: positions of the sequences.
         maps: ``before`` and ``after``: :class:`nnode.discover.report.deviation.Deviation` of
             ``base`` and ``extended``; those that are missing are computed.
-        simulated: for each entry of ``diagnosis.sealed``, the simulations with ``base`` and with
-            ``extended`` that its errors are computed from; None if nothing was compared.
+        simulated: for each entry of ``diagnosis.confirmation_errors``, the simulations with
+            ``base`` and with ``extended`` that its errors are computed from; None if nothing was
+            compared.
     """
 
     diagnosis: Diagnosis

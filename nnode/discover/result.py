@@ -178,19 +178,19 @@ class Clusters:
     """The independent clusters.
 
     Attributes:
-        open, sealed: numbers of exploration and of confirmation clusters.
+        exploration, confirmation: numbers of clusters.
         least: exploration clusters that sign flips need to reach the level.
-        least_sealed: confirmation clusters that a confirmation needs.
+        least_confirmation: confirmation clusters that a confirmation needs.
         enough: approximate total number of clusters that would be sufficient.
         why: the definition of a cluster, in words.
         simultaneous: the test of simultaneous clusters, in words.
         note: a restriction of the confirmation set; empty: none.
     """
 
-    open: int
-    sealed: int
-    least: int
-    least_sealed: int
+    exploration: int
+    confirmation: int
+    least_exploration: int
+    least_confirmation: int
     enough: int
     why: str
     simultaneous: str
@@ -206,7 +206,7 @@ class FirstScreen:
         effect: the effect with this p-value.
         clusters: number of clusters of the sign flips.
         floor: the smallest possible p-value.
-        leads: of the effects that explain most: name, share of the squared residuals explained,
+        strongest: of the effects that explain most: name, share of the squared residuals explained,
             p-value. With too few clusters, they are descriptive.
     """
 
@@ -214,7 +214,7 @@ class FirstScreen:
     effect: str
     clusters: int
     floor: float
-    leads: list[dict[str, Any]] = field(default_factory=list)
+    strongest: list[dict[str, Any]] = field(default_factory=list)
 
 
 @dataclass
@@ -381,7 +381,7 @@ class Diagnosis:
     screen: FirstScreen
     confirmation: Confirmation
     effects: list[NamedEffect]
-    leads: list[NamedEffect]  # selected in exploration clusters, not confirmed
+    hypotheses: list[NamedEffect]  # selected in exploration clusters, not confirmed
     agents: list[Agents]
     drivers: list[Variation]
     data_faults: list[DataFault]
@@ -391,10 +391,12 @@ class Diagnosis:
     unknown: Structure | None
     gap: Gap
     base: dict[str, dict[str, Any]]  # term.parameter: before, after, unit
-    split: dict[str, list[str]]  # exploration (open) and confirmation (sealed) sequences, by name
+    split: dict[str, list[str]]  # names of exploration and confirmation sequences
     notes: list[str]
     seconds: dict[str, float]
-    sealed: list[dict[str, Any]] = field(default_factory=list)  # name, before, after of each
+    confirmation_errors: list[dict[str, Any]] = field(
+        default_factory=list
+    )  # name, before, after of each
     not_offered: dict[str, str] = field(default_factory=dict)  # effect to why it does not apply
     law_at_bounds: list[str] = field(default_factory=list)  # parameters that show the law is wrong
     laws: Laws | None = None  # the comparison of base laws

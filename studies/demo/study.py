@@ -110,7 +110,7 @@ def demo(folder: Path, *, seed: int = 0, platoons: int = 20, epochs: int = 60) -
         absences=_absences(nothing),
         deviations=_map(report, truth),
         law=law,
-        errors_by_platoon=report.plot("sealed"),
+        errors_by_platoon=report.plot("confirmation"),
         force=force,
         truth=truth,
         report=report,

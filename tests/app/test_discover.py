@@ -49,7 +49,7 @@ def overrides(table: Path, folder: Path) -> list[str]:
         f"data.path={table}",
         "data.domain=traffic",
         f"hydra.run.dir={folder}",
-        "discover.sealed=0.4",
+        "discover.confirmation=0.4",
         "discover.compare=[idm]",
     ]
 
@@ -135,7 +135,7 @@ def test_the_report_names_faults_by_the_agents_own_names(run: Path) -> None:
     assert fault["sequence"] == "lane/0"
     assert "v0-1" in fault["agents"]
     assert fault["time"] == pytest.approx(3.2)
-    assert "lane/0" not in report["split"]["open"] + report["split"]["sealed"]
+    assert "lane/0" not in report["split"]["exploration"] + report["split"]["confirmation"]
     assert report["seconds"]["reading"] > 0
     page = unescape((run / "report.html").read_text())
     assert f"nnode evaluate checkpoint={run / 'checkpoints' / 'best.pt'}" in page
@@ -153,7 +153,7 @@ def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(run: Path) -> None:
     report = json.loads((run / "report.json").read_text())
     assert metrics["part"] == "heldout"
     assert metrics["trained_on"] == 0
-    assert sorted(metrics["costs"]) == sorted(report["split"]["sealed"])
+    assert sorted(metrics["costs"]) == sorted(report["split"]["confirmation"])
     assert metrics["parameters"]["speed_zone.alpha"] == pytest.approx(0.65)
     # the mean square error over the followers, of a simulation with another step
     assert metrics["rmse"] ** 2 == pytest.approx(report["gap"]["after"], rel=0.2)
@@ -183,8 +183,8 @@ def test_training_goes_on_with_the_open_sequences(
     before = load_checkpoint(run / "checkpoints" / "best.pt")
     after = load_checkpoint(tmp_path / "checkpoints" / "last.pt")
     report = json.loads((run / "report.json").read_text())
-    assert after.split["heldout"] == before.split["heldout"] == report["split"]["sealed"]
-    assert after.split["train"] == report["split"]["open"]
+    assert after.split["heldout"] == before.split["heldout"] == report["split"]["confirmation"]
+    assert after.split["train"] == report["split"]["exploration"]
     assert after.history[0]["parameters/speed_zone.alpha"] == pytest.approx(0.65)
 
 
@@ -336,7 +336,7 @@ def test_faults_stand_beside_the_verdict(tmp_path: Path) -> None:
     assert report["verdict"] == "named"
     faults = [(fault["sequence"], *fault["agents"]) for fault in report["data_faults"]]
     assert ("lane/0", "v0-1") in {fault[:2] for fault in faults}
-    assert "lane/0" not in report["split"]["open"] + report["split"]["sealed"]
+    assert "lane/0" not in report["split"]["exploration"] + report["split"]["confirmation"]
 
 
 @pytest.mark.slow

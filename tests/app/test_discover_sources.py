@@ -79,10 +79,10 @@ def test_a_diagnosis_ends_with_a_verdict(
     report: dict[str, Any] = json.loads((folder / "report.json").read_text())
     assert f"verdict: {report['verdict']}" in done.stdout
     # six open clusters are as many as it takes to test one effect
-    assert report["clusters"]["open"] == report["clusters"]["least"] == 6
+    assert report["clusters"]["exploration"] == report["clusters"]["least_exploration"] == 6
     # with so few clusters the effect may be one that cannot be tested
     absences = report["absences"]
     testable = not absences or any(absence["testable"] for absence in absences)
     assert report["verdict"] in ("unknown", "none" if testable else "not_testable")
     assert report["effects"] == report["data_faults"] == []
-    assert len(report["split"]["open"]) + len(report["split"]["sealed"]) == 9
+    assert len(report["split"]["exploration"]) + len(report["split"]["confirmation"]) == 9

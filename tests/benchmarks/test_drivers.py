@@ -35,7 +35,7 @@ def test_rows_are_scored_and_kept(
         calls.append(table)
         alpha = {"alpha": {"value": 0.88, "low": 0.85, "high": 0.91}}
         effect = {"name": "speed_zone", "alternatives": [], "coefficients": alpha}
-        report = {"effects": [effect], "verdict": "named", "drivers": [], "leads": []}
+        report = {"effects": [effect], "verdict": "named", "drivers": [], "hypotheses": []}
         return SimpleNamespace(plain=lambda: report)
 
     monkeypatch.setattr(nnode, "diagnose", zone)

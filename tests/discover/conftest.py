@@ -21,7 +21,7 @@ from tests.discover import stand_in
 from tests.discover.platoons import lin, platoons, relative_speed
 from tests.discover.recorded import corridor, lane
 
-#: Sixteen clusters: five of them are sealed, as many as it takes to confirm something.
+#: Sixteen clusters: five of them confirm, as many as it takes to confirm something.
 MANY: dict[str, Any] = {"number": 16, "seconds": 12.0, "driver": 0.1}
 #: What the followers of :func:`hidden_reaction` do besides their law.
 KAPPA = 0.4
@@ -38,7 +38,7 @@ class Case:
 
 
 def _case(folder: Path, model: dict[str, Any], **data: Any) -> Case:
-    options = DiscoverOptions(sealed=0.4)
+    options = DiscoverOptions(confirmation=0.4)
     inputs = read_inputs(TableOptions(**data), folder / "data")
     model = model_options(model, "measured")
     found = stand_in.diagnose(build_model(model), inputs.sequences, options)

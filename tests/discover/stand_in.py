@@ -74,8 +74,8 @@ def diagnose(
         Path(os.environ[WAIT]).write_text("")
         time.sleep(60)
     traffic = system.domain == "traffic"
-    number = max(1, round(options.sealed * len(sequences)))
-    sealed = list(range(len(sequences) - number, len(sequences)))
+    number = max(1, round(options.confirmation * len(sequences)))
+    confirmation = list(range(len(sequences) - number, len(sequences)))
     base = calibrated(system)
     extended = deepcopy(base)
     if traffic:
@@ -103,7 +103,7 @@ def diagnose(
         gain=0.63,
         confirmed=0.01,
     )
-    simulated = _simulated((base, extended), [sequences[i] for i in sealed])
+    simulated = _simulated((base, extended), [sequences[i] for i in confirmation])
     costs = np.array([[_cost(one) for one in pair] for pair in simulated])
     before, after = costs.mean(0)
     floor = 0.0025 if traffic else 0.0002
@@ -115,10 +115,10 @@ def diagnose(
             domain=system.domain,
             model="stand-in",
             clusters=Clusters(
-                open=len(sequences) - number,
-                sealed=number,
-                least=11,
-                least_sealed=5,
+                exploration=len(sequences) - number,
+                confirmation=number,
+                least_exploration=11,
+                least_confirmation=5,
                 enough=17,
                 why="sequences of a recording that share an agent",
                 simultaneous="no two clusters of a recording were there at one time",
@@ -128,11 +128,13 @@ def diagnose(
                 effect=name,
                 clusters=len(sequences) - number,
                 floor=0.001,
-                leads=[{"name": name, "share": 0.5, "p_value": 0.001, next(iter(values)): -0.3}],
+                strongest=[
+                    {"name": name, "share": 0.5, "p_value": 0.001, next(iter(values)): -0.3}
+                ],
             ),
             confirmation=Confirmation(0.01, number, True),
             effects=[effect],
-            leads=[],
+            hypotheses=[],
             drivers=[],
             agents=[drivers()] if traffic else [],
             data_faults=[],
@@ -167,27 +169,27 @@ def diagnose(
             ),
             base={"lin.v0": {"before": 24.0, "after": V0, "unit": "m/s"}} if traffic else {},
             split={
-                "open": [s.name for i, s in enumerate(sequences) if i not in sealed],
-                "sealed": [sequences[i].name for i in sealed],
+                "exploration": [s.name for i, s in enumerate(sequences) if i not in confirmation],
+                "confirmation": [sequences[i].name for i in confirmation],
             },
             notes=["made by hand"],
             seconds={"screening": 1.0},
-            sealed=[
+            confirmation_errors=[
                 {"name": sequences[i].name, "before": b, "after": a}
-                for i, (b, a) in zip(sealed, costs, strict=True)
+                for i, (b, a) in zip(confirmation, costs, strict=True)
             ],
         ),
         base=base,
         extended=extended,
         searched=extended,
-        exploration=[i for i in range(len(sequences)) if i not in sealed],
-        confirmation=sealed,
+        exploration=[i for i in range(len(sequences)) if i not in confirmation],
+        confirmation=confirmation,
         simulated=simulated,
     )
 
 
 def drivers() -> Agents:
-    """Drivers who were found to differ, which sealed sequences did not confirm."""
+    """Drivers who were found to differ, which confirmation sequences did not confirm."""
     return Agents(
         name="driver_heterogeneity",
         strength=0.05,
@@ -203,7 +205,7 @@ def drivers() -> Agents:
         confirmed=0.4,
         found=True,
         named=False,
-        reason="the last part of the sealed sequences is not predicted better by own numbers",
+        reason="the last part of the confirmation sequences is not predicted better by own numbers",
     )
 
 

@@ -39,19 +39,21 @@ def test_a_hidden_effect_is_named_with_its_coefficient_and_what_it_changes(
     # judged where half of the intervals of the usual length are known better
     assert zone.testable
     assert "half of the intervals" in zone.reason
-    assert d.leads == d.agents == d.data_faults == []
+    assert d.hypotheses == d.agents == d.data_faults == []
     # eleven open clusters: no two-sided p-value is below 2^-10
-    assert (d.clusters.open, d.clusters.sealed) == (d.screen.clusters, 5) == (11, 5)
+    assert (d.clusters.exploration, d.clusters.confirmation) == (d.screen.clusters, 5) == (11, 5)
     assert d.screen.floor == 2**-10
     assert d.screen.floor <= effect.p_value
     assert (d.screen.effect, d.screen.p_value) == ("relative_speed", effect.p_value)
-    # five sequences were sealed, every one is predicted better: the least p that they allow
+    # five confirmation sequences, all predicted better: the smallest p-value that they allow
     assert d.confirmation.confirmed
     assert d.confirmation.p_value == effect.confirmed == 2**-5
-    assert sorted(d.split["open"] + d.split["sealed"]) == sorted(s.name for s in sequences)
-    assert [one["name"] for one in d.sealed] == d.split["sealed"]
-    assert len(d.split["sealed"]) == 5
-    assert all(one["after"] < one["before"] for one in d.sealed)
+    assert sorted(d.split["exploration"] + d.split["confirmation"]) == sorted(
+        s.name for s in sequences
+    )
+    assert [one["name"] for one in d.confirmation_errors] == d.split["confirmation"]
+    assert len(d.split["confirmation"]) == 5
+    assert all(one["after"] < one["before"] for one in d.confirmation_errors)
     gap = d.gap
     assert gap.closed == pytest.approx((gap.before - gap.after) / (gap.before - gap.noise_floor))
     assert gap.closed > 0.3
@@ -65,7 +67,7 @@ def test_nothing_is_named_where_the_law_is_right() -> None:
     sequences = platoons(**MANY)
     options = DiscoverOptions(effects=["relative_speed", "speed_zone", "free_flow_speed"])
     d = diagnose(LAW, sequences, options).diagnosis
-    assert (d.verdict, d.effects, d.leads, d.unknown) == ("none", [], [], None)
+    assert (d.verdict, d.effects, d.hypotheses, d.unknown) == ("none", [], [], None)
     assert (d.confirmation.confirmed, d.confirmation.p_value) == (None, None)
     absent = {one.name: one for one in d.absences}
     assert set(absent) == set(options.effects)
@@ -117,7 +119,7 @@ def test_a_law_with_parameters_at_bounds_makes_effects_hypotheses(
     found = diagnose(LAW, sequences, options)
     d = found.diagnosis
     assert (d.verdict, d.effects, d.law_at_bounds) == ("unknown", [], ["lin.L"])
-    assert [effect.name for effect in d.leads] == ["relative_speed"]
+    assert [effect.name for effect in d.hypotheses] == ["relative_speed"]
     assert d.gap.after == d.gap.before
     assert "lin.L ends at a bound of the admissible values, with relative_speed" in verdict(d)
 

@@ -71,7 +71,7 @@ def test_whole_clusters_are_sealed_but_never_more_than_half_of_the_sequences(see
     order = np.random.default_rng(seed).permutation(len(names))
     sequences = recorded(names[i] + chr(400 + int(i)) for i in order)
     for share in (0.1, 0.3, 0.6, 0.9):
-        found = divide(sequences, DiscoverOptions(seed=seed, sealed=share))
+        found = divide(sequences, DiscoverOptions(seed=seed, confirmation=share))
         assert_sound(found, sequences)
         assert found.number([*found.exploration, *found.confirmation]) == len(sizes)
         assert found.number(found.confirmation) <= max(round(share * len(sizes)), 1)

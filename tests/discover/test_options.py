@@ -28,7 +28,7 @@ def test_all_effects_of_the_domain_are_looked_for_unless_some_are_chosen() -> No
         ({"effects": ["speed_zon"]}, r"discover\.effects: .*did you mean speed_zone\?"),
         ({"exclude": ["inertias"]}, r"discover\.exclude: .*did you mean inertia\?"),
         ({"effects": [stand_in.Wind.name]}, "an effect of crowd models"),
-        ({"sealed": 1.0}, r"discover\.sealed=1\.0 must lie between 0 and 1"),
+        ({"confirmation": 1.0}, r"discover\.confirmation=1\.0 must lie between 0 and 1"),
         ({"alpha": 0.0}, r"discover\.alpha=0\.0 must lie between 0 and 1"),
         ({"max_effects": -1}, r"discover\.max_effects=-1 must be at least 0"),
         ({"step": 0.0}, r"discover\.step=0\.0 must be a positive number"),

@@ -124,7 +124,7 @@ def test_sumo_s_drivers_are_understood_without_any_noise(
     )
     # without noise every law that is not exactly right leaves structure: beside what drivers
     # mind first, the bounds on their accelerations may be seen, as a short inertia
-    effect, *bounds = report["effects"] + report["leads"]
+    effect, *bounds = report["effects"] + report["hypotheses"]
     assert [bound["name"] for bound in bounds] in ([], ["inertia"])
     assert all(bound["coefficients"]["tau_v"]["value"] < 0.5 for bound in bounds)
     kin = {"asymmetric_response", "relative_speed"}

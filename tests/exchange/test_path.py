@@ -145,8 +145,8 @@ def test_the_diagnosis_finds_the_zone(work: Path) -> None:
 
 def test_the_page_of_motion_holds_the_table(work: Path) -> None:
     page = held(work / "runs/errors/replay.html")
-    sealed = read(work / "runs/lacks/report.json")["sealed"]
-    assert {scene["name"] for scene in page["scenes"]} == {one["name"] for one in sealed}
+    errors = read(work / "runs/lacks/report.json")["confirmation_errors"]
+    assert {scene["name"] for scene in page["scenes"]} == {one["name"] for one in errors}
     table = pd.read_csv(work / "mine.csv")
     for scene in page["scenes"]:
         rows = table[table["sequence"] == int(scene["name"].rpartition("/")[2])]

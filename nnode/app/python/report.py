@@ -48,9 +48,9 @@ class Report:
         return self.diagnosis.effects
 
     @property
-    def leads(self) -> list[NamedEffect]:
+    def hypotheses(self) -> list[NamedEffect]:
         """Hypotheses that were not confirmed."""
-        return self.diagnosis.leads
+        return self.diagnosis.hypotheses
 
     @property
     def places(self) -> list[Place]:
@@ -82,7 +82,7 @@ class Report:
 
         Args:
             which: ``map``: measured minus simulated speed in space and time, or acceleration by
-                position, before and after the effects were added; ``sealed``: errors of the
+                position, before and after the effects were added; ``confirmation``: errors of the
                 confirmation sequences, before and after; ``coefficients`` of the effects;
                 ``where``: deviations by variable.
 
@@ -101,7 +101,8 @@ class Report:
             self.sentence,
             "",
             f"{'Model':<36}{d.model}",
-            f"{'Exploration, confirmation clusters':<36}{d.clusters.open}, {d.clusters.sealed}",
+            f"{'Exploration clusters':<36}{d.clusters.exploration}",
+            f"{'Confirmation clusters':<36}{d.clusters.confirmation}",
             f"{'Error before, confirmation (m²)':<36}{amount(gap.before)}",
             f"{'Error after, confirmation (m²)':<36}{amount(gap.after)}",
             f"{'Noise floor (m²)':<36}{noise}",
@@ -109,7 +110,7 @@ class Report:
         ]
         for title, effects in (
             ("Effects", self.effects),
-            ("Not confirmed", self.leads),
+            ("Not confirmed", self.hypotheses),
         ):
             rows = [
                 (f"{effect.name}.{name}", c.value, c.low, c.high, c.unit)
@@ -144,7 +145,7 @@ class Report:
                 "confirmed": effect.confirmed,
                 "where": effect.where,
             }
-            for effects, named in ((self.effects, True), (self.leads, False))
+            for effects, named in ((self.effects, True), (self.hypotheses, False))
             for effect in effects
             for name, c in effect.coefficients.items()
         ]
@@ -162,7 +163,7 @@ class Report:
         return dataset.assign_attrs(verdict=self.verdict, model=self.diagnosis.model)
 
     def __repr__(self) -> str:
-        lines = [f"{e.name}: {interval(e)}; {e.where}" for e in self.effects or self.leads]
+        lines = [f"{e.name}: {interval(e)}; {e.where}" for e in self.effects or self.hypotheses]
         return "\n".join([f"{self.verdict}: {self.sentence}", *(f"  {line}" for line in lines)])
 
     def _repr_html_(self) -> str:

@@ -54,7 +54,7 @@ def figures(inputs: Inputs, outcome: DiagnosisOutcome, options: DiscoverOptions)
     d, maps = outcome.diagnosis, _map_figures(inputs, outcome, options)
     drawn: Figures = {
         "map": [*maps[:1]],
-        "gap": [_confirmation_errors(outcome)] if d.sealed else [],
+        "gap": [_confirmation_errors(outcome)] if d.confirmation_errors else [],
         "effects": [],
         "places": [*_places(outcome), *maps[1:]],
         "unknown": [],
@@ -89,8 +89,8 @@ def figure(
     """One figure of a diagnosis by its name on the page.
 
     Args:
-        which: ``map`` of the deviations before and after, ``sealed`` for errors of the held-back
-            sequences, ``coefficients`` of the effects, or others that it names.
+        which: ``map`` of the deviations before and after, ``confirmation`` for errors of the
+            confirmation sequences, ``coefficients`` of the effects, or others that it names.
 
     Raises:
         ConfigError: the diagnosis has no such figure; names those that it has.
@@ -109,11 +109,13 @@ def figure(
 
 def _confirmation_errors(outcome: DiagnosisOutcome) -> FigureBlock:
     d = outcome.diagnosis
-    names, before, after = ([row[key] for row in d.sealed] for key in ("name", "before", "after"))
+    names, before, after = (
+        [row[key] for row in d.confirmation_errors] for key in ("name", "before", "after")
+    )
     smaller = sum(a < b for a, b in zip(after, before, strict=True))
     counted = f" With effects, {smaller} of {len(names)} errors are smaller." * bool(d.effects)
     return FigureBlock(
-        "sealed",
+        "confirmation",
         confirmation_costs(
             list(map(str, names)), before, after if d.effects else None, d.gap.noise_floor
         ),

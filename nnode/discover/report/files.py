@@ -28,7 +28,7 @@ CHECKPOINT = Path("checkpoints", "best.pt")
 
 #: Version of ``report.json``, raised when a key changes its name or meaning. 2: the base model's
 #: parameters are named by term and name, ``lin.v0``.
-SCHEMA = 2
+SCHEMA = 3
 
 #: The counters of a training that has not started.
 UNTRAINED: dict[str, float] = {
@@ -140,8 +140,8 @@ def verdict(d: Diagnosis) -> str:
         f"error above the noise floor ({amount(d.gap.noise_floor)} m²)"
     )
     unconfirmed = ""
-    hypotheses = _listed([effect.name for effect in d.leads])
-    if d.leads:
+    hypotheses = _listed([effect.name for effect in d.hypotheses])
+    if d.hypotheses:
         unconfirmed = f" {hypotheses} remains a hypothesis: {d.confirmation.reason}."
     match d.verdict:
         case "named":
@@ -155,7 +155,7 @@ def verdict(d: Diagnosis) -> str:
             )
         case "not_testable":
             c = d.clusters
-            if c.open >= c.least:
+            if c.exploration >= c.least_exploration:
                 return (
                     "These data cannot test the model: no effect of the catalogue, with its "
                     "smallest relevant size, would be named with a probability of 80 %. No "
@@ -163,13 +163,13 @@ def verdict(d: Diagnosis) -> str:
                 )
             return (
                 f"The data are too few for a test: they contain "
-                f"{_count(c.open, 'exploration cluster')} and "
-                f"{_count(c.sealed, 'confirmation cluster')}, and about {c.enough} clusters are "
-                f"needed (a cluster is formed by {c.why}). No effect is named."
+                f"{_count(c.exploration, 'exploration cluster')} and "
+                f"{_count(c.confirmation, 'confirmation cluster')}, and about {c.enough} clusters "
+                f"are needed (a cluster is formed by {c.why}). No effect is named."
             )
         case "unknown" if d.law_at_bounds:
             ends = "ends at a bound" if len(d.law_at_bounds) == 1 else "end at bounds"
-            effects = f", with {hypotheses} added" if d.leads else ""
+            effects = f", with {hypotheses} added" if d.hypotheses else ""
             return (
                 f"The model {d.model} is not the law of these data: "
                 f"{_listed(d.law_at_bounds)} {ends} of the admissible values{effects}. No effect "

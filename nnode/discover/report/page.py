@@ -103,7 +103,7 @@ def page_blocks(
             Text(
                 f"A cluster consists of {c.why}; {c.simultaneous}. Clusters are the unit of every "
                 "interval, test and cross-validation. No two-sided p-value can be below "
-                f"{amount(d.screen.floor, 2)} with {c.open} exploration clusters."
+                f"{amount(d.screen.floor, 2)} with {c.exploration} exploration clusters."
             ),
             tables.clusters_table(d),
         ],
@@ -117,7 +117,10 @@ def page_blocks(
 
 def _gap(d: Diagnosis, drawn: Figures) -> list[Block]:
     """The errors on the confirmation sequences, with the definition for the whole page."""
-    n_confirmation, n_exploration = len(d.split.get("sealed", [])), len(d.split.get("open", []))
+    n_confirmation, n_exploration = (
+        len(d.split.get("confirmation", [])),
+        len(d.split.get("exploration", [])),
+    )
     return [
         *drawn["gap"],
         tables.gap_table(d),
@@ -138,11 +141,11 @@ def _coefficients(d: Diagnosis, drawn: Figures, outcome: DiagnosisOutcome) -> li
         blocks.append(Text("No effect of the catalogue was added to the model."))
     if d.base:
         blocks.append(tables.base_table(d))
-    if d.leads:
+    if d.hypotheses:
         blocks += [
             Heading("Hypotheses that were not confirmed", 3),
             Text(f"Reason: {d.confirmation.reason}."),
-            tables.coefficients_table(d.leads, "leads"),
+            tables.coefficients_table(d.hypotheses, "hypotheses"),
         ]
     return blocks
 
@@ -168,7 +171,7 @@ def _decided(d: Diagnosis) -> list[Block]:
         blocks.append(tables.effects_table(d))
     if any(effect.alternatives for effect in d.effects):
         blocks.append(tables.alternatives_table(d))
-    if d.clusters.open < d.clusters.least and d.screen.leads:
+    if d.clusters.exploration < d.clusters.least_exploration and d.screen.strongest:
         blocks += [
             Heading("Hypotheses", 3),
             Text(
@@ -177,7 +180,7 @@ def _decided(d: Diagnosis) -> list[Block]:
             ),
             tables.screen_table(d),
         ]
-    if d.sealed:
+    if d.confirmation_errors:
         blocks.append(tables.confirmation_table(d))
     return blocks
 
@@ -269,13 +272,10 @@ def _provenance(d: Diagnosis, inputs: Inputs) -> Provenance:
         listed = [f"{f['name']} (SHA-256 {f['sha256'][:12]})" for f in files.values()]
         facts["Data"] = ", ".join(listed[:12]) + (" …" if len(listed) > 12 else "")
     facts["Sequences"] = (
-        f"exploration: {_names(d.split.get('open', []))}; "
-        f"confirmation: {_names(d.split.get('sealed', []))}"
+        f"exploration: {_names(d.split.get('exploration', []))}; "
+        f"confirmation: {_names(d.split.get('confirmation', []))}"
     )
-    facts["Time"] = ", ".join(
-        f"{'confirm' if what == 'sealed' else what} {seconds:.1f} s"
-        for what, seconds in d.seconds.items()
-    )
+    facts["Time"] = ", ".join(f"{what} {seconds:.1f} s" for what, seconds in d.seconds.items())
     return Provenance(facts)
 
 
@@ -297,7 +297,7 @@ def write_events(
     shutil.rmtree(folder, ignore_errors=True)
     book = Logbook(folder, config)
     for step, (cost, key) in enumerate(((d.gap.before, "before"), (d.gap.after, "after"))):
-        row = {"gap/sealed": cost, "gap/noise_floor": d.gap.noise_floor}
+        row = {"gap/confirmation": cost, "gap/noise_floor": d.gap.noise_floor}
         row |= {f"parameters/{n}": v[key] for n, v in d.base.items() if key in v}
         for effect in d.effects if step else []:
             values = {n: c.value for n, c in effect.coefficients.items()}

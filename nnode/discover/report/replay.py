@@ -27,7 +27,7 @@ def scenes(outcome: DiagnosisOutcome) -> list[Scene]:
     d = outcome.diagnosis
     compared = [
         (row, before, after)
-        for row, (before, after) in zip(d.sealed, outcome.simulated, strict=False)
+        for row, (before, after) in zip(d.confirmation_errors, outcome.simulated, strict=False)
         if before is not None
         and after is not None
         and np.isfinite([row["before"], row["after"]]).all()

@@ -120,8 +120,8 @@ def clusters_table(d: Diagnosis) -> TableBlock:
         [
             dict(zip(("clusters", "available", "required", "in order to"), row, strict=True))
             for row in (
-                ("exploration", c.open, c.least, "name an effect"),
-                ("confirmation", c.sealed, c.least_sealed, "confirm an effect"),
+                ("exploration", c.exploration, c.least_exploration, "name an effect"),
+                ("confirmation", c.confirmation, c.least_confirmation, "confirm an effect"),
             )
         ],
         "Numbers of independent clusters.",
@@ -142,7 +142,7 @@ def screen_table(d: Diagnosis) -> TableBlock:
                     f"{key} {amount(value)}" for key, value in row.items() if key not in fixed
                 ),
             }
-            for row in d.screen.leads
+            for row in d.screen.strongest
         ],
         "Effects that explain most of the exploration sequences, by linear response. *Change*: "
         f"difference of the coefficient from its neutral value. No p can be below "
@@ -268,8 +268,8 @@ def alternatives_table(d: Diagnosis) -> TableBlock:
         ],
         "Effects that the data cannot distinguish from the chosen one. *p*: for the alternative "
         "being the true effect. *Clusters*: exploration clusters that distinguish both with a "
-        f"power of 90 %, at the observed difference; {d.clusters.open} are available. A *leader* "
-        "has a sinusoidal speed within the measured speeds and 2 m/s².",
+        f"power of 90 %, at the observed difference; {d.clusters.exploration} are available. A "
+        "*leader* has a sinusoidal speed within the measured speeds and 2 m/s².",
     )
 
 
@@ -308,17 +308,17 @@ def gap_table(d: Diagnosis) -> TableBlock:
 def confirmation_table(d: Diagnosis) -> TableBlock:
     """The errors of the individual confirmation sequences."""
     return _table(
-        "sealed",
+        "confirmation",
         [
             {
                 "sequence": row["name"],
                 "without effects (m²)": amount(row["before"]),
                 **({"with effects (m²)": amount(row["after"])} if d.effects else {}),
             }
-            for row in d.sealed
+            for row in d.confirmation_errors
         ],
         "Mean square error of each confirmation sequence.",
-        full=pd.DataFrame(d.sealed).rename(columns={"name": "sequence"}),
+        full=pd.DataFrame(d.confirmation_errors).rename(columns={"name": "sequence"}),
     )
 
 

@@ -35,7 +35,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> nnode.Report:
 def test_what_was_named_is_a_table(result: nnode.Report) -> None:
     assert result.verdict == "named"
     rows = result.to_dataframe()
-    assert set(rows.effect) == {effect.name for effect in [*result.effects, *result.leads]}
+    assert set(rows.effect) == {effect.name for effect in [*result.effects, *result.hypotheses]}
     first = result.effects[0]
     (name, value), *_ = first.coefficients.items()
     row = rows[(rows.effect == first.name) & (rows.coefficient == name)].iloc[0]

@@ -68,15 +68,15 @@ def test_right_answers(
     answer: dict[str, Any], effects: list[tuple[str, ...]], verdict: str, right: bool, false: str
 ) -> None:
     named = [{"name": n, "alternatives": [{"name": o} for o in more]} for n, *more in effects]
-    row = answered({"verdict": verdict, "effects": named, "leads": []}, **answer)
+    row = answered({"verdict": verdict, "effects": named, "hypotheses": []}, **answer)
     assert (row["right"], row["false_names"]) == (right, false)
 
 
 def test_a_world_of_a_law_is_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
     memory = {"name": "memory", "alternatives": []}
-    requested = {"verdict": "named", "effects": [memory], "leads": [], "laws_again": None}
+    requested = {"verdict": "named", "effects": [memory], "hypotheses": [], "laws_again": None}
     requested["laws"] = {"ranking": [{"name": "lin"}]}
-    best = SimpleNamespace(plain=lambda: {"verdict": "none", "effects": [], "leads": []})
+    best = SimpleNamespace(plain=lambda: {"verdict": "none", "effects": [], "hypotheses": []})
     found = SimpleNamespace(plain=lambda: requested, nearest=best)
     monkeypatch.setattr(discover, "diagnose_table", lambda *given, **options: found)
     first, second = worlds.evaluate("laws", "lin", 5, "idm")["worlds"]

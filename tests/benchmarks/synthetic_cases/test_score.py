@@ -48,7 +48,9 @@ def report(*effects: str, verdict: str = "named", **more: Any) -> dict[str, Any]
 
 def lead(name: str) -> dict[str, Any]:
     """A report of an unconfirmed effect."""
-    return report(verdict="none", leads=[{"name": name, "coefficients": {}, "alternatives": []}])
+    return report(
+        verdict="none", hypotheses=[{"name": name, "coefficients": {}, "alternatives": []}]
+    )
 
 
 EQUALS, UNKNOWN, NONE = ({"verdict": v} for v in ("indistinguishable", "unknown", "none"))
@@ -135,7 +137,7 @@ INEXACT = {"exact": False, "class_right": False}
                 report(
                     **NONE,
                     screen={"p_value": p_value, "effect": effect},
-                    clusters={"open": 15, "sealed": 5},
+                    clusters={"exploration": 15, "confirmation": 5},
                 ),
                 {"screen_p": p_value, "screen_false": false, "clusters": 15},
             )

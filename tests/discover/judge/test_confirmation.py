@@ -1,4 +1,4 @@
-"""Names are confirmed by clusters that nothing looked at, or they are leads."""
+"""Names are confirmed by clusters that nothing looked at, or they are hypotheses."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ LAW = lin(v0=25.0, length=7.0)
 
 
 def turned() -> list[Sequence]:
-    """Platoons whose sealed ones react the other way round."""
+    """Platoons whose confirmation ones react the other way round."""
     forth, back = (platoons(relative_speed(s * KAPPA), **MANY) for s in (1, -1))
-    sealed = divide(forth, OPTIONS).confirmation
-    return [back[i] if i in sealed else one for i, one in enumerate(forth)]
+    confirmation = divide(forth, OPTIONS).confirmation
+    return [back[i] if i in confirmation else one for i, one in enumerate(forth)]
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +53,13 @@ def test_what_is_worse_on_sealed_clusters_is_not_confirmed(
 ) -> None:
     report, _ = unconfirmed
     assert (report["verdict"], report["effects"]) == ("none", [])
-    (lead,) = report["leads"]
+    (lead,) = report["hypotheses"]
     assert lead["name"] == "relative_speed"
     # the open clusters do say so: the least p that eleven of them allow
-    assert (report["clusters"]["open"], report["clusters"]["sealed"]) == (11, 5)
+    assert (report["clusters"]["exploration"], report["clusters"]["confirmation"]) == (11, 5)
     assert report["screen"]["p_value"] == lead["p_value"] == 2**-10
     assert lead["coefficients"]["kappa"]["value"] == pytest.approx(KAPPA, abs=0.05)
-    # the sealed ones are all worse
+    # the confirmation ones are all worse
     assert lead["confirmed"] == report["confirmation"]["p_value"] == 1.0
     assert report["confirmation"]["confirmed"] is False
 
@@ -82,21 +82,21 @@ def test_what_is_not_confirmed_is_a_hypothesis_in_every_file(
 def test_two_confirmation_clusters_are_enough_and_one_is_not(
     number: int, confirmation: int
 ) -> None:
-    options = replace(OPTIONS, sealed=confirmation / (number + confirmation))
+    options = replace(OPTIONS, confirmation=confirmation / (number + confirmation))
     made = platoons(relative_speed(KAPPA), **{**MANY, "number": number + confirmation})
     # a law that predicts no better than the model with the effect does not take its place
     found = diagnose(LAW, made, options, nearer=BetterLaw("lin", LAW))
     d = found.diagnosis
-    assert d.clusters.sealed == confirmation
+    assert d.clusters.confirmation == confirmation
     if confirmation == 2:
-        assert (d.verdict, d.leads) == ("named", [])
+        assert (d.verdict, d.hypotheses) == ("named", [])
         (effect,) = d.effects
         # 2^-2 is the least p-value of two clusters, and the exploration clusters are sure
         assert effect.confirmed == 0.25
         assert effect.combined < 0.05
     else:
         assert (d.verdict, d.effects) == ("none", [])
-        assert [one.name for one in d.leads] == ["relative_speed"]
+        assert [one.name for one in d.hypotheses] == ["relative_speed"]
         assert "requires 2" in d.confirmation.reason
         assert effects_of(found.extended) == []
 
@@ -105,24 +105,29 @@ def test_with_too_few_clusters_nothing_is_named_and_it_says_how_many_would_do() 
     sequences = platoons(relative_speed(KAPPA), **{**MANY, "number": 11})
     found = diagnose(LAW, sequences, DiscoverOptions(structure=False))
     d = found.diagnosis
-    assert (d.verdict, d.effects, d.leads) == ("not_testable", [], [])
+    assert (d.verdict, d.effects, d.hypotheses) == ("not_testable", [], [])
     # eight open clusters have 2^7 outcomes, too few for so many effects
     effects = [one for one in CATALOGUE.of("traffic") if not issubclass(one, IndividualEffect)]
-    assert d.clusters.open == 8 < d.clusters.least == least_number(0.05, hypotheses=len(effects))
+    assert (
+        d.clusters.exploration
+        == 8
+        < d.clusters.least_exploration
+        == least_number(0.05, hypotheses=len(effects))
+    )
     assert not any(one.testable for one in d.absences if one.name in {e.name for e in effects})
     assert "8 exploration clusters and 3 confirmation clusters" in sentence(d)
     assert f"about {d.clusters.enough} clusters are needed" in sentence(d)
     # so many would do, and not many fewer
     for number, do in ((d.clusters.enough, True), (d.clusters.enough - 3, False)):
         parts = divide(platoons(number=number, seconds=1.0), DiscoverOptions())
-        least = d.clusters.least, d.clusters.least_sealed
+        least = d.clusters.least_exploration, d.clusters.least_confirmation
         enough = (
             parts.number(parts.exploration) >= least[0]
             and parts.number(parts.confirmation) >= least[1]
         )
         assert enough == do
     # what one would look at first is told all the same
-    assert d.screen.leads[0]["name"] in ("relative_speed", "asymmetric_response")
+    assert d.screen.strongest[0]["name"] in ("relative_speed", "asymmetric_response")
 
 
 def test_an_effect_of_all_is_named_although_drivers_differ() -> None:

@@ -68,7 +68,7 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 @pytest.mark.thorough
 def test_errors_are_those_of_the_simulations_that_are_shown(run: Run) -> None:
-    rows = run.found.diagnosis.sealed
+    rows = run.found.diagnosis.confirmation_errors
     assert len(rows) == len(run.found.simulated) > 3
     for row, pair in zip(rows, run.found.simulated, strict=True):
         for key, one in zip(("before", "after"), pair, strict=True):
@@ -85,7 +85,9 @@ def test_errors_are_those_of_the_simulations_that_are_shown(run: Run) -> None:
 
 def test_headline_tables_and_json_state_the_same_errors(run: Run) -> None:
     d, report = run.found.diagnosis, run.report
-    before, after = (np.mean([row[key] for row in report["sealed"]]) for key in ("before", "after"))
+    before, after = (
+        np.mean([row[key] for row in report["confirmation_errors"]]) for key in ("before", "after")
+    )
     assert report["gap"]["before"] == pytest.approx(before)
     assert report["gap"]["after"] == pytest.approx(after)
     words = [amount(before), amount(after)]
@@ -95,9 +97,13 @@ def test_headline_tables_and_json_state_the_same_errors(run: Run) -> None:
     table = pd.read_csv(run.folder / "gap.csv", dtype=str)
     shown = table[table.iloc[:, 0].isin(["base", "base with effects"])]
     assert list(shown.iloc[:, 1]) == (words if d.effects else words[:1])
-    each = pd.read_csv(run.folder / "sealed.csv")
-    assert list(each["before"]) == pytest.approx([row["before"] for row in report["sealed"]])
-    assert list(each["after"]) == pytest.approx([row["after"] for row in report["sealed"]])
+    each = pd.read_csv(run.folder / "confirmation.csv")
+    assert list(each["before"]) == pytest.approx(
+        [row["before"] for row in report["confirmation_errors"]]
+    )
+    assert list(each["after"]) == pytest.approx(
+        [row["after"] for row in report["confirmation_errors"]]
+    )
 
 
 def test_the_definition_stands_once_on_the_page_and_in_the_report(run: Run) -> None:
@@ -111,7 +117,7 @@ def test_the_definition_stands_once_on_the_page_and_in_the_report(run: Run) -> N
 
 
 def test_player_and_paths_show_the_errors_of_the_table(run: Run) -> None:
-    rows = {row["name"]: row for row in run.report["sealed"]}
+    rows = {row["name"]: row for row in run.report["confirmation_errors"]}
     (text,) = re.findall(r'<script type="application/json">(.*?)</script>', run.page, re.S)
     player = json.loads(text)
     scenes = player["scenes"]

@@ -62,13 +62,13 @@ def test_the_report_holds_what_programs_rely_on(traffic: Case, tmp_path: Path) -
     assert set(effect) >= {"coefficients", "where", "alternatives", "formula", "source", "p_value"}
     assert set(effect["coefficients"]["alpha"]) == {"value", "low", "high", "unit"}
     assert report["not_testable"] == ["reaction_delay"]
-    assert report["data_faults"] == report["leads"] == []
-    assert report["clusters"]["open"] + report["clusters"]["sealed"] == 5
-    assert set(report["screen"]) >= {"p_value", "clusters", "floor", "leads"}
+    assert report["data_faults"] == report["hypotheses"] == []
+    assert report["clusters"]["exploration"] + report["clusters"]["confirmation"] == 5
+    assert set(report["screen"]) >= {"p_value", "clusters", "floor", "strongest"}
     assert report["confirmation"]["confirmed"] is True
     (drivers,) = report["agents"]
     assert drivers["share"] == {"recording": None, "sequence": 0.2, "agent": 0.5, "mood": 0.3}
-    assert {"name", "before", "after"} == set(report["sealed"][0])
+    assert {"name", "before", "after"} == set(report["confirmation_errors"][0])
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,8 @@ JUMPS = [DataFault("jump", f"lane/{i}", ["v1"], 3.0) for i in (1, 1, 2)]
             {"verdict": "not_testable"},
             " 3 exploration clusters and 2 confirmation clusters, | about 17 clusters",
         ),
-        ({"verdict": "not_testable", "least": 2}, "These data cannot test the model: "),
-        ({"leads": True}, "lacks speed_zone | inertia remains a hypothesis: no better."),
+        ({"verdict": "not_testable", "least_exploration": 2}, "These data cannot test the model: "),
+        ({"hypotheses": True}, "lacks speed_zone | inertia remains a hypothesis: no better."),
         ({"data_faults": JUMPS}, "lacks speed_zone | 2 sequences with 3 faults "),
     ],
 )
@@ -125,10 +125,11 @@ def test_the_sentence_has_the_facts_of_a_verdict(
     (effect,) = d.effects
     effect = replace(effect, alternatives=[Alternative("inertia", 1.0, 0.5)])
     changes = {"effects": [effect], **changes}
-    if "least" in changes:
-        changes["clusters"] = replace(d.clusters, least=changes.pop("least"))
-    if "leads" in changes:
-        changes["leads"] = [replace(effect, name="inertia")]
+    if "least_exploration" in changes:
+        least = changes.pop("least_exploration")
+        changes["clusters"] = replace(d.clusters, least_exploration=least)
+    if "hypotheses" in changes:
+        changes["hypotheses"] = [replace(effect, name="inertia")]
     no = Confirmation(0.4, 5, False, "no better")
     said = sentence(replace(d, confirmation=no, gap=Gap(5.0, 1.0, 0.5, 8 / 9), **changes))
     assert said.endswith(".")
@@ -179,8 +180,8 @@ def test_the_checkpoint_has_the_diagnosis_own_parts(traffic: Case) -> None:
     checkpoint = checkpoint_of(
         traffic.found, traffic.inputs.sequences, config, {}, AdadeltaOptions()
     )
-    assert checkpoint.split["heldout"] == traffic.found.diagnosis.split["sealed"]
-    assert checkpoint.split["train"] == traffic.found.diagnosis.split["open"]
+    assert checkpoint.split["heldout"] == traffic.found.diagnosis.split["confirmation"]
+    assert checkpoint.split["train"] == traffic.found.diagnosis.split["exploration"]
     # cars behind a leader at 14 to 22 m/s
     assert checkpoint.free_speed is not None
     assert 5 < checkpoint.free_speed < 27

@@ -93,7 +93,7 @@ def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
         "faults",
         "map",
         "map_beside",
-        "sealed",
+        "confirmation",
         "trajectories",
         "unknown",
         "where",
@@ -109,7 +109,9 @@ def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
 def test_tensorboard_shows_before_and_after(written: Path, traffic: Case) -> None:
     events = EventAccumulator(str(written / "tensorboard")).Reload()
     gap = traffic.found.diagnosis.gap
-    assert [e.value for e in events.Scalars("gap/sealed")] == pytest.approx([gap.before, gap.after])
+    assert [e.value for e in events.Scalars("gap/confirmation")] == pytest.approx(
+        [gap.before, gap.after]
+    )
     assert [e.value for e in events.Scalars("parameters/lin.v0")] == [24.0, 27.0]
     assert [e.value for e in events.Scalars("effects/speed_zone/alpha")] == pytest.approx([0.65])
     assert "diagnosis/map" in events.Tags()["images"]
@@ -141,7 +143,7 @@ def words_of(case: Case, **changes: Any) -> list[str]:
     ]
 
 
-EMPTY = ("effects", "places", "absences", "not_testable", "sealed", "notes", "agents")
+EMPTY = ("effects", "places", "absences", "not_testable", "confirmation_errors", "notes", "agents")
 
 
 def test_a_page_has_no_tables_of_what_was_not_found(traffic: Case) -> None:
@@ -155,8 +157,8 @@ def test_a_page_has_no_tables_of_what_was_not_found(traffic: Case) -> None:
 def test_hypotheses_are_listed_with_the_reason(traffic: Case) -> None:
     d = traffic.found.diagnosis
     no = Confirmation(0.4, 5, False, "the errors do not fall")
-    words = words_of(traffic, effects=[], verdict="none", leads=d.effects, confirmation=no)
-    assert words[words.index("leads") - 1] == "Reason: the errors do not fall."
+    words = words_of(traffic, effects=[], verdict="none", hypotheses=d.effects, confirmation=no)
+    assert words[words.index("hypotheses") - 1] == "Reason: the errors do not fall."
     assert "screen" in words_of(traffic, effects=[], verdict="not_testable")
 
 
@@ -197,7 +199,7 @@ def test_the_player_opens_on_the_sequence_with_the_median_error(traffic: Case) -
     rows = [
         {"name": s.name, "before": e, "after": e} for s, e in zip(sequences, errors, strict=True)
     ]
-    found.diagnosis = replace(found.diagnosis, sealed=rows)
+    found.diagnosis = replace(found.diagnosis, confirmation_errors=rows)
     shown = scenes(found)
     assert [scene.sequence.name for scene in shown] == ["s16", "s9", "s4", "s1"]
     assert shown[typical(shown)].sequence.name == "s4"

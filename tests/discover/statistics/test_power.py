@@ -18,7 +18,7 @@ from tests.builders import regression
 
 OPEN, EACH, ALPHA, LEVEL = 30, 12, 0.05, thresholds.LEVEL
 
-#: What one parameter of a model and the effect do to the residuals of open and sealed clusters.
+#: What one parameter of a model and the effect do to the residuals of all clusters.
 RNG = np.random.default_rng(8)
 LABEL = np.repeat(np.arange(OPEN), EACH)
 ROWS = np.arange(OPEN * EACH).reshape(OPEN, EACH)
@@ -41,7 +41,7 @@ def scored(residual: np.ndarray, seed: int = 0) -> tuple[Fit, Screen, Score]:
     return fit, screen, score
 
 
-def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
+def is_named(rng: np.random.Generator, size: float, confirmation: int) -> bool:
     """One search on fresh clusters in which the effect has a size."""
     fit, _, score = scored(drawn(rng, LABEL) - size * EFFECT * KNOWN)
     columns = np.stack([PARAMETER, EFFECT], 1) * KNOWN[:, None]
@@ -55,28 +55,28 @@ def is_named(rng: np.random.Generator, size: float, sealed: int) -> bool:
         or low <= 0 <= high
     ):
         return False
-    # sealed clusters are like the open ones
-    picked = ROWS[rng.integers(0, OPEN, sealed)].ravel()
-    label = np.repeat(np.arange(sealed), EACH)
+    # confirmation clusters are like the others
+    picked = ROWS[rng.integers(0, OPEN, confirmation)].ravel()
+    label = np.repeat(np.arange(confirmation), EACH)
     seen = drawn(rng, label) - size * columns[picked, 1]
     before = seen + columns[picked, 0] * fit.row[0]
     after = seen + columns[picked] @ wider.row
     likelier = gains(group_sums(before**2, label), group_sums(after**2, label)).mean() > 0
     p_value = better(score_toward(before, after, label))
-    together = combined(score.p_value, p_value, OPEN, sealed)
+    together = combined(score.p_value, p_value, OPEN, confirmation)
     return bool(likelier and p_value <= thresholds.EACH and together <= ALPHA)
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("size", "sealed"), [(0.15, 5), (0.15, 16)])
-def test_power_is_how_often_the_whole_search_names(size: float, sealed: int) -> None:
+@pytest.mark.parametrize(("size", "confirmation"), [(0.15, 5), (0.15, 16)])
+def test_power_is_how_often_the_whole_search_names(size: float, confirmation: int) -> None:
     rng = np.random.default_rng(1)
-    often = np.mean([is_named(rng, size, sealed) for _ in range(RUNS)])
+    often = np.mean([is_named(rng, size, confirmation) for _ in range(RUNS)])
     # the power is judged from residuals in which nothing is hidden, of other data each time
     powers = []
     for seed in range(40):
         _, screen, score = scored(drawn(rng, LABEL), seed)
-        way = PowerSimulation(screen, ALPHA, sealed)
+        way = PowerSimulation(screen, ALPHA, confirmation)
         powers.append(way.power(score, score.evidence[0], size, seed))
     error = np.sqrt(often * (1 - often) / RUNS + np.var(powers, ddof=1) / len(powers))
     assert 0.05 < often < 0.95
@@ -85,7 +85,7 @@ def test_power_is_how_often_the_whole_search_names(size: float, sealed: int) -> 
 
 def test_one_confirmation_cluster_leaves_no_power() -> None:
     _, screen, score = scored(drawn(np.random.default_rng(2), LABEL))
-    one, many = (PowerSimulation(screen, ALPHA, sealed) for sealed in (1, 2))
+    one, many = (PowerSimulation(screen, ALPHA, confirmation) for confirmation in (1, 2))
     assert one.power(score, score.evidence[0], 3.0) == 0.0
     assert one.detectable(score, score.evidence[0], 1.0) == np.inf
     assert many.power(score, score.evidence[0], 3.0) == 1.0
