@@ -181,7 +181,7 @@ def diagnose(
         options.seed,
     )
     kinds = [effect for effect in offered if issubclass(effect, IndividualEffect)]
-    individual_estimates = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
+    individuals = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
     selection, unconfirmed = confirmation.confirmed(engine, selection)
     law_at_bounds |= parameters_at_bounds(base_system, selection.fit, engine.cluster)
     unexplained = _unexplained(exploration, selection)
@@ -192,11 +192,9 @@ def diagnose(
     absent_effects = absences(selection, power)
     corrected = confirmation.corrected(engine, selection)
     if unconfirmed:
-        # an unconfirmed effect that was removed could otherwise show as a difference of agents
         refitted = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
-        pairs = [(a, b) for a, b in zip(individual_estimates, refitted, strict=True) if a and b]
-        individual_estimates = [max(pair, key=lambda estimate: estimate.p_value) for pair in pairs]
-    estimates = _bonferroni([estimate for estimate in individual_estimates if estimate is not None])
+        individuals = _less_significant(individuals, refitted)
+    estimates = _bonferroni([estimate for estimate in individuals if estimate is not None])
     agents = [
         confirmation.agents(estimate, corrected.system, bool(unexplained), testable)
         for estimate in estimates
@@ -312,6 +310,15 @@ def _offered(
     candidates = [effect for effect in catalogue if effect.name in names]
     refused = {e.name: reason for e in candidates if (reason := not_offered(e, system, differ))}
     return [effect for effect in candidates if effect.name not in refused], refused
+
+
+def _less_significant(
+    before: list[IndividualEstimate | None], after: list[IndividualEstimate | None]
+) -> list[IndividualEstimate | None]:
+    """The less significant estimates of two models, if both exist. An unconfirmed effect that was
+    removed could otherwise show as a difference between agents."""
+    pairs = [(a, b) for a, b in zip(before, after, strict=True) if a and b]
+    return [max(pair, key=lambda estimate: estimate.p_value) for pair in pairs]
 
 
 def _bonferroni(estimates: list[IndividualEstimate]) -> list[IndividualEstimate]:

@@ -142,7 +142,8 @@ def verdict(d: Diagnosis) -> str:
     unconfirmed = ""
     hypotheses = _listed([effect.name for effect in d.hypotheses])
     if d.hypotheses:
-        unconfirmed = f" {hypotheses} remains a hypothesis: {d.confirmation.reason}."
+        remain = "remains a hypothesis" if len(d.hypotheses) == 1 else "remain hypotheses"
+        unconfirmed = f" {hypotheses} {remain}: {hypotheses_reason(d)}."
     match d.verdict:
         case "named":
             return f"The model {d.model} lacks {names}: {gain}.{unconfirmed}"
@@ -168,12 +169,10 @@ def verdict(d: Diagnosis) -> str:
                 f"are needed (a cluster is formed by {c.why}). No effect is named."
             )
         case "unknown" if d.law_at_bounds:
-            ends = "ends at a bound" if len(d.law_at_bounds) == 1 else "end at bounds"
             effects = f", with {hypotheses} added" if d.hypotheses else ""
             return (
-                f"The model {d.model} is not the law of these data: "
-                f"{_listed(d.law_at_bounds)} {ends} of the admissible values{effects}. No effect "
-                "of the catalogue explains the deviation."
+                f"The model {d.model} is not the law of these data: {_at_bounds(d)}{effects}. No "
+                "effect of the catalogue explains the deviation."
             )
         case "unknown":
             variables = (
@@ -189,6 +188,18 @@ def verdict(d: Diagnosis) -> str:
                 f"No missing effect was found: none of the catalogue improves the model {d.model} "
                 f"significantly, and no structure remains in the residuals.{unconfirmed}"
             )
+
+
+def hypotheses_reason(d: Diagnosis) -> str:
+    """Why selected effects are hypotheses."""
+    if d.law_at_bounds:
+        return _at_bounds(d)
+    return d.confirmation.reason or "a better-fitting law does without"
+
+
+def _at_bounds(d: Diagnosis) -> str:
+    ends = "ends at a bound" if len(d.law_at_bounds) == 1 else "end at bounds"
+    return f"{_listed(d.law_at_bounds)} {ends} of the admissible values"
 
 
 def _count(number: int, what: str) -> str:

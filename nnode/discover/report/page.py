@@ -19,6 +19,7 @@ from nnode.discover.report.files import (
     CHECKPOINT,
     amount,
     has_network,
+    hypotheses_reason,
     individual,
     interval,
     remarks,
@@ -144,7 +145,7 @@ def _coefficients(d: Diagnosis, drawn: Figures, outcome: DiagnosisOutcome) -> li
     if d.hypotheses:
         blocks += [
             Heading("Hypotheses that were not confirmed", 3),
-            Text(f"Reason: {d.confirmation.reason}."),
+            Text(f"Reason: {hypotheses_reason(d)}."),
             tables.coefficients_table(d.hypotheses, "hypotheses"),
         ]
     return blocks

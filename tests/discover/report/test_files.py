@@ -115,6 +115,10 @@ JUMPS = [DataFault("jump", f"lane/{i}", ["v1"], 3.0) for i in (1, 1, 2)]
         ),
         ({"verdict": "not_testable", "least_exploration": 2}, "These data cannot test the model: "),
         ({"hypotheses": True}, "lacks speed_zone | inertia remains a hypothesis: no better."),
+        (
+            {"verdict": "unknown", "law_at_bounds": ["lin.L"], "hypotheses": True},
+            "not the law of these data: lin.L ends at a bound | values, with inertia added.",
+        ),
         ({"data_faults": JUMPS}, "lacks speed_zone | 2 sequences with 3 faults "),
     ],
 )
