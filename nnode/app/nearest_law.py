@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from nnode.app.python.inputs import model_options
-from nnode.app.training import set_threads
+from nnode.app.training import set_threads, threads_given_back
 from nnode.config import choices
 from nnode.discover import thresholds
 from nnode.discover.compare.laws import BetterLaw, compare_laws, with_effects
@@ -110,6 +110,7 @@ def law_options(name: str, asked: Mapping[str, Any]) -> dict[str, Any]:
     return {**options, **{key: asked[key] for key in SHARED if key in asked and key in options}}
 
 
+@threads_given_back()
 def diagnosed(job: Job) -> list[tuple[Job, DiagnosisOutcome]]:
     """Diagnoses of the requested law and of the nearest law, if it is another one.
 

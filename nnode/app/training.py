@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from omegaconf import DictConfig
+from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader
 
 from nnode.app.cli.saved import options_of
@@ -92,19 +93,23 @@ def batches(
 
 
 def set_threads(threads: int | None, domain: str) -> None:
-    """Set torch's threads; by default one for traffic, whose tensors are small."""
+    """Set the threads of torch and of NumPy's linear algebra; by default one for traffic, whose
+    tensors are small: others would wait busily, and results would depend on their number in the
+    last digits."""
     if threads is not None or domain == "traffic":
         torch.set_num_threads(threads or 1)
+        threadpool_limits(threads or 1, "blas")
 
 
 @contextmanager
 def threads_given_back() -> Iterator[None]:
-    """Restore torch's number of threads at the end."""
+    """Restore the numbers of threads at the end."""
     before = torch.get_num_threads()
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    with threadpool_limits(user_api="blas"):
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
 
 
 def check(config: DictConfig) -> None:
