@@ -114,7 +114,7 @@ class TrainerOptions:
     pooling: Pooling = Pooling.pooled  # shared by all sequences, or separate for each
     # none | auto | [T, v0]: parameters that differ between drivers, see nnode.population; auto:
     # those whose variance the data determine; null: auto for laws of second order with
-    # optimizer=gauss_newton if position errors are at most 0.45 m and not smoothed, otherwise none
+    # optimizer=gauss_newton unless positions were smoothed or have large errors, otherwise none
     drivers: Any = None
     # first speeds of training sequences: given by the data, or fitted; auto: depending on the noise
     # of the measurement

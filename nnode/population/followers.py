@@ -45,12 +45,14 @@ from nnode.simulation.rhs import formula_of
 #: Smallest standard deviation of measurement errors that fourth differences show, m: that of a
 #: camera. Smaller ones are estimated with the other variances.
 FLOOR = 0.01
-#: Range of white measurement errors, m. Below it, positions were simulated, or they were smoothed:
+#: Smallest white measurement errors, m. Below it, positions were simulated, or they were smoothed:
 #: then their errors are autocorrelated, which the likelihood neglects. SUMO's paths at 5 Hz, which
-#: have no errors, seem to have errors of 0.011 m. Above it, smoothed leaders keep too much noise:
-#: ESIMAS's errors of 0.57 m are attributed to pushes. A table in docs/discovery_earlier.md compares
-#: both approaches.
-NOISE = (0.015, 0.45)
+#: have no errors, seem to have errors of 0.011 m.
+WHITE = 0.015
+#: Largest errors of smoothed leaders' speeds, relative to how much these speeds vary. With larger
+#: ones, leaders' errors are attributed to their followers. The table in docs/discovery.md has what
+#: this is for some data.
+LEADER_ERROR = 0.2
 #: Longest step of laws that are maps from step to step, s: SUMO's default.
 MAPPED = 0.1
 #: Longest step of models with zones or periods, s: vehicles pass the end of a zone within 0.1 to
@@ -250,7 +252,7 @@ def _smoothed_error(weights: list[float], dt: float, noise: float) -> tuple[floa
         Its standard deviation, m, and its correlation time, s.
     """
     time = dt * max(float(np.median(weights)) ** (1 / 6), 0.5)
-    variance = noise**2 * dt / (2 * time) if noise > NOISE[0] else 0.0
+    variance = noise**2 * dt / (2 * time) if noise > WHITE else 0.0
     return math.sqrt(variance), time
 
 
@@ -308,16 +310,34 @@ def follower_formula(system: System) -> LaneDynamics | None:
 
 def drivers_differ(system: System, sequences: Iterable[Sequence]) -> bool:
     """Whether differences between drivers can be estimated by default: if the model is a formula
-    of the positions and speeds of a driver and of the vehicles ahead, and the measurement errors
-    are not above :data:`NOISE`. If they are below, see :func:`without_errors`."""
+    of the positions and speeds of a driver and of the vehicles ahead, and the errors of smoothed
+    leaders are not above :data:`LEADER_ERROR`."""
     if follower_formula(system) is None:
         return False
-    return measured_noise(sequences).position < NOISE[1]
+    return leader_error(list(sequences)) <= LEADER_ERROR
+
+
+def leader_error(sequences: list[Sequence]) -> float:
+    """The standard deviation of the errors of smoothed speeds, relative to that of smoothed speeds
+    over time: medians over the sequences. 0 if positions have no white errors, NaN if errors are
+    unknown, because no sequence has five samples."""
+    noise = measured_noise(sequences).position
+    if not noise > WHITE:
+        return 0.0 * noise
+    errors, variations = list[float](), list[float]()
+    for s in (s for s in sequences if s.n_samples > 1):
+        smoothed, weight = whittaker(s.x[..., 0])
+        error, time = _smoothed_error([weight], s.dt, noise)
+        # with x = omega time, speeds have the variance 2 error²/(pi time²) times the integral of
+        # x²/(1 + x^6)², which is pi/12
+        errors.append(error / time / math.sqrt(6))
+        variations.append(float(np.gradient(smoothed, s.dt, axis=0).std(0).mean()))
+    return float(np.median(errors) / np.median(variations))
 
 
 def without_errors(sequences: Iterable[Sequence]) -> bool:
     """Whether positions have no white measurement errors: they were simulated or smoothed."""
-    return measured_noise(sequences).position < NOISE[0]
+    return measured_noise(sequences).position < WHITE
 
 
 def _n_disturbed(lane: LaneDynamics) -> int:

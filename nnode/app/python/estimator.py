@@ -62,8 +62,8 @@ class Calibrator:
         drivers: ``none``, ``auto`` or names of parameters such as ``["T", "v0"]``, which differ
             between drivers; ``auto`` selects those whose variance the data determine. Laws of lanes
             are then calibrated by a mixed-effects model, see ``docs/method.md``. None is ``auto``
-            for laws of second order if errors of positions are at most 0.45 m, and otherwise
-            ``none``.
+            for laws of second order unless positions were smoothed or have large errors, and
+            otherwise ``none``.
         pooling: ``pooled``, ``alone`` or ``shrunk``; the last two add separate parameters of each
             sequence in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
         start_speeds: ``auto``, ``given``, or ``fitted`` for each training sequence; see
