@@ -39,7 +39,7 @@ STEP = {1: 0.4, 2: 0.2}
 WINDOW, FORGET, SHARE = 10.0, 5.0, 0.2
 #: Threshold of Huber's loss for whitened residuals.
 LARGE = 6.0
-#: Difference of an agent's parameter for derivatives.
+#: Difference of an agent's parameter for derivatives, and share of an effect's step.
 SMALL = 1e-4
 #: Number of sequences times changes whose response is computed at once; so many fit the cache.
 BLOCK = 4096

@@ -25,6 +25,7 @@ from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.sequence import Sequence
 from nnode.discover.lanes.engine import (
     LARGE,
+    SMALL,
     TrafficEngine,
     huber_residuals,
     weights_of,
@@ -206,7 +207,11 @@ class FollowersEngine(TrafficEngine):
         self, system: System, row: Tensor, effect: type[Effect], *probes: Probe
     ) -> Tensor:
         """``(S, n)`` derivatives of the residuals with respect to the strengths of one probe after
-        the other: by linear response; of an effect with a memory, the change by it as a whole."""
+        the other: by linear response; of an effect with a memory, the change by it as a whole.
+
+        Effects by a property of the vehicle change the same as differences between drivers. Where
+        those are large, V^(-1/2) leaves less of this direction than the errors of the linear
+        response, which are some per mille, so that these effects are simulated."""
         run, changes = self._run_of(system, row), []
         at_once = max(1, NUMBERS // run.rates.size)
         if len(probes) > at_once:
@@ -216,6 +221,12 @@ class FollowersEngine(TrafficEngine):
             for probe in probes:
                 changed, amount = with_all_strengths(run.system, effect, probe)
                 changes.append(self._displacement(run, changed) / amount)
+            return self._residual_changes(run, np.stack(changes, 2))
+        if effect.covariate is not None:
+            for probe in probes:
+                small = replace(probe, steps={name: SMALL * x for name, x in probe.steps.items()})
+                for changed, size in with_each_strength(run.system, effect, small):
+                    changes.append(self._displacement(run, changed) / size)
             return self._residual_changes(run, np.stack(changes, 2))
         for probe in probes:
             for changed, size in with_each_strength(run.system, effect, probe):

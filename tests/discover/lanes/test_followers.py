@@ -22,6 +22,7 @@ from nnode.model.effects.lane import (
     ReactionDelay,
     RelativeSpeed,
     SpeedPeriod,
+    VehicleClass,
 )
 from nnode.model.extend import extended
 
@@ -49,6 +50,27 @@ def test_derivatives_beside_a_memory_are_differences(memory: Effect) -> None:
     )
     difference = (after - before) / size
     assert float((column - difference).norm()) < 0.05 * float(difference.norm())
+
+
+def test_the_change_by_a_class_is_exact_where_drivers_differ() -> None:
+    """Almost all of it is what drivers of another T would do, which the whitening removes."""
+    table = platoons("idm", "vehicle_class", 0.3, 78, number=6, vehicles=4, error=0.02)
+    engine = FollowersEngine(list(nnode.sequences(table)))
+    law = Traffic([make_law("idm")], leader="measured").double()
+    engine.fit_whitening(law, ParameterVector(law).row)
+    assert engine.population is not None
+    assert "idm.T" in engine.population.random
+    system = engine.population.system
+    (probe,) = VehicleClass.probes(engine.batch, system)
+    row = ParameterVector(system).row
+    (column,) = engine.screen_columns(system, row, VehicleClass, probe)
+    size = 1e-4
+    longer, _ = extended(system, VehicleClass(**probe.options, phi=1 + size).double())
+    before, after = (
+        engine.residuals(model, ParameterVector(model).row[None])[0] for model in (system, longer)
+    )
+    difference = (after - before) / size
+    assert float((column - difference).norm()) < 0.01 * float(difference.norm())
 
 
 @pytest.mark.parametrize("memory", [Inertia(tau_v=0.3), ReactionDelay(T=0.3)])
