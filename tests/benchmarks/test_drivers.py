@@ -35,7 +35,8 @@ def test_rows_are_scored_and_kept(
         calls.append(table)
         alpha = {"alpha": {"value": 0.88, "low": 0.85, "high": 0.91}}
         effect = {"name": "speed_zone", "alternatives": [], "coefficients": alpha}
-        report = {"effects": [effect], "verdict": "named", "drivers": [], "hypotheses": []}
+        empty: dict[str, list[Any]] = {"drivers": [], "hypotheses": [], "law_at_bounds": []}
+        report = {"effects": [effect], "verdict": "named", **empty}
         return SimpleNamespace(plain=lambda: report)
 
     monkeypatch.setattr(nnode, "diagnose", zone)
@@ -49,6 +50,7 @@ def test_rows_are_scored_and_kept(
     assert rows["speed_zone"].tolist()[1:] == [0.88]
     assert rows["speed_zone covered"].tolist()[1:] == [covered]
     assert rows["v0 covered"].isna().all()
+    assert not rows["law_at_bounds"].any()
     assert run(monkeypatch, tmp_path / "nothing.csv", "--nothing", *size)["effect"].tolist() == [
         "none",
         "none",
