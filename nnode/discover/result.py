@@ -394,9 +394,8 @@ class Diagnosis:
     split: dict[str, list[str]]  # names of exploration and confirmation sequences
     notes: list[str]
     seconds: dict[str, float]
-    confirmation_errors: list[dict[str, Any]] = field(
-        default_factory=list
-    )  # name, before, after of each
+    # name, before, after of each confirmation sequence
+    confirmation_errors: list[dict[str, Any]] = field(default_factory=list)
     not_offered: dict[str, str] = field(default_factory=dict)  # effect to why it does not apply
     law_at_bounds: list[str] = field(default_factory=list)  # parameters that show the law is wrong
     laws: Laws | None = None  # the comparison of base laws

@@ -217,16 +217,15 @@ class FollowersEngine(TrafficEngine):
         if len(probes) > at_once:
             parts = [probes[i : i + at_once] for i in range(0, len(probes), at_once)]
             return torch.cat([self.screen_columns(system, row, effect, *part) for part in parts])
+        simulated: list[tuple[System, float]] = []
         if effect.remembers():
-            for probe in probes:
-                changed, amount = with_all_strengths(run.system, effect, probe)
-                changes.append(self._displacement(run, changed) / amount)
-            return self._residual_changes(run, np.stack(changes, 2))
-        if effect.covariate is not None:
+            simulated = [with_all_strengths(run.system, effect, probe) for probe in probes]
+        elif effect.covariate is not None:
             for probe in probes:
                 small = replace(probe, steps={name: SMALL * x for name, x in probe.steps.items()})
-                for changed, size in with_each_strength(run.system, effect, small):
-                    changes.append(self._displacement(run, changed) / size)
+                simulated += with_each_strength(run.system, effect, small)
+        if simulated:
+            changes = [self._displacement(run, changed) / size for changed, size in simulated]
             return self._residual_changes(run, np.stack(changes, 2))
         for probe in probes:
             for changed, size in with_each_strength(run.system, effect, probe):

@@ -20,7 +20,7 @@ from nnode.data.clusters import group_sums
 from nnode.discover.lanes.followers import FollowersEngine
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit, evaluated
-from nnode.discover.statistics.leverage import orthonormal
+from nnode.discover.statistics.leverage import orthonormal, without_span
 from nnode.errors import SimulationError
 from nnode.model.extend import effects_of, place_of
 
@@ -58,9 +58,7 @@ def mean_scores(
     parts = []
     for engine, fit in simulated:
         basis, effect_columns = orthonormal(fit.jacobian), columns(engine, fit)
-        parts.append(
-            group_sums(effect_columns - basis @ (basis.T @ effect_columns), label, fit.residual)
-        )
+        parts.append(group_sums(without_span(effect_columns, basis), label, fit.residual))
     return np.asarray(np.mean(parts, 0)) if parts else 0.0
 
 

@@ -15,7 +15,7 @@ from nnode.calibrate.intervals import at_bounds
 from nnode.data.clusters import better, group_sums
 from nnode.discover import thresholds
 from nnode.discover.residuals.fit import Fit
-from nnode.discover.statistics.leverage import leverage_adjusted, orthonormal
+from nnode.discover.statistics.leverage import leverage_adjusted, orthonormal, without_span
 from nnode.model.system import System
 from nnode.model.term import physical_bounds
 
@@ -51,9 +51,10 @@ def _at_bounds(system: System) -> set[str]:
 
 
 def required_beyond_bounds(fit: Fit, cluster: np.ndarray) -> set[str]:
-    """Names of the law's parameters at bounds with a significant score toward values beyond: one-
-    sided p-values by sign flips of clusters, multiplied by the number of these parameters, are at
-    most :data:`~nnode.discover.thresholds.STRICT`.
+    """Names of the law's parameters at bounds with a significant score toward values beyond.
+
+    The one-sided p-value by sign flips of clusters, multiplied by the number of these parameters,
+    is at most :data:`~nnode.discover.thresholds.STRICT`.
 
     Args:
         fit: a calibrated model, whose first term is the law.
@@ -71,7 +72,7 @@ def required_beyond_bounds(fit: Fit, cluster: np.ndarray) -> set[str]:
     columns = fit.jacobian[:, held]
     # the cost falls against the gradient
     outward = np.sign(columns.T @ fit.residual)
-    columns = outward * (columns - basis @ (basis.T @ columns))
+    columns = outward * without_span(columns, basis)
     scores = group_sums(columns * residual[:, None], cluster)
     law = fit.system.term_list[0].name
     return {

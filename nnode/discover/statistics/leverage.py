@@ -34,3 +34,9 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
     vectors, values, _ = np.linalg.svd(columns, full_matrices=False)
     kept: np.ndarray = vectors[:, values > 1e-8 * values[0]]
     return kept
+
+
+def without_span(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """``(n, k)`` columns, projected orthogonally to an orthonormal basis ``(n, F)``."""
+    remaining: np.ndarray = columns - basis @ (basis.T @ columns)
+    return remaining

@@ -32,7 +32,7 @@ from nnode.discover import thresholds
 from nnode.discover.residuals.engine import Engine
 from nnode.discover.residuals.fit import Fit
 from nnode.discover.residuals.fit import grams as grams_of
-from nnode.discover.statistics.leverage import leverage_adjusted, orthonormal
+from nnode.discover.statistics.leverage import leverage_adjusted, orthonormal, without_span
 from nnode.discover.statistics.standard import cluster_variance_of, joint, standardised
 from nnode.model.effects import Effect, Probe
 
@@ -194,8 +194,7 @@ class Screen:
     def adjusted(self, columns: np.ndarray) -> np.ndarray:
         """``columns`` projected orthogonally to the tangents of all of the model's parameters, also
         those at a bound."""
-        adjusted: np.ndarray = columns - self._basis @ (self._basis.T @ columns)
-        return adjusted
+        return without_span(columns, self._basis)
 
     def parts(self, z: np.ndarray, label: np.ndarray) -> np.ndarray:
         """``(G, k)`` scores of directions that are orthogonal to the model's tangents.
