@@ -192,9 +192,9 @@ def fit_drivers(
     names = [] if drivers in ("auto", "none") else full_names(drivers, plain.may_differ)
     alike = _with_lasting_errors(_most_likely(plain, starts))
     if drivers == "auto":
-        population = _with_random_effects(alike)
+        population = with_random_effects(alike)
         better = _with_lasting_errors(population)
-        population = population if better is population else _with_random_effects(better)
+        population = population if better is population else with_random_effects(better)
     else:
         population = _with_lasting_errors(_with_named_effects(alike, names)) if names else alike
     return bias_corrected(population, seed, pairs) if pairs else population
@@ -277,7 +277,7 @@ def refit(before: Population, system: System, paths: Paths, *, fixed: bool) -> P
     """Calibrate another model of the same law, starting from an earlier estimate.
 
     Args:
-        before: where the search starts; further random effects may be selected.
+        before: where the search starts; its random effects are kept.
         system, paths: the model and the followers.
         fixed: only estimate deviations, with the system's parameters and the earlier variances.
     """
@@ -287,7 +287,7 @@ def refit(before: Population, system: System, paths: Paths, *, fixed: bool) -> P
     same_followers &= previous.start.shape == (len(paths.agent), model.starts)
     modes = (previous.agents, previous.start) if same_followers else (None, None)
     if not fixed:
-        return _with_random_effects(_estimated(model, model.start, variances, *modes))
+        return _estimated(model, model.start, variances, *modes)
     agents, start = modes
     deviations = fit_deviations(
         model, PushNoise(), model.start, variances, agents=agents, start=start
@@ -455,7 +455,7 @@ def _with_lasting_errors(best: Population) -> Population:
     return estimated if estimated.marginal.loglik > limit else best
 
 
-def _with_random_effects(best: Population) -> Population:
+def with_random_effects(best: Population) -> Population:
     """Forward selection of random effects, then backward elimination.
 
     Random effects are added while twice the log marginal likelihood rises by more than the

@@ -147,8 +147,9 @@ def estimate(
         longest: largest step of a parameter, in its own unit.
         steps: largest number of steps; halving one takes further linearisations.
         tolerance: the search ends when a step moves no parameter by more than this share of its
-            standard error, no standard deviation by more than this share of itself, and no agent's
-            deviation by more than this share of their standard deviation.
+            standard error, no standard deviation by more than this share of itself, and the agents'
+            deviations, root mean square, by no more than this share of their standard deviation.
+            Single agents may cycle around kinks of the model without effect on the other estimates.
         agents, start: ``(D, Q)``, ``(S, H)`` deviations that the search starts from; by default 0.
 
     Raises:
@@ -390,7 +391,7 @@ def _largest_change(
     changes = (
         np.abs(current.change) * scale,
         np.abs(np.log(variances.row / before.row)),
-        np.abs(current.deviations - agents) / variances.spread,
+        np.sqrt(np.mean((current.deviations - agents) ** 2, 0)) / variances.spread,
     )
     return max(float(np.max(values, initial=0.0)) for values in changes)
 

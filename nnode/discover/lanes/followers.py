@@ -49,6 +49,7 @@ from nnode.population.drivers import (
     fit_drivers,
     initial_variances,
     refit,
+    with_random_effects,
     with_smaller_errors,
 )
 from nnode.population.estimate import fit_deviations
@@ -262,27 +263,28 @@ class FollowersEngine(TrafficEngine):
         return engine
 
     def fit_whitening(self, system: System, row: Tensor) -> None:
-        """Estimate drivers, starts, pushes and their variances, with the model's parameters."""
-        if self._like is not None and self._like.population is not None:
-            fixed = self._like.population.system
-        else:
-            fixed = with_parameters(system, row)
-        row = ParameterVector(fixed).row
-        paths, previous = self._paths_for(fixed, row), self.population
-        start = previous
-        if start is None and self._like is not None:
-            start = self._like.population
-        if start is None:
-            self._set_population(fit_drivers(fixed, paths, pairs=0))
-        else:
-            self._set_population(refit(start, fixed, paths, fixed=self._like is not None))
+        """Estimate drivers, starts, pushes and their variances, with the model's parameters, and
+        select which parameters differ between drivers."""
+        first = self.population is None
+        self._set_population(self.population_of(with_parameters(system, row)))
+        if not first and self._like is None:
+            self.select_random_effects()
 
     def population_of(self, system: System) -> Population:
-        """The estimate with a model; the engine keeps its own."""
-        trial = copy.copy(self)
-        trial.fit_whitening(system, ParameterVector(system).row)
-        assert trial.population is not None
-        return trial.population
+        """The estimate with a model; the engine keeps its own. The same parameters differ between
+        drivers as in the engine's estimate; if it has none, they are selected."""
+        like = None if self._like is None else self._like.population
+        fixed = system if like is None else like.system
+        paths = self._paths_for(fixed, ParameterVector(fixed).row)
+        start = like if self.population is None else self.population
+        if start is None:
+            return fit_drivers(fixed, paths, pairs=0)
+        return refit(start, fixed, paths, fixed=self._like is not None)
+
+    def select_random_effects(self) -> None:
+        """Select which parameters differ between drivers, from those of the last estimate."""
+        assert self.population is not None
+        self._set_population(with_random_effects(self.population))
 
     def drivers(self, seed: int) -> Population:
         """The last estimate, corrected for its bias; where errors of positions are smaller than

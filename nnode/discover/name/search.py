@@ -353,6 +353,7 @@ def _with_refitted_variances(
             populations[candidate.name] = engine.population_of(candidate.fit.system)
     if populations:
         engine.set_likeliest(populations.values())
+        engine.select_random_effects()
     selection.fit = refine(engine, selection.fit.system)
     refitted = []
     for candidate in candidates:
