@@ -16,12 +16,20 @@ import pandas as pd
 import torch
 from scipy.special import stdtrit
 
-from nnode.app.drivers import AUTO, EXACT, NONE, Drivers, calibrated_drivers
+from nnode.app.drivers import (
+    ALONE,
+    AUTO,
+    EXACT,
+    NONE,
+    Drivers,
+    calibrated_drivers,
+    separate_parameters,
+)
 from nnode.app.training import batches, positions
 from nnode.calibrate.checkpoint import Checkpoint, copied, save_checkpoint
 from nnode.calibrate.evaluate import Metrics, evaluate, sensitivity
 from nnode.calibrate.optimizers.gauss_newton import GaussNewton
-from nnode.calibrate.options import Pooling, StartSpeeds
+from nnode.calibrate.options import StartSpeeds
 from nnode.calibrate.trainer import Trainer
 from nnode.data.clusters import clusters
 from nnode.data.dataset import SequenceDataset, SmoothSpeeds, Source, noise_of
@@ -40,7 +48,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
-    from nnode.calibrate.pooling import SequenceParameters
 
 log = logging.getLogger(__name__)
 
@@ -140,11 +147,10 @@ class Calibration:
         epoch: epoch of the best evaluation.
         n_iter: number of epochs.
         history: one row per evaluation: epoch, costs, parameters.
-        own: separate parameters of each training sequence for ``trainer.pooling``: a row per
-            sequence with ``cost_pool`` (with pooled parameters) and ``cost``; None for pooled
-            parameters only. ``parameters`` and ``cost_heldout`` are the pooled ones.
-        pooling: the kind of separate parameters, and costs of second halves, which were not used
-            for their calibration.
+        separate: for ``trainer.drivers=alone`` a row per training sequence with ``cluster``,
+            ``cost_pooled`` (with the pooled parameters), ``cost``, the parameters, and the names of
+            those ``at_bound``; otherwise None. ``parameters`` and ``cost_heldout`` are those of the
+            pooled calibration.
         drivers: results for drivers who differ. ``drivers.variability`` has standard deviations of
             parameters between drivers (%, of logarithms), of disturbances (m/s or m/s²) and of
             measurement errors (m), and the correlation time of disturbances (s), with intervals of
@@ -178,8 +184,7 @@ class Calibration:
     epoch: int
     n_iter: int
     history: pd.DataFrame
-    own: pd.DataFrame | None
-    pooling: dict[str, Any]
+    separate: pd.DataFrame | None
     drivers: Drivers | None
     start_speeds: dict[str, Any]
     noise: Noise
@@ -292,13 +297,10 @@ class Calibration:
                 f"first speeds of training sequences are fitted: {speeds['change']:.3g} "
                 f"m/s (root mean square) from those of {whose}, which held-out sequences start with"
             )
-        if self.pooling:
+        if self.separate is not None:
             lines.append(
-                f"with parameters of each sequence's own ({self.pooling['kind']}): "
-                f"{self.pooling['cost']:.4g} {unit} where they were calibrated; on second halves, "
-                "calibrated on the first: "
-                + ", ".join(f"{k} {v:.4g}" for k, v in self.pooling["second_half"].items())
-                + f" {unit}; another sequence gets the pool's parameters"
+                f"each training sequence calibrated separately: {self.separate['cost'].mean():.4g} "
+                f"{unit} on the same sequences; other sequences have the pooled parameters"
             )
         if self.drivers is not None:
             lines += self.drivers.summary()
@@ -478,8 +480,8 @@ class Calibration:
                 for name, row in _rows(self.correlation).items()
             }
             content["clusters"] = self.clusters
-        if self.own is not None:
-            content["pooling"] = {**self.pooling, "sequences": self.own.to_dict("records")}
+        if self.separate is not None:
+            content["separate"] = self.separate.to_dict("records")
         if self.drivers is not None:
             content["drivers"] = self.drivers.plain()
         content["start_speeds"] = self.start_speeds
@@ -569,8 +571,7 @@ def calibrated(trainer: Trainer, store: Source, seconds: float) -> Calibration:
         epoch=trainer.best_epoch,
         n_iter=trainer.epoch,
         history=pd.DataFrame(history),
-        own=None if separate is None else separate.table,
-        pooling=separate.facts if separate else {},
+        separate=separate,
         drivers=drivers,
         start_speeds=speeds,
         noise=noise_of(store),
@@ -609,7 +610,7 @@ def _drivers(trainer: Trainer, store: Source) -> Drivers | None:
     Searches start at the last and at the first state of the training.
     """
     drivers = trainer.options.drivers
-    if drivers == NONE:
+    if drivers in (NONE, ALONE):
         return None
     if (
         drivers in (None, AUTO)
@@ -676,7 +677,7 @@ def _status(trainer: Trainer, model: System, store: Source) -> str:
 
 def _by_tangents(
     trainer: Trainer, model: System, store: Source
-) -> tuple[dict[str, Any], SequenceParameters | None, dict[str, Any]]:
+) -> tuple[dict[str, Any], pd.DataFrame | None, dict[str, Any]]:
     """Intervals of the best parameters, separate parameters of sequences and first speeds, as far
     as they are requested. They need the Gauss-Newton optimiser."""
     config, options = trainer.provenance.config, trainer.options
@@ -688,7 +689,6 @@ def _by_tangents(
         return {}, None, speeds
     # compiled code takes a second to import
     from nnode.calibrate.intervals import intervals
-    from nnode.calibrate.pooling import sequence_parameters
     from nnode.calibrate.problem import ResidualProblem
     from nnode.simulation.fused import FusedSolver
 
@@ -713,9 +713,9 @@ def _by_tangents(
         )
         change = float(np.sqrt(np.mean(change_of_speeds**2)))
         speeds |= {"kind": options.start_speeds.value, "change": change, "sequences": by_name}
-    if options.pooling is not Pooling.pooled:
-        chosen = [store[i] for i in indices]
-        separate = sequence_parameters(options.pooling, double, chosen, make, int(config["seed"]))
+    if options.drivers == ALONE:
+        sequences = [store[i] for i in indices]
+        separate = separate_parameters(problem, sequences, int(config["seed"]))
     return estimated, separate, speeds
 
 

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pandas as pd
 
-from nnode.calibrate.options import Pooling, TrainerOptions
+from nnode.calibrate.options import TrainerOptions
 from nnode.calibrate.parameters import ParameterVector
+from nnode.data.clusters import clusters, index_of
 from nnode.data.sequence import Sequence, evenly
 from nnode.errors import CheckpointError, ConfigError, unknown_value
 from nnode.model import System
@@ -22,14 +23,17 @@ from nnode.model.term import short_names
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from nnode.calibrate.problem import ResidualProblem
     from nnode.population.drivers import Population
 
 log = logging.getLogger(__name__)
 
-AUTO, NONE = "auto", "none"
+ALONE, AUTO, NONE = "alone", "auto", "none"
 #: Root mean square error (m) of pooled parameters below which paths are explained exactly, as by a
 #: model's own simulation.
 EXACT = 0.01
+#: Number of starts of each sequence's separate calibration; the first is the pooled parameters.
+STARTS = 4
 #: Distance of start values from the bounds, as a share of the admissible interval.
 INSIDE = 0.01
 
@@ -37,7 +41,8 @@ INSIDE = 0.01
 def planned(
     options: TrainerOptions, model: System, sequences: Callable[[], list[Sequence]], exact: bool
 ) -> str | list[str] | None:
-    """The treatment of differences between drivers: ``auto``, ``none``, or names of parameters.
+    """The treatment of differences between drivers: ``auto``, ``none``, ``alone``, or names of
+    parameters.
 
     None is ``auto`` with a fallback: all drivers share their parameters if the estimation fails.
 
@@ -53,26 +58,24 @@ def planned(
     given = options.drivers
     if given == NONE:
         return NONE
-    from nnode.population.drivers import full_names, obstacle  # compiled code takes a second
+    # compiled code takes a second
+    from nnode.population.drivers import full_names, no_drivers, obstacle
     from nnode.population.followers import drivers_differ
 
     if given is None:
-        if not exact or model.order == 1 or options.pooling is not Pooling.pooled:
+        if not exact or model.order == 1:
             return NONE
         training = sequences()
         possible = obstacle(model, training) is None and drivers_differ(model, training)
         return None if possible else NONE
-    asked = f"trainer.drivers={given if given == AUTO else '[' + ', '.join(given) + ']'}"
-    if options.pooling is not Pooling.pooled:
-        raise ConfigError(
-            f"{asked} and trainer.pooling={options.pooling.value} both give drivers parameters of "
-            "their own; choose one of them"
-        )
-    reason = obstacle(model, sequences())
+    asked = f"trainer.drivers={given if isinstance(given, str) else '[' + ', '.join(given) + ']'}"
+    reason = no_drivers(model) if given == ALONE else obstacle(model, sequences())
     if reason is not None:
         raise ConfigError(f"{asked} has no place here: {reason}; take trainer.drivers=none")
-    if given == AUTO:
-        return AUTO
+    if given == ALONE and not exact:
+        raise ConfigError(f"{asked} needs optimizer=gauss_newton")
+    if given in (ALONE, AUTO):
+        return str(given)
     full_names(given, law_parameters(model))
     return list(given)
 
@@ -90,11 +93,41 @@ def check_drivers(given: Any) -> None:
         ConfigError: another value.
     """
     listed = isinstance(given, ListLike) and not isinstance(given, str) and len(given) > 0
-    if given not in (None, AUTO, NONE) and not (
+    if given not in (None, ALONE, AUTO, NONE) and not (
         listed and all(isinstance(name, str) for name in given)
     ):
         hint = ", or a list of parameters of the law such as [T, v0]"
-        raise unknown_value("trainer.drivers", given, (AUTO, NONE), hint)
+        raise unknown_value("trainer.drivers", given, (AUTO, NONE, ALONE), hint)
+
+
+def separate_parameters(
+    problem: ResidualProblem, sequences: list[Sequence], seed: int
+) -> pd.DataFrame:
+    """The parameters of every sequence, calibrated separately.
+
+    Args:
+        problem: of all sequences, which starts at the pooled parameters.
+        seed: of further starts.
+
+    Returns:
+        See :attr:`nnode.app.calibration.Calibration.separate`.
+    """
+    from nnode.calibrate.intervals import at_bounds  # compiled code takes a second
+    from nnode.calibrate.problem import random_starts, separate
+
+    rows, costs = separate(problem, random_starts(problem, [problem.start] * STARTS, seed))
+    names = list(short_names(problem.names).values())
+    bounds = [at_bounds(row, problem.low, problem.high) != "" for row in rows]
+    return pd.DataFrame(
+        {
+            "sequence": [s.name for s in sequences],
+            "cluster": clusters(index_of(sequences)).astype(int),
+            "cost_pooled": problem.costs(problem.start),
+            "cost": costs,
+            **dict(zip(names, rows.T, strict=True)),
+            "at_bound": [" ".join(np.array(names)[bound]) for bound in bounds],
+        }
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

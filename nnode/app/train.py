@@ -38,12 +38,11 @@ RESUMABLE = (
     "trainer.max_epochs",
     "trainer.patience",
     "trainer.min_delta",
-    "trainer.pooling",
     "trainer.save_every",
     "trainer.figure_every",
 )
-#: Table of the separate parameters of sequences, for ``trainer.pooling``.
-SEQUENCES = "own_parameters.csv"
+#: Table of the separate parameters of sequences, for ``trainer.drivers=alone``.
+SEPARATE = "separate_parameters.csv"
 #: Table of drivers, for ``trainer.drivers``.
 DRIVERS = "drivers.csv"
 SECTIONS = ("model", "data", "optimizer", "solver", "trainer", "seed")
@@ -107,8 +106,8 @@ def train(config: DictConfig, folder: Path) -> None:
     if result.drivers is not None:
         save_checkpoint(result.checkpoint, trainer.best_path)
         paths["drivers"] = write_csv(folder / DRIVERS, result.drivers.table)
-    if result.own is not None:
-        paths["own parameters"] = write_csv(folder / SEQUENCES, result.own)
+    if result.separate is not None:
+        paths["separate parameters"] = write_csv(folder / SEPARATE, result.separate)
     write_json(folder / RESULT, result.plain({name: str(path) for name, path in paths.items()}))
     print(result.summary())
     for what, path in paths.items():

@@ -14,14 +14,13 @@ from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader
 
 from nnode.app.cli.saved import options_of
-from nnode.app.drivers import NONE, check_drivers, planned
+from nnode.app.drivers import ALONE, NONE, check_drivers, planned
 from nnode.calibrate.checkpoint import Checkpoint
 from nnode.calibrate.distributed import World
 from nnode.calibrate.evaluate import best_common_speed
 from nnode.calibrate.optimizers import build_optimizer, needs_full_batch
 from nnode.calibrate.options import (
     FusedOptions,
-    Pooling,
     SolverOptions,
     StartSpeeds,
     TorchdiffeqOptions,
@@ -179,7 +178,6 @@ def trainer_of(
     optimizer_options: Any = options_of(config.optimizer)
     if needs_full_batch(optimizer_options.name):
         data.loader.batch_size = 0
-    _check_pooling(options.pooling, model, optimizer_options.name)
     if checkpoint is not None and source_hashes(store.manifest) != source_hashes(
         checkpoint.manifest
     ):
@@ -194,7 +192,7 @@ def trainer_of(
     if options.start_speeds is StartSpeeds.auto:
         source = sound_speeds(store, model.domain, model.order)
         # calibrations to drivers who differ fit start speeds themselves
-        fits = exact and options.drivers == NONE and isinstance(source, SmoothSpeeds)
+        fits = exact and options.drivers in (NONE, ALONE) and isinstance(source, SmoothSpeeds)
         options.start_speeds = StartSpeeds.fitted if fits else StartSpeeds.given
     if options.start_speeds is StartSpeeds.fitted and not exact:
         raise ConfigError(
@@ -282,27 +280,3 @@ def _parts(store: Source, data: DataOptions, checkpoint: Checkpoint | None) -> S
         return split(store.index, data.split)
     parts = {part: sorted(positions(store, saved.get(part, []))) for part in PARTS}
     return Split(**parts, mode="checkpoint", note="as it was")
-
-
-def _check_pooling(kind: Pooling, model: System, optimizer: str) -> None:
-    """Refuse separate parameters of sequences where they are not available.
-
-    Raises:
-        ConfigError: a crowd model, another optimiser, or a network.
-    """
-    if kind is Pooling.pooled:
-        return
-    asked = f"trainer.pooling={kind.value}"
-    if model.domain != "traffic":
-        raise ConfigError(
-            f"{asked} is one of laws of lanes, and {model.domain} models have parameters that all "
-            "share: everybody in a sequence meets everybody; take trainer.pooling=pooled"
-        )
-    if optimizer != "gauss_newton":
-        raise ConfigError(f"{asked} needs optimizer=gauss_newton, found optimizer={optimizer}")
-    physical = sum(value.numel() for value, _ in model.physical().values())
-    if sum(p.numel() for p in model.parameters() if p.requires_grad) > physical:
-        raise ConfigError(
-            f"{asked} has no place in a network: one sequence does not determine its weights; "
-            "take a law such as idm without model.network, or trainer.pooling=pooled"
-        )

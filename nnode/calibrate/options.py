@@ -40,19 +40,6 @@ class Monitor(str, Enum):
     heldout = "heldout"
 
 
-class Pooling(str, Enum):
-    """Whether all sequences share their parameters, see :mod:`nnode.calibrate.pooling`.
-
-    ``pooled``: all sequences share them. ``alone``: each sequence has separate parameters.
-    ``shrunk``: each sequence has separate parameters, which are shrunk towards the pooled ones
-    with the strength that predicts best.
-    """
-
-    pooled = "pooled"
-    alone = "alone"
-    shrunk = "shrunk"
-
-
 class StartSpeeds(str, Enum):
     """First speeds of training sequences: from the data, or fitted with the parameters.
 
@@ -111,10 +98,10 @@ class TrainerOptions:
     patience: int | None = None
     min_delta: float = 0.0  # smallest decrease of the cost that counts as progress
     cost: Convention = Convention.integral
-    pooling: Pooling = Pooling.pooled  # shared by all sequences, or separate for each
-    # none | auto | [T, v0]: parameters that differ between drivers, see nnode.population; auto:
-    # those whose variance the data determine; null: auto for laws of second order with
-    # optimizer=gauss_newton unless positions were smoothed or have large errors, otherwise none
+    # none | auto | [T, v0] | alone: parameters that differ between drivers, see nnode.population;
+    # auto: those whose variance the data determine; alone: a separate calibration of each sequence;
+    # null: auto for laws of second order with optimizer=gauss_newton unless positions were smoothed
+    # or have large errors, otherwise none
     drivers: Any = None
     # first speeds of training sequences: given by the data, or fitted; auto: depending on the noise
     # of the measurement

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -39,6 +39,8 @@ _CENTRAL = float(np.finfo(np.float64).eps) ** (1 / 3), 0.01
 _FORWARD = {torch.float32: (1e-3, 0.1), torch.float64: (1e-6, 0.1)}
 #: For first speeds: difference, m/s; largest number of steps of a fit; its tolerance.
 _SPEED, _TURNS, _SETTLED = 1e-5, 10, 1e-12
+#: Range of the random factors on start values of bounded parameters.
+FACTORS = (0.5, 2.0)
 #: Numbers of samples of the first horizons, and the largest number of steps at each horizon.
 _HORIZONS, _SHORT = tuple(4 * 2**k for k in range(30)), 8
 
@@ -393,19 +395,42 @@ def pooled(
     return replace(minimum, row=minimum.row[0], cost=minimum.cost[0])
 
 
-def alone(problem: ResidualProblem, start: np.ndarray | None = None, **options: Any) -> Minimum:
-    """The parameters ``(B, P)`` that minimise the cost of every sequence separately.
+def random_starts(problem: ResidualProblem, rows: Iterable[np.ndarray], seed: int) -> np.ndarray:
+    """``(R, P)`` starts: the first row, then rows with random factors on bounded parameters."""
+    rng, (shrink, stretch) = np.random.default_rng(seed), np.log(FACTORS)
+    limited = np.isfinite(problem.low) & np.isfinite(problem.high)
+    starts = []
+    for i, row in enumerate(rows):
+        if i:
+            factor = np.exp(rng.uniform(shrink, stretch, len(row)))
+            row = np.where(limited, row * factor, row)
+        starts.append(np.clip(row, problem.low, problem.high))
+    return np.stack(starts)
+
+
+def separate(
+    problem: ResidualProblem, starts: Iterable[np.ndarray], **options: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """The parameters ``(B, P)`` that minimise the cost of every sequence separately, the best of
+    several starts.
 
     Args:
-        start: ``(P,)`` or ``(B, P)``.
+        starts: ``(P,)`` or ``(B, P)`` each.
         options: options of :func:`~nnode.calibrate.least_squares.least_squares`.
+
+    Returns:
+        The parameters, and the costs ``(B,)`` with the penalty.
     """
-    begin = problem.start if start is None else start
-    return least_squares(
-        problem,
-        lambda trials: np.stack([problem.costs(rows) for rows in trials]),
-        np.broadcast_to(begin, (len(problem.batch), len(problem.names))),
-        problem.low,
-        problem.high,
-        **{"tolerance": 1e-8, **options},
-    )
+    fits = [
+        least_squares(
+            problem,
+            lambda trials: np.stack([problem.costs(rows) for rows in trials]),
+            np.broadcast_to(start, (len(problem.batch), len(problem.names))),
+            problem.low,
+            problem.high,
+            **{"tolerance": 1e-8, **options},
+        )
+        for start in starts
+    ]
+    costs, rows = np.array([fit.cost for fit in fits]), np.array([fit.row for fit in fits])
+    return rows[costs.argmin(0), np.arange(costs.shape[1])], costs.min(0)

@@ -247,17 +247,25 @@ def fit_all_random(starts: Iterable[tuple[System, Paths]]) -> Population:
     return _continued(max(quick, key=lambda fit: fit.marginal.loglik), RANKING_STEPS)
 
 
+def no_drivers(system: System) -> str | None:
+    """Why the parameters of a model are not those of single drivers; None if they are."""
+    physical = sum(value.numel() for value, _ in system.physical().values())
+    if system.domain != "traffic":
+        return "people meet everybody in their sequence, and only cars follow measured leaders"
+    if sum(p.numel() for p in system.parameters() if p.requires_grad) > physical:
+        return "the model contains a network, whose weights are no quantities of a driver"
+    return None
+
+
 def obstacle(system: System, sequences: list[Sequence], needed: int = LEAST_DRIVERS) -> str | None:
     """Why drivers who differ cannot be estimated for a model or its data; None if they can.
 
     Args:
         needed: number of followers.
     """
-    physical = sum(value.numel() for value, _ in system.physical().values())
-    if system.domain != "traffic":
-        return "people meet everybody in their sequence, and only cars follow measured leaders"
-    if sum(p.numel() for p in system.parameters() if p.requires_grad) > physical:
-        return "the model contains a network, whose weights are no quantities of a driver"
+    reason = no_drivers(system)
+    if reason is not None:
+        return reason
     lane = formula_of(system)
     if lane is None:
         return "the model is no formula of a lane"

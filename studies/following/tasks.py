@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import t
 
-from nnode.calibrate import pooling
 from nnode.calibrate.cost import Convention
 from nnode.calibrate.intervals import at_bounds, influence
 from nnode.calibrate.parameters import ParameterVector
-from nnode.calibrate.pooling import best_alone, random_starts
-from nnode.calibrate.problem import ResidualProblem, pooled
+from nnode.calibrate.problem import ResidualProblem, pooled, random_starts, separate
 from nnode.calibrate.resampling import paired
 from nnode.data.clusters import folds as by_cluster
 from nnode.data.sequence import Batch, Sequence, collate
@@ -27,6 +25,7 @@ from nnode.model.system import System
 from nnode.simulation.fused import FusedSolver
 from studies.following import data, printed
 from studies.following.data import gap_of
+from studies.following.halves import calibrated_halves
 from studies.stores import sequences
 
 #: Cost of a network's weight of 1, m: networks of so few pairs are kept flat.
@@ -256,7 +255,7 @@ def floor(folder: str, name: str, restarts: int, seed: int) -> Result:
     candidate = EVERY[name]
     cost = costs_of(candidate, data.batch(folder))
     centre = calibrated(candidate, cost, 1, seed)
-    rows, costs = best_alone(cost, (centre, *starts(candidate, cost, restarts, seed)))
+    rows, costs = separate(cost, (centre, *starts(candidate, cost, restarts, seed)))
     return {"costs": costs, "limits": [at_limits(cost, row) for row in rows]}
 
 
@@ -361,7 +360,7 @@ def halves(
     label = data.labels(pairs)
     fold = by_cluster(label, folds, seed)
     others = starts(EVERY[name], first, restarts, seed)
-    results = pooling.halves(first, second, np.array(row), others, fold)
+    results = calibrated_halves(first, second, np.array(row), others, fold)
     return {"names": list(named(first, results.centre)), **vars(results), "clusters": label}
 
 
@@ -442,7 +441,7 @@ def separate_rows(
     law = candidate(name)
     cost = costs_of(law, batch)
     begin = starts(law, cost, restarts, seed)
-    rows, _ = best_alone(cost, begin, steps=STEPS, tolerance=TOLERANCE, penalty=decay(cost))
+    rows, _ = separate(cost, begin, steps=STEPS, tolerance=TOLERANCE, penalty=decay(cost))
     return cost, rows
 
 

@@ -15,7 +15,7 @@ import pytest
 import nnode
 from nnode.app.drivers import planned
 from nnode.app.python.inputs import model_options
-from nnode.calibrate.options import Pooling, TrainerOptions
+from nnode.calibrate.options import TrainerOptions
 from nnode.errors import ConfigError
 from nnode.model import build_model
 from nnode.population import drivers as population
@@ -132,7 +132,7 @@ def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model
         ("idm", False, {}, None),
         ("lin", True, {}, "none"),
         ("a2", True, {}, "none"),
-        ("idm", True, {"pooling": Pooling.alone}, "none"),
+        ("idm", True, {"drivers": "alone"}, "alone"),
         ("idm", True, {"drivers": "none"}, "none"),
         ("idm", False, {"drivers": "auto"}, "auto"),
         ("lin", True, {"drivers": ["v0"]}, ["v0"]),
@@ -144,6 +144,8 @@ def test_drivers_differ_by_default_in_laws_of_second_order(
     given = list(nnode.sequences(small if noise else pairs(number=6, seconds=20.0)))
     system = build_model(model_options(model, "measured"), 0)
     for exact in (True, False):
+        if plan == "alone" and not exact:
+            continue  # refused, see below
         result = planned(TrainerOptions(**options), system, lambda: given, exact)
         assert result == (plan if exact or options.get("drivers") else "none")
 
@@ -172,11 +174,15 @@ def test_a_short_delay_is_simulated_in_short_steps(small: pd.DataFrame) -> None:
     ("options", "words"),
     [
         ({"drivers": ["foo"]}, r"drivers=foo is no parameter .* v0, T, s0, a, b"),
-        ({"drivers": "some"}, r"drivers=some is unknown, expected one of auto, none, or a list"),
+        (
+            {"drivers": "some"},
+            r"drivers=some is unknown, expected one of auto, none, alone, or",
+        ),
         ({"drivers": []}, r"drivers=\[\] is unknown"),
-        ({"drivers": "auto", "pooling": "alone"}, r"choose one of them"),
         ({"drivers": "auto", "model": "krauss"}, r"map from step to step; take .*drivers=none"),
         ({"drivers": ["v0"], "model": "n2"}, r"a network, whose weights"),
+        ({"drivers": "alone", "model": "a2"}, r"a network, whose weights"),
+        ({"drivers": "alone", "optimizer": "lbfgs"}, r"alone needs optimizer=gauss_newton"),
     ],
 )
 def test_what_has_no_place_is_refused(

@@ -9,7 +9,7 @@ import torch
 from nnode.calibrate.cost import FOLLOWING, Convention, sequence_costs
 from nnode.calibrate.intervals import intervals
 from nnode.calibrate.optimizers.gauss_newton import GaussNewton
-from nnode.calibrate.problem import ResidualProblem, alone, pooled
+from nnode.calibrate.problem import ResidualProblem, pooled, separate
 from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import System, Traffic, build_model
@@ -114,9 +114,9 @@ def test_pooled_parameters_are_found_and_lie_in_their_intervals(pairs: Batch) ->
     assert sum(inside) >= 4  # five intervals of 95 %
     # weights choose sequences
     one = pooled(cost, weights=np.eye(6)[2])
-    each = alone(cost, fit.row)
-    assert one.cost == pytest.approx(each.cost[2], rel=1e-6)
-    assert (each.cost <= cost.costs(fit.row) + 1e-12).all()
+    _, costs = separate(cost, [fit.row])
+    assert one.cost == pytest.approx(costs[2], rel=1e-6)
+    assert (costs <= cost.costs(fit.row) + 1e-12).all()
 
 
 def test_parameters_at_a_bound_are_flagged(pairs: Batch) -> None:

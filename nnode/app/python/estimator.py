@@ -63,9 +63,8 @@ class Calibrator:
             between drivers; ``auto`` selects those whose variance the data determine. Laws of lanes
             are then calibrated by a mixed-effects model, see ``docs/method.md``. None is ``auto``
             for laws of second order unless positions were smoothed or have large errors, and
-            otherwise ``none``.
-        pooling: ``pooled``, ``alone`` or ``shrunk``; the last two add separate parameters of each
-            sequence in ``result_.own``; see :mod:`nnode.calibrate.pooling`.
+            otherwise ``none``. ``alone`` calibrates each sequence separately as well, see
+            ``result_.separate``.
         start_speeds: ``auto``, ``given``, or ``fitted`` for each training sequence; see
             :class:`nnode.calibrate.options.StartSpeeds`.
         optimizer: a name as in ``conf/optimizer``, or options with their ``name``. None takes
@@ -92,7 +91,6 @@ class Calibrator:
     leader: str | None = None
     cost: str = "integral"
     drivers: str | ListLike[str] | None = None
-    pooling: str = "pooled"
     start_speeds: str = "auto"
     optimizer: str | Mapping[str, Any] | None = None
     solver: str | None = None
@@ -223,7 +221,6 @@ class Calibrator:
             "figure_every": 0,
             "cost": self.cost,
             "drivers": drivers if drivers is None or isinstance(drivers, str) else list(drivers),
-            "pooling": self.pooling,
             "start_speeds": self.start_speeds,
             "device": Device.cpu,
         }

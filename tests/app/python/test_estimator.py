@@ -64,7 +64,7 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
     ("given", "options"),
     [
         ({"model": "idm"}, ["model=idm"]),
-        ({"model": "helly", "pooling": "shrunk"}, ["model=helly", "trainer.pooling=shrunk"]),
+        ({"model": "helly", "drivers": "alone"}, ["model=helly", "trainer.drivers=alone"]),
         (
             {
                 "model": "lin",
@@ -86,7 +86,7 @@ def test_known_parameters_are_found_and_lie_in_their_intervals() -> None:
             ["model=ovm", "optimizer=lbfgs", "trainer.cost=gap", "trainer.max_epochs=3"],
         ),
     ],
-    ids=["idm", "shrunk", "lin", "ovm"],
+    ids=["idm", "alone", "lin", "ovm"],
 )
 def test_the_command_finds_the_same_to_the_last_digits(
     script: Script, tmp_path: Path, tidy: pd.DataFrame, given: dict[str, Any], options: list[str]
@@ -111,10 +111,10 @@ def test_the_command_finds_the_same_to_the_last_digits(
     assert calibrator.n_iter_ == written["history"][-1]["epoch"]
     assert calibrator.result_.summary() in done.stdout
     assert "not in compiled code" not in done.stdout + done.stderr
-    own, path = calibrator.result_.own, tmp_path / "own_parameters.csv"
-    assert (own is not None) == path.exists() == ("pooling" in given)
-    if own is not None:
-        pd.testing.assert_frame_equal(own, pd.read_csv(path, keep_default_na=False))
+    separate, path = calibrator.result_.separate, tmp_path / "separate_parameters.csv"
+    assert (separate is not None) == path.exists() == ("drivers" in given)
+    if separate is not None:
+        pd.testing.assert_frame_equal(separate, pd.read_csv(path, keep_default_na=False))
 
 
 def _numbers(value: Any, name: str = "") -> dict[str, float]:

@@ -110,6 +110,20 @@ def test_numbers_of_a_pair_that_last_are_found(monkeypatch: pytest.MonkeyPatch) 
     assert np.mean(result["shrunk"]) < 0.1 * np.mean(result["pooled"])
 
 
+@pytest.mark.thorough
+def test_errors_of_measurement_are_shrunk_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drivers who do not differ: the differences between separate calibrations are errors."""
+    rng, pairs = np.random.default_rng(1), driven()
+    for pair in pairs:
+        pair.x[1:, 0] += 0.5 * rng.standard_normal((300, 1))
+    monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
+    row = [HELLY[n] for n in ("c_s", "c_v", "T", "s0")]
+    result = tasks.halves("", "helly", row, folds=2, restarts=1, seed=0)
+    alone = np.mean(result["alone"])
+    assert np.mean(result["shrunk"]) < alone
+    assert np.mean(result["pooled"]) < alone
+
+
 def test_a_profile_is_least_at_the_best_value(pairs_by_helly: list[Sequence]) -> None:
     cost = ResidualProblem(
         EVERY["helly"].system(), collate(pairs_by_helly), FusedSolver(), Convention.spacing

@@ -1,0 +1,27 @@
+"""Separate calibrations of sequences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nnode.app.drivers import separate_parameters
+from nnode.calibrate.cost import Convention
+from nnode.calibrate.problem import ResidualProblem
+from nnode.data.sequence import collate
+from nnode.simulation import FusedSolver
+from tests.calibrate.test_start_speeds import known
+from tests.studies.following.test_fit import driven
+
+TIME_GAPS = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
+
+
+@pytest.mark.thorough
+def test_the_parameters_of_every_sequence_are_estimated() -> None:
+    sequences = driven(time_gaps=TIME_GAPS)
+    problem = ResidualProblem(known(), collate(sequences), FusedSolver(), Convention.spacing)
+    table = separate_parameters(problem, sequences, seed=0)
+    assert table["T"].to_numpy() == pytest.approx(TIME_GAPS, rel=1e-3)
+    assert table["cluster"].tolist() == [0, 0, 1, 1, 2, 2]
+    assert table["cost"].mean() < 1e-3 < 0.1 < table["cost_pooled"].mean()
+    assert table["at_bound"].tolist() == [""] * 6
