@@ -210,9 +210,12 @@ class FollowersEngine(TrafficEngine):
         """``(S, n)`` derivatives of the residuals with respect to the strengths of one probe after
         the other: by linear response; of an effect with a memory, the change by it as a whole.
 
-        Effects by a property of the vehicle change the same as differences between drivers. Where
-        those are large, V^(-1/2) leaves less of this direction than the errors of the linear
-        response, which are some per mille, so that these effects are simulated."""
+        Some changes are simulated, because the linear response is not exact enough. Effects by a
+        property of the vehicle change the same as differences between drivers. Where those are
+        large, V^(-1/2) leaves less of this direction than the errors of the linear response, which
+        are some per mille. The speed of a map from step to step does not depend on a desired speed
+        above it. The linear response to a factor that brings the desired speed below it adds the
+        change of one step in every step."""
         run, changes = self._run_of(system, row), []
         at_once = max(1, NUMBERS // run.rates.size)
         if len(probes) > at_once:
@@ -225,6 +228,9 @@ class FollowersEngine(TrafficEngine):
             for probe in probes:
                 small = replace(probe, steps={name: SMALL * x for name, x in probe.steps.items()})
                 simulated += with_each_strength(run.system, effect, small)
+        elif effect.consecutive and "dt" in run.model.lane.symbols:
+            for probe in probes:
+                simulated += with_each_strength(run.system, effect, probe)
         if simulated:
             changes = [self._displacement(run, changed) / size for changed, size in simulated]
             return self._residual_changes(run, np.stack(changes, 2))

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import nnode
-from benchmarks.drivers import platoons
+from benchmarks.drivers import ZONE, platoons
 from nnode.calibrate.parameters import ParameterVector
 from nnode.discover.lanes.followers import ERROR, FollowersEngine
-from nnode.discover.residuals.fit import evaluated
+from nnode.discover.residuals.fit import evaluated, refine
 from nnode.discover.statistics.score import Screen, traces
 from nnode.model import System, Traffic, make_law
 from nnode.model.effects import Effect
@@ -22,6 +22,7 @@ from nnode.model.effects.lane import (
     ReactionDelay,
     RelativeSpeed,
     SpeedPeriod,
+    SpeedZone,
     VehicleClass,
 )
 from nnode.model.extend import extended
@@ -138,3 +139,16 @@ def test_an_effect_does_not_carry_a_parameter_beyond_its_bound() -> None:
     left = Screen(fit, engine.cluster).adjusted(trace.columns)
     # all of it would be left beside the free parameters; 4 % are errors of the linear response
     assert np.linalg.norm(left) < 0.1 * np.linalg.norm(trace.columns)
+
+
+def test_a_zone_is_located_where_a_law_does_not_reach_its_desired_speed() -> None:
+    """Speeds of a map from step to step do not depend on a desired speed that none reaches."""
+    table = platoons("idm", "speed_zone", 0.1, 79, number=8, vehicles=4)
+    engine = FollowersEngine(list(nnode.sequences(table)))
+    law = Traffic([make_law("krauss", v0=40.0)], leader="measured").double()
+    usual = engine.with_usual_variances(law)
+    fit = refine(usual, law)
+    (score,) = Screen(fit, usual.cluster).scores(traces(usual, fit, SpeedZone))
+    low, high = ZONE
+    assert low < (score.options["a"] + score.options["b"]) / 2 < high
+    assert score.options["alpha"] < 1
