@@ -300,8 +300,10 @@ def _print(outcome: DiagnosisOutcome, paths: Mapping[str, Path], seconds: float)
         print(f"  {effect.name}: {interval(effect)}")
         print(f"    {effect.formula}; {effect.where}")
         for other in effect.alternatives:
-            number = f", or about {other.clusters} exploration clusters" if other.clusters else ""
-            print(f"    not distinguishable from {other.name} without {other.separated_by}{number}")
+            needed = other.distinguishing_data
+            if other.clusters:
+                needed += f", or about {other.clusters} exploration clusters"
+            print(f"    not distinguishable from {other.name} without {needed}")
     for what, path in paths.items():
         print(f"{what}: {path}")
     print(f"time: {seconds:.1f} s")

@@ -206,7 +206,7 @@ class Judged:
 def judge(
     options: DataOptions, files: _Files, read: Reading, stages: Stages | None = None
 ) -> Judged:
-    """Look for faults and sort out what the options do not keep.
+    """Search for faults and remove what the options do not keep.
 
     Args:
         files: what was read.

@@ -45,7 +45,7 @@ class Alternative:
         loss: its held-out cost over that of the effect that was chosen.
         p_value: of the hypothesis that it is the true effect, by a J test on held-out residuals
             against the model with the chosen effect.
-        separated_by: data that would distinguish the two.
+        distinguishing_data: data that would distinguish the two.
         clusters: approximate number of similar exploration clusters that distinguishes them with a
             power of 90 %; None if no number would.
         profile: the leader's speed profile that needs the fewest platoons; in lanes only.
@@ -54,7 +54,7 @@ class Alternative:
     name: str
     loss: float
     p_value: float
-    separated_by: str = ""
+    distinguishing_data: str = ""
     clusters: int | None = None
     profile: Profile | None = None
 

@@ -72,7 +72,7 @@ class Examination(Scaled):
 
 
 def examine(path: Path, domain: Domain | None = None, rate: float | None = None) -> Examination:
-    """Look at a file of trajectories.
+    """Examine a file of trajectories.
 
     Args:
         domain: of the data; None looks for itself.

@@ -59,7 +59,7 @@ class Raw:
 
 
 def read_raw(path: Path) -> Raw:
-    """Look at a file.
+    """Examine a file.
 
     Raises:
         ConfigError: there is no such file.

@@ -60,7 +60,7 @@ def named(
                 name=rival.name,
                 loss=float(rival.losses.sum() / step.chosen.losses.sum()),
                 p_value=test.p_value,
-                separated_by=effect.distinguishing_data,
+                distinguishing_data=effect.distinguishing_data,
                 clusters=clusters_to_tell(test, apart_at(step.chosen, rival)),
                 profile=_profile(engine, fit, rival, apart_at(step.chosen, rival)),
             )

@@ -281,7 +281,7 @@ def _distinguishing_data(alternative: Alternative) -> str:
         if p
         else ""
     )
-    return "; ".join(filter(None, (alternative.separated_by, leader))) or NOTHING
+    return "; ".join(filter(None, (alternative.distinguishing_data, leader))) or NOTHING
 
 
 def gap_table(d: Diagnosis) -> TableBlock:
