@@ -281,7 +281,10 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
         return None  # the variances were already fitted with the most likely extension
     hinted = {effect.name for hint in hints for effect in effects_of(hint)}
     ranked = [s for s in scores if s.gain >= thresholds.RIVAL * scores[0].gain][:RIVALS]
-    ranked += [score for score in scores if score.effect.name in hinted and score not in ranked]
+    # the whitening removes most of a change by a property of agents, as of all that differs between
+    # agents, so that its gain is too small until the variances are refitted
+    hidden = {s.effect.name for s in scores if s.effect.covariate and s.p_value <= thresholds.EACH}
+    ranked += [s for s in scores if s.effect.name in hinted | hidden and s not in ranked]
     candidates = _ranked(engine, selection, ranked, hints, significant)
     eligible = [
         c
@@ -346,7 +349,8 @@ def _with_refitted_variances(
     """The candidates with variances refitted under the most likely of them. The variances of the
     model without a strong effect would attribute it to autocorrelated pushes."""
     assert selection.screen is not None
-    likeliest = sorted(candidates, key=lambda c: c.fit.cost)[:LIKELY]
+    by_cost = sorted(candidates, key=lambda c: c.fit.cost)
+    likeliest = by_cost[:LIKELY] + [c for c in by_cost[LIKELY:] if c.score.effect.covariate]
     populations = dict[str, Population]()
     for candidate in likeliest:
         with suppress(SimulationError):
