@@ -139,13 +139,13 @@ def diagnosed(job: Job) -> list[tuple[Job, DiagnosisOutcome]]:
         seconds += time.monotonic() - start
         return ranking, calibrated
 
-    laws, systems = compared(job.laws, []) if job.laws else (None, {})
+    laws, _ = compared(job.laws, []) if job.laws else (None, {})
     nearest = _with_law(job, _nearest(laws, job)) if laws else job
     outcome = _diagnose(nearest)
     effects, second_comparison = _added_effects(nearest, outcome), None
     calibrated_laws: dict[str, System] = {}
-    if systems and effects:
-        second_comparison, calibrated_laws = compared(systems, effects)
+    if job.laws and effects:
+        second_comparison, calibrated_laws = compared(job.laws, effects)
         best = _nearest(second_comparison, nearest)
         if best != nearest.name:
             nearest = _with_law(job, best)
@@ -158,7 +158,7 @@ def diagnosed(job: Job) -> list[tuple[Job, DiagnosisOutcome]]:
         e for e in _added_effects(*diagnoses[0]) if not e.built_into_laws and e.name not in names
     ]
     if len(diagnoses) > 1 and further:
-        last, calibrated_laws = compared(systems, effects + further)
+        last, calibrated_laws = compared(job.laws, effects + further)
         if last.p_values.get(nearest.name, 1.0) <= thresholds.LEVEL:
             second_comparison, nearest = last, _with_law(job, last.best)
             outcome = _diagnose(nearest, hint=calibrated_laws[last.best])
