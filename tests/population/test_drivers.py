@@ -95,7 +95,9 @@ def test_differences_that_are_not_needed_are_removed() -> None:
     sequences, _ = platoons(0.15, 1)
     paths = paths_of(sequences, 0.2)
     superfluous = fit_drivers(law(), paths, ["L", "v0"], pairs=0)
-    assert refit(superfluous, law(), paths, fixed=False).random == ["lin.v0"]
+    refitted = refit(superfluous, law(), paths, fixed=False)
+    assert refitted.random == ["lin.L", "lin.v0"]
+    assert with_random_effects(refitted).random == ["lin.v0"]
 
 
 @pytest.mark.parametrize(
