@@ -19,7 +19,7 @@ from nnode.model.effects import Effect
 from nnode.model.effects.lane import Inertia, ReactionDelay, SpeedZone
 from nnode.model.term import Interval
 from nnode.population import followers
-from nnode.population.drivers import Population, fit_drivers, refit
+from nnode.population.drivers import Population, fit_drivers, refit, with_random_effects
 from nnode.population.followers import longest_step, paths_of
 from nnode.population.intervals import deviation_intervals, influence
 from nnode.population.likelihood import NOISE
