@@ -28,7 +28,7 @@ from nnode.errors import SimulationError
 from nnode.model.effects import Effect
 from nnode.model.extend import effects_of, place_of, without
 from nnode.model.system import System
-from nnode.population.drivers import Population
+from nnode.population.drivers import Population, with_random_effects
 
 log = logging.getLogger(__name__)
 
@@ -214,7 +214,8 @@ def _with_likeliest_ends(engine: FollowersEngine, fit: Fit, name: str) -> Fit:
             row[k] = (low + high) / 2
             if row[index[0]] < row[index[1]]:
                 with suppress(SimulationError):
-                    populations.append(engine.population_of(with_parameters(fit.system, row)))
+                    moved = engine.population_of(with_parameters(fit.system, row))
+                    populations.append(with_random_effects(moved))
         engine.set_likeliest(populations)
         if engine.population is not populations[0]:
             fit = refine(engine, engine.population.system)
