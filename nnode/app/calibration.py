@@ -6,7 +6,7 @@ import copy
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -47,7 +47,6 @@ from nnode.simulation import Solver
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
-
 
 log = logging.getLogger(__name__)
 
@@ -693,16 +692,12 @@ def _by_tangents(
     from nnode.simulation.fused import FusedSolver
 
     assert isinstance(trainer.solver, FusedSolver)
-    make = partial(
-        ResidualProblem,
-        solver=trainer.solver,
-        convention=options.cost,
-        start_speeds=options.start_speeds,
-    )
     indices = positions(store, trainer.provenance.split["train"])
     (batch,) = batches(store, indices, 0)
     double = copy.deepcopy(model).double()
-    problem = make(double, batch)
+    problem = ResidualProblem(
+        double, batch, trainer.solver, options.cost, start_speeds=options.start_speeds
+    )
     row = problem.vector.row.numpy()
     estimated, separate = intervals(problem, row, clusters(store.index)[indices]), None
     if options.start_speeds is StartSpeeds.fitted:

@@ -63,7 +63,7 @@ from nnode.discover.statistics.simultaneous import Simultaneous, simultaneous
 from nnode.errors import SimulationError
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
 from nnode.model.system import System
-from nnode.population.drivers import EXPLAINED
+from nnode.population.drivers import EXPLAINED, likeliest
 from nnode.population.followers import drivers_differ, without_errors
 from nnode.population.intervals import variations
 from nnode.progress import Stages
@@ -436,7 +436,7 @@ def _explore(
                     populations.append(engine.population_of(extension))
                 if populations[-1].plausible:
                     break
-        engine.set_likeliest(populations)
+        engine.set_population(likeliest(populations))
         fit = best_fit(engine, [populations[0].system, initial.system])
         if fit is None:
             raise SimulationError(BLOWS_UP)

@@ -463,6 +463,12 @@ def _with_lasting_errors(best: Population) -> Population:
     return estimated if estimated.marginal.loglik > limit else best
 
 
+def likeliest(populations: Iterable[Population]) -> Population:
+    """The estimate with the best BIC. The variances of a model that lacks an effect would attribute
+    it to autocorrelated pushes, which would hide it."""
+    return max(populations, key=lambda population: population.criterion)
+
+
 def with_random_effects(best: Population) -> Population:
     """Forward selection of random effects, then backward elimination.
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from nnode.calibrate.problem import ResidualProblem, pooled, separate
 
-#: Factors on the penalty of deviations from the pooled parameters.
+#: Factors, in the unit of the cost, on squared deviations from the pooled parameters.
 STRENGTHS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 #: A parameter's standard deviation between pairs is at least this share of the pooled value.
 LEAST_SPREAD = 0.02
@@ -30,22 +30,17 @@ class Halves:
         centre: ``(P,)`` pooled parameters.
         between: ``(P,)`` standard deviation of the pairs' separate parameters.
         spread: ``(P,)`` root of the covariance between both halves.
-        scale: ``(P,)`` unit of deviations from the pooled parameters: the spread, or at least a
-            share of the centre.
         pooled, alone, shrunk: ``(B,)`` costs of second halves.
         strengths: strength of shrinkage of every fold, the best for the other folds' pairs.
-        by_strength: mean cost of second halves by strength.
     """
 
     centre: np.ndarray
     between: np.ndarray
     spread: np.ndarray
-    scale: np.ndarray
     pooled: np.ndarray
     alone: np.ndarray
     shrunk: np.ndarray
     strengths: list[float]
-    by_strength: np.ndarray
 
 
 def calibrated_halves(
@@ -54,7 +49,6 @@ def calibrated_halves(
     row: np.ndarray,
     others: Iterable[np.ndarray],
     pair_fold: np.ndarray,
-    strengths: ListLike[float] = STRENGTHS,
 ) -> Halves:
     """Pooled, separate and shrunk calibrations of first halves, evaluated on second halves.
 
@@ -62,8 +56,6 @@ def calibrated_halves(
         row: ``(P,)`` start of the pooled calibration.
         others: further starts of the separate calibrations.
         pair_fold: ``(B,)`` fold of every pair.
-        strengths: factors, in the unit of the cost, on squared deviations from the pooled
-            parameters; the first is 0.
     """
     centre = pooled(first, row).row
     begin = [centre, *others]
@@ -72,24 +64,22 @@ def calibrated_halves(
     scale = np.maximum(spread, LEAST_SPREAD * np.where(centre == 0, 1.0, np.abs(centre)))
     candidates = [
         separate(first, [centre], penalty=(centre, s / scale**2))[0] if s else apart[0]
-        for s in strengths
+        for s in STRENGTHS
     ]
     costs = np.stack([second.costs(candidate) for candidate in candidates])
     shrunk, chosen = np.zeros(len(pair_fold)), []
     for k in range(int(pair_fold.max()) + 1):
         i = int(np.argmin(costs[:, pair_fold != k].mean(1)))
         shrunk[pair_fold == k] = costs[i, pair_fold == k]
-        chosen.append(float(strengths[i]))
+        chosen.append(STRENGTHS[i])
     return Halves(
         centre=centre,
         between=np.std(apart[0], axis=0),
         spread=spread,
-        scale=scale,
         pooled=second.costs(centre),
         alone=costs[0],
         shrunk=shrunk,
         strengths=chosen,
-        by_strength=costs.mean(1),
     )
 
 

@@ -176,7 +176,7 @@ def test_a_short_delay_is_simulated_in_short_steps(small: pd.DataFrame) -> None:
         ({"drivers": ["foo"]}, r"drivers=foo is no parameter .* v0, T, s0, a, b"),
         (
             {"drivers": "some"},
-            r"drivers=some is unknown, expected one of auto, none, alone, or",
+            r"drivers=some is unknown, expected one of auto, none, alone, or a list",
         ),
         ({"drivers": []}, r"drivers=\[\] is unknown"),
         ({"drivers": "auto", "model": "krauss"}, r"map from step to step; take .*drivers=none"),
@@ -190,6 +190,13 @@ def test_what_has_no_place_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=words):
         nnode.Calibrator(**{"model": "idm", **options}).fit(small)
+
+
+def test_people_share_their_parameters() -> None:
+    rows = [(0, 0.1 * k, a, 0.1 * k + a, 1.0 * a) for k in range(4) for a in range(2)]
+    people = pd.DataFrame(rows, columns=["sequence", "time", "agent", "x", "y"])
+    with pytest.raises(ConfigError, match="people meet everybody"):
+        nnode.Calibrator("sf", drivers="alone", epochs=1).fit(people)
 
 
 def test_too_few_followers_are_refused(small: pd.DataFrame) -> None:

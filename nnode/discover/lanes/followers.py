@@ -13,7 +13,7 @@ all models of a diagnosis are compared with the same whitening.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -271,10 +271,9 @@ class FollowersEngine(TrafficEngine):
     def fit_whitening(self, system: System, row: Tensor) -> None:
         """Estimate drivers, starts, pushes and their variances, with the model's parameters, and
         select which parameters differ between drivers."""
-        first = self.population is None
-        self._set_population(self.population_of(with_parameters(system, row)))
-        if not first and self._like is None:
-            self.select_random_effects()
+        population = self.population_of(with_parameters(system, row))
+        selected = self.population is None or self._like is not None
+        self.set_population(population if selected else with_random_effects(population))
 
     def population_of(self, system: System) -> Population:
         """The estimate with a model; the engine keeps its own. The same parameters differ between
@@ -286,11 +285,6 @@ class FollowersEngine(TrafficEngine):
         if start is None:
             return fit_drivers(fixed, paths, pairs=0)
         return refit(start, fixed, paths, fixed=self._like is not None)
-
-    def select_random_effects(self) -> None:
-        """Select which parameters differ between drivers, from those of the last estimate."""
-        assert self.population is not None
-        self._set_population(with_random_effects(self.population))
 
     def drivers(self, seed: int) -> Population:
         """The last estimate, corrected for its bias; where errors of positions are smaller than
@@ -334,13 +328,8 @@ class FollowersEngine(TrafficEngine):
         variances = initial_variances(model)
         deviations = fit_deviations(model, PushNoise(), model.start, variances)
         engine = copy.copy(self)
-        engine._set_population(Population.uncorrected(model, deviations))
+        engine.set_population(Population.uncorrected(model, deviations))
         return engine
-
-    def set_likeliest(self, populations: Iterable[Population]) -> None:
-        """Take the estimate with the best BIC. The variances of a model that lacks an effect would
-        attribute it to autocorrelated pushes, which would hide it."""
-        self._set_population(max(populations, key=lambda population: population.criterion))
 
     def simulated_engines(self, system: System, row: Tensor, seed: int) -> list[FollowersEngine]:
         """Engines of paths simulated by a model, with deviations of drivers, pushes and measurement
@@ -352,7 +341,7 @@ class FollowersEngine(TrafficEngine):
             engine._paths_by_step = {
                 strides(model.paths.dt, 2 * model.paths.half + 1e-9): model.paths
             }
-            engine._set_population(replace(refitted, model=model, estimate=modes))
+            engine.set_population(replace(refitted, model=model, estimate=modes))
             engines.append(engine)
         return engines
 
@@ -435,7 +424,8 @@ class FollowersEngine(TrafficEngine):
                 )
         return difference, model, states
 
-    def _set_population(self, population: Population) -> None:
+    def set_population(self, population: Population) -> None:
+        """Whiten residuals by an estimate."""
         estimate, variances = population.estimate, population.estimate.variances
         self.population = population
         start = variances.start.copy()

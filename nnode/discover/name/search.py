@@ -28,7 +28,7 @@ from nnode.errors import SimulationError
 from nnode.model.effects import Effect
 from nnode.model.extend import effects_of, place_of, without
 from nnode.model.system import System
-from nnode.population.drivers import Population, with_random_effects
+from nnode.population.drivers import Population, likeliest, with_random_effects
 
 log = logging.getLogger(__name__)
 
@@ -216,7 +216,7 @@ def _with_likeliest_ends(engine: FollowersEngine, fit: Fit, name: str) -> Fit:
                 with suppress(SimulationError):
                     moved = engine.population_of(with_parameters(fit.system, row))
                     populations.append(with_random_effects(moved))
-        engine.set_likeliest(populations)
+        engine.set_population(likeliest(populations))
         if engine.population is not populations[0]:
             fit = refine(engine, engine.population.system)
     return fit
@@ -351,14 +351,13 @@ def _with_refitted_variances(
     model without a strong effect would attribute it to autocorrelated pushes."""
     assert selection.screen is not None
     by_cost = sorted(candidates, key=lambda c: c.fit.cost)
-    likeliest = by_cost[:LIKELY] + [c for c in by_cost[LIKELY:] if c.score.effect.covariate]
+    refitted_first = by_cost[:LIKELY] + [c for c in by_cost[LIKELY:] if c.score.effect.covariate]
     populations = dict[str, Population]()
-    for candidate in likeliest:
+    for candidate in refitted_first:
         with suppress(SimulationError):
             populations[candidate.name] = engine.population_of(candidate.fit.system)
     if populations:
-        engine.set_likeliest(populations.values())
-        engine.select_random_effects()
+        engine.set_population(with_random_effects(likeliest(populations.values())))
     selection.fit = refine(engine, selection.fit.system)
     refitted = []
     for candidate in candidates:

@@ -85,7 +85,6 @@ def invented() -> dict[str, dict[str, Any]]:
         "alone": [6.0] * 6,
         "shrunk": [3.0] * 6,
         "strengths": [0.1, 1.0],
-        "by_strength": [4.0],
         "clusters": [0, 0, 1, 1, 2, 2],
     }
     for name, fold, heldout in (("idm", 2.0, 3.0), ("helly", 3.0, 1.0)):
