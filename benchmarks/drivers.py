@@ -29,11 +29,11 @@ import nnode
 from benchmarks.discovery.run import sources
 from benchmarks.discovery.verdicts import verdicts
 from benchmarks.synthetic_cases.score import covers, judged
-from nnode.app.nearest_law import candidates
+from nnode.app.compared_laws import compared_laws
 from nnode.app.python.inputs import model_options
-from nnode.discover import thresholds
-from nnode.discover.compare.laws import compare_laws
-from nnode.discover.options import DiscoverOptions
+from nnode.diagnosis import thresholds
+from nnode.diagnosis.compare import compare_laws
+from nnode.diagnosis.options import DiscoverOptions
 from nnode.files import write_text
 from nnode.model.build import build_model
 from nnode.model.term import short_names
@@ -372,7 +372,7 @@ def _compared(case: dict[str, Any]) -> dict[str, Any]:
     """A comparison of all laws, of which the case's law should be the first."""
     sequences, options = list(nnode.sequences(platoons(**case))), DiscoverOptions()
     model = model_options(case["law"], "measured")
-    laws = candidates(model, build_model(model), options)
+    laws = compared_laws(model, build_model(model), options)
     p_values = compare_laws(laws, case["law"], sequences, options)[0].p_values
     first, second, *_ = p_values
     return {

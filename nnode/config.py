@@ -35,7 +35,7 @@ from nnode.data.readers.pairs import PairOptions
 from nnode.data.readers.sumo import SumoOptions
 from nnode.data.readers.table import TableOptions
 from nnode.data.readers.vehicles import VehicleTableOptions
-from nnode.discover.options import DiscoverOptions
+from nnode.diagnosis.options import DiscoverOptions
 from nnode.model.laws import LAW_MODELS
 from nnode.model.options import (
     FormulaOptions,

@@ -11,7 +11,7 @@ import pandas as pd
 
 from nnode.data.sequence import Sequence
 from nnode.data.sequences import Sequences
-from nnode.discover.residuals.fit import Fit
+from nnode.diagnosis.residuals.fit import Fit
 from nnode.model import Law, System, make_law
 
 

@@ -37,8 +37,8 @@ WRONG = [
     ),
     (
         "nnode/plots/style.py",
-        "if TYPE_CHECKING:\n    import nnode.discover.diagnose",
-        "nnode.plots -> nnode.discover",
+        "if TYPE_CHECKING:\n    import nnode.diagnosis.single_law",
+        "nnode.plots -> nnode.diagnosis",
     ),
     ("nnode/simulation/base.py", "from nnode import load", "nnode.simulation -> nnode.app"),
     ("nnode/errors.py", "import nnode.files", "nnode.errors -> nnode.files"),

@@ -16,7 +16,7 @@ import pytest
 
 from tests.app.following import TRUE, pairs
 from tests.builders import as_table
-from tests.discover.platoons import platoons
+from tests.diagnosis.platoons import platoons
 from tests.installed import Run, built, installed
 
 ROOT = Path(__file__).parents[1]

@@ -16,8 +16,8 @@ from benchmarks.synthetic_cases.platoons import DT, SUBSTEPS, platoons, waves
 from benchmarks.synthetic_cases.score import EQUALS, judged
 from benchmarks.synthetic_cases.traffic.motion import Hidden
 from nnode.data.sequence import Sequence
-from nnode.discover.diagnose import diagnose
-from nnode.discover.options import DiscoverOptions
+from nnode.diagnosis.options import DiscoverOptions
+from nnode.diagnosis.single_law import diagnose_law
 from nnode.model.build import build_model
 
 #: Effects, and their coefficients in the equations of motion, s.
@@ -55,7 +55,7 @@ def evaluate(seed: int, name: str) -> dict[str, list[dict[str, Any]]]:
             Sequence(name=f"r/{i}", recording="r", time=time + 100.0 * i, x=x[..., None])
             for i, x in enumerate(runs)
         ]
-        report = diagnose(build_model(law), sequences, options).diagnosis.plain()
+        report = diagnose_law(build_model(law), sequences, options).diagnosis.plain()
         row = {"data": data, "seed": seed, "hidden": name, "value": value}
         rows.append(row | judged(report, [name]))
         return report

@@ -17,14 +17,14 @@ from nnode.config import SCHEMAS
 from nnode.data.options import Faults
 from nnode.data.readers.table import TableOptions
 from nnode.data.sequence import Domain
-from nnode.discover.division import divide
-from nnode.discover.inputs import read_inputs
-from nnode.discover.judge.model_comparison import engine_of, windows_of
-from nnode.discover.name.search import converged_fit
-from nnode.discover.options import DiscoverOptions
-from nnode.discover.residuals.engine import Engine, square_of
-from nnode.discover.residuals.fit import Fit, refine
-from nnode.discover.statistics.score import Trace, traces
+from nnode.diagnosis.division import divide
+from nnode.diagnosis.inputs import read_inputs
+from nnode.diagnosis.model_comparison import engine_of, windows_of
+from nnode.diagnosis.options import DiscoverOptions
+from nnode.diagnosis.residuals.engine import Engine, square_of
+from nnode.diagnosis.residuals.fit import Fit, refine
+from nnode.diagnosis.search import converged_fit
+from nnode.diagnosis.statistics.score import Trace, traces
 from nnode.errors import SimulationError
 from nnode.model import build_model
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect

@@ -56,7 +56,7 @@ _FOLDERS = (
     "benchmarks/discovery",
     "benchmarks/programs",
     "benchmarks/synthetic_cases",
-    *(f"nnode/{name}" for name in ("app", "calibrate", "data", "discover", "model")),
+    *(f"nnode/{name}" for name in ("app", "calibrate", "data", "diagnosis", "model")),
     *(f"nnode/{name}" for name in ("population", "simulation")),
 )
 _PACKAGES = ("torch", "numba", "numpy", "scipy", "scikit-learn", "pysindy")

@@ -18,8 +18,8 @@ from benchmarks.synthetic_cases.case import cases as hidden_cases
 from benchmarks.synthetic_cases.case import hidden
 from benchmarks.synthetic_cases.score import ERROR, coefficient_rows, score
 from nnode.app import discover
-from nnode.discover import thresholds
-from nnode.discover.options import DiscoverOptions
+from nnode.diagnosis import thresholds
+from nnode.diagnosis.options import DiscoverOptions
 from nnode.errors import ConfigError, NNodeError
 from nnode.model.effects import CATALOGUE
 

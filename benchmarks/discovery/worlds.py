@@ -19,7 +19,7 @@ from benchmarks.discovery.scenes import SCENES
 from benchmarks.synthetic_cases.laws import FIRST_ORDER, RANGES, measured
 from benchmarks.synthetic_cases.score import UNKNOWN, judged
 from nnode.app import discover
-from nnode.discover.options import DiscoverOptions
+from nnode.diagnosis.options import DiscoverOptions
 
 #: Effects of a law of second order that a law of the first or of the second order lacks: those of
 #: its linearisation (speed difference, lag, a gap that grows with the speed ahead, a highest

@@ -250,8 +250,8 @@ def _load_libraries() -> None:
 
     from benchmarks.discovery import run  # noqa: F401
     from nnode.app import discover, prepare, train  # noqa: F401
-    from nnode.discover import diagnose  # noqa: F401
-    from nnode.discover.report import page  # noqa: F401
+    from nnode.diagnosis import diagnose  # noqa: F401
+    from nnode.diagnosis.report import page  # noqa: F401
     from nnode.simulation import fused  # noqa: F401
     from studies import command  # noqa: F401
 

@@ -28,7 +28,7 @@ LIST = Path(__file__).with_name("mutants.csv")
 #: Modules that get mutants, and the tests of their rooms.
 ROOMS = {
     "nnode/population/*.py": "tests/population",
-    "nnode/discover/statistics/*.py": "tests/discover/statistics",
+    "nnode/diagnosis/statistics/*.py": "tests/diagnosis/statistics",
     "nnode/calibrate/least_squares.py": "tests/calibrate",
     "nnode/calibrate/intervals.py": "tests/calibrate",
     "nnode/calibrate/resampling.py": "tests/calibrate",

@@ -27,8 +27,8 @@ import json, resource, sys, time
 import numpy as np, torch
 torch.set_num_threads(1)
 from nnode.data.sequence import Sequence
-from nnode.discover.diagnose import diagnose
-from nnode.discover.options import DiscoverOptions
+from nnode.diagnosis.single_law import diagnose_law
+from nnode.diagnosis.options import DiscoverOptions
 from nnode.model.build import build_model
 data, v0, length = np.load(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
 model = dict(term="lin", name="lin", leader="measured", v0=v0, L=length, L_min=1.0)
@@ -38,7 +38,7 @@ sequences = [
 ]
 system = build_model(model)
 wall, cpu = time.perf_counter(), time.process_time()
-found = diagnose(system, sequences, DiscoverOptions()).diagnosis
+found = diagnose_law(system, sequences, DiscoverOptions()).diagnosis
 print(json.dumps({
     "wall_s": time.perf_counter() - wall,
     "cpu_s": time.process_time() - cpu,

@@ -22,7 +22,7 @@ from nnode.data.readers.columns import floats, quoted
 from nnode.data.sequence import Domain, Sequence
 from nnode.data.split import split
 from nnode.data.units import certainty
-from nnode.discover.inputs import LEAST
+from nnode.diagnosis.inputs import LEAST
 from nnode.errors import ConfigError, NNodeError, printable
 from nnode.machine import how_made
 from nnode.pages.page import Block, FigureBlock, Heading, Provenance, TableBlock, Text, write_page

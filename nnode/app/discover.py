@@ -7,7 +7,7 @@ import shlex
 import signal
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from nnode.app.cli.prepared import with_prepared
 from nnode.app.cli.saved import options_of, plain_config
 from nnode.app.cli.typed import changes, group_defaults, plain_options, shell_override
-from nnode.app.nearest_law import Job, candidates, diagnosed
+from nnode.app.compared_laws import compared_laws, law_options
 from nnode.app.python.inputs import (
     Table,
     data_of,
@@ -26,18 +26,19 @@ from nnode.app.python.inputs import (
     table_options,
 )
 from nnode.app.python.report import Report
-from nnode.app.training import brief, check_domain
+from nnode.app.training import brief, check_domain, set_threads, threads_given_back
 from nnode.calibrate.checkpoint import save_checkpoint
 from nnode.calibrate.interrupt import BreakingGuard, Interrupted, InterruptGuard
 from nnode.calibrate.optimizers import AdadeltaOptions
 from nnode.calibrate.options import TorchdiffeqOptions, TrainerOptions
 from nnode.data.options import DataOptions, Faults
 from nnode.data.sequences import Sequences
-from nnode.discover.eligibility import check_model
-from nnode.discover.inputs import Inputs, inputs_of, read_inputs, with_faulty
-from nnode.discover.options import DiscoverOptions, check_options
-from nnode.discover.outcome import DiagnosisOutcome
-from nnode.discover.report.files import (
+from nnode.diagnosis.diagnose import diagnose
+from nnode.diagnosis.eligibility import check_model
+from nnode.diagnosis.inputs import Inputs, inputs_of, read_inputs, with_faulty
+from nnode.diagnosis.options import DiscoverOptions, check_options
+from nnode.diagnosis.outcome import DiagnosisOutcome
+from nnode.diagnosis.report.files import (
     CHECKPOINT,
     MODEL,
     REPORT,
@@ -77,6 +78,24 @@ SMOOTHED_SOURCES = {
 }
 
 
+@dataclass(frozen=True)
+class Job:
+    """What a diagnosis was made of.
+
+    Attributes:
+        model, data: options of the diagnosed law and of the data in plain types.
+        groups: the configuration groups of model and data.
+        inputs: the data.
+        options: the checked options.
+    """
+
+    model: dict[str, Any]
+    data: dict[str, Any]
+    groups: dict[str, str]
+    inputs: Inputs
+    options: DiscoverOptions
+
+
 def discover(config: DictConfig, folder: Path) -> None:
     """Diagnose a model on data, write the report, and print the result.
 
@@ -96,8 +115,7 @@ def discover(config: DictConfig, folder: Path) -> None:
         options: DiscoverOptions = options_of(config.discover)
         data: DataOptions = options_of(config.data)
         read = partial(read_inputs, data, folder / "data")
-        job = _job(plain["model"], data, plain["data"], plain["groups"], options, read)
-        diagnoses = diagnosed(job)
+        diagnoses = _diagnoses(plain["model"], data, plain["data"], plain["groups"], options, read)
         with Stages("drawing", {"drawing": 5.0}) as stages:
             stages.begin("drawing")
             written = [_drawn(*result) for result in _places(diagnoses, folder)]
@@ -105,7 +123,7 @@ def discover(config: DictConfig, folder: Path) -> None:
         paths = [write() for write in reversed(written)][::-1]
     _print(diagnoses[0][1], paths[0], time.monotonic() - start)
     if len(diagnoses) > 1:
-        print(f"\nthe best law, {diagnoses[1][0].name}:")
+        print(f"\nthe best law, {diagnoses[1][1].diagnosis.model}:")
         _print(diagnoses[1][1], paths[1], time.monotonic() - start)
     if guard.requested:
         name = signal.Signals(guard.requested).name
@@ -159,8 +177,8 @@ def diagnose_table(
     def read() -> Inputs:
         return inputs_of(Sequences.of(source, with_faulty(data_options)), data_options)
 
-    job = _job(plain_model, data_options, plain_options(data_options), groups, chosen, read)
-    diagnoses = diagnosed(job)
+    plain_data = plain_options(data_options)
+    diagnoses = _diagnoses(plain_model, data_options, plain_data, groups, chosen, read)
     if place is not None:
         for result in reversed(_places(diagnoses, place)):
             _drawn(*result)()
@@ -177,26 +195,28 @@ def diagnose_table(
 
 def _figure(job: Job, outcome: DiagnosisOutcome, which: str) -> Figure:
     """A figure of a diagnosis, drawn on request."""
-    from nnode.discover.report.captions import figure  # loads Matplotlib, which takes a second
+    from nnode.diagnosis.report.captions import figure  # loads Matplotlib, which takes a second
 
     return figure(which, job.inputs, outcome, job.options)
 
 
-def _job(
+@threads_given_back()
+def _diagnoses(
     model: dict[str, Any],
     data: DataOptions,
     plain_data: dict[str, Any],
     groups: dict[str, str],
     options: DiscoverOptions,
     read: Callable[[], Inputs],
-) -> Job:
+) -> list[tuple[Job, DiagnosisOutcome]]:
+    """Check the options, read the data, and diagnose the requested law and the best-fitting one."""
     start = time.monotonic()
     load_own()
-    system = build_model(model, options.seed)
-    check_domain(system, str(model["name"]), str(data.domain), str(data.name))
-    check_options(options, system.domain, system.order)  # type: ignore[arg-type]
+    name, system = str(model["name"]), build_model(model, options.seed)
+    check_domain(system, name, str(data.domain), str(data.name))
+    check_options(options, system.domain, system.order)
     check_model(system)
-    laws = candidates(model, system, options)
+    laws = compared_laws(model, system, options)
     inputs = read()
     if options.smoothed is None:
         smoothed = data.smooth is not None or str(data.name) in SMOOTHED_SOURCES
@@ -205,7 +225,17 @@ def _job(
         # the extended model is trained and tested on the sequences without faults
         plain_data = {**plain_data, "faults": Faults.drop.value}
     seconds = time.monotonic() - start
-    return Job(model, plain_data, groups, system, inputs, options, laws, seconds)
+    set_threads(None, system.domain)
+    outcomes = diagnose(name, system, laws, inputs, options)
+    first = outcomes[0].diagnosis
+    first.seconds = {"reading": seconds, **first.seconds}
+    diagnoses = []
+    for outcome in outcomes:
+        law = outcome.diagnosis.model
+        law_model = model if law == name else law_options(law, model)
+        job = Job(law_model, plain_data, {**groups, "model": law}, inputs, options)
+        diagnoses.append((job, outcome))
+    return diagnoses
 
 
 def _places(
@@ -239,7 +269,7 @@ def _drawn(job: Job, outcome: DiagnosisOutcome, folder: Path) -> Callable[[], di
     config = training_config(job, outcome)
     pages = None
     if job.options.page:
-        from nnode.discover.report.page import draw  # loads Matplotlib, which takes a second
+        from nnode.diagnosis.report.page import draw  # loads Matplotlib, which takes a second
 
         pages = draw(job.inputs, outcome, job.options, config, _commands(config, folder), folder)
     checkpoint = checkpoint_of(

@@ -13,7 +13,7 @@ from nnode.app.saved_run import SavedRun
 from nnode.data.readers.columns import Table as DataTable
 from nnode.data.readers.table import TableOptions, read_table
 from nnode.data.sequence import Sequence, evenly
-from nnode.discover.report.replay import zone_of
+from nnode.diagnosis.report.replay import zone_of
 from nnode.errors import DataError
 from nnode.exchange.trajectories import simulated as simulated_by
 from nnode.model.effects import Effect

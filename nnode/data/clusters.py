@@ -9,7 +9,7 @@ Folds, sign flips, jackknife, paired tests and confirmation sets all go by clust
   (median) and mostly (82 to 95 %) at most 5 s to go until it leaves the camera's view, so that
   later sequences rarely hold it.
 - Where agents who are there at one time but share nobody behave alike, time is shared too: that is
-  found out from residuals (:mod:`nnode.discover.statistics.simultaneous`) and asked for by
+  found out from residuals (:mod:`nnode.diagnosis.statistics.simultaneous`) and asked for by
   ``together``.
 
 Of G clusters, sign flips have 2^G outcomes: no one-sided p-value is below 2^-G, no two-sided one

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 
-from nnode.data.sequence import Domain
 from nnode.errors import ConfigError, suggestion, unknown_value
 from nnode.model.effects import CATALOGUE
 from nnode.model.effects.base import Effect
@@ -107,7 +106,7 @@ def add_effects(model: System, chosen: Sequence[str | Options]) -> None:
     added = []
     for entry in chosen:
         name, values = _entry(entry)
-        names = [effect.name for effect in CATALOGUE.of(cast(Domain, model.domain), every=True)]
+        names = [effect.name for effect in CATALOGUE.of(model.domain, every=True)]
         if name not in names:
             raise ConfigError(
                 f"model.effects: there is no {model.domain} effect {name}, expected one of "

@@ -10,7 +10,7 @@ from typing import TypeVar, cast
 import torch
 from torch import Tensor, nn
 
-from nnode.data.sequence import Batch
+from nnode.data.sequence import Batch, Domain
 from nnode.errors import DataError
 from nnode.model.formula import crowd_of, effect_alone, lane_of, rates_of, starts_of
 from nnode.model.laws import Law
@@ -37,7 +37,7 @@ class System(nn.Module):
         wall_spacing: largest distance between the points that represent a wall, m.
     """
 
-    domain: str
+    domain: Domain
     order: int
     dim: int
 

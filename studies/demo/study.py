@@ -34,8 +34,8 @@ from nnode.app.train import train
 from nnode.config import register
 from nnode.data.store import Store
 from nnode.data.synthetic import Forces, SlowZone, demo_data
-from nnode.discover.options import DiscoverOptions
-from nnode.discover.report.files import amount, interval
+from nnode.diagnosis.options import DiscoverOptions
+from nnode.diagnosis.report.files import amount, interval
 from nnode.errors import NNodeError
 from nnode.files import write_text
 from nnode.machine import how_made

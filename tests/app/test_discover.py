@@ -15,28 +15,28 @@ import pandas as pd
 import pytest
 
 from nnode.app import discover as app
-from nnode.app import nearest_law
 from nnode.app.python.report import Report
 from nnode.calibrate.checkpoint import load_checkpoint
-from nnode.discover import thresholds
-from nnode.discover.options import DiscoverOptions
-from nnode.discover.outcome import DiagnosisOutcome
-from nnode.discover.report import page
+from nnode.diagnosis import diagnose, thresholds
+from nnode.diagnosis.options import DiscoverOptions
+from nnode.diagnosis.outcome import DiagnosisOutcome
+from nnode.diagnosis.report import page
 from nnode.errors import ConfigError
 from nnode.model import System
 from tests.app.conftest import Script, composed
 from tests.app.forked import Forks
-from tests.discover import stand_in
-from tests.discover.recorded import ALPHA, ZONE, corridor, lane
+from tests.diagnosis import stand_in
+from tests.diagnosis.recorded import ALPHA, ZONE, corridor, lane
 
 #: The script with results made by hand.
 CODE = """
 import sys
-from nnode.app import discover, nearest_law
+from nnode.app import discover
 from nnode.app.cli.run import run
-from tests.discover import stand_in
+from nnode.diagnosis import diagnose
+from tests.diagnosis import stand_in
 if __name__ == "__main__":
-    nearest_law.diagnose = stand_in.diagnose
+    diagnose.diagnose_law = stand_in.diagnose
     run("discover", discover.discover)
 """
 
@@ -61,9 +61,10 @@ import runpy
 import shutil
 import sys
 from pathlib import Path
-from nnode.app import discover, nearest_law
+from nnode.app import discover
 from nnode.app.cli.run import run
-from tests.discover import stand_in
+from nnode.diagnosis import diagnose
+from tests.diagnosis import stand_in
 
 def script(name, *arguments):
     sys.argv = [f"scripts/{name}.py", *arguments]
@@ -72,7 +73,7 @@ def script(name, *arguments):
 if __name__ == "__main__":
     folder, *overrides = sys.argv[1:]
     sys.argv[1:] = overrides
-    nearest_law.diagnose = stand_in.diagnose
+    diagnose.diagnose_law = stand_in.diagnose
     run("discover", discover.discover)
     checkpoint = f"checkpoint={folder}/run/checkpoints/best.pt"
     print("== evaluate")
@@ -232,7 +233,7 @@ def test_wrong_options_are_refused_before_any_data_are_read(
 @pytest.fixture
 def by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Results made by hand, and nothing that could be drawn."""
-    monkeypatch.setattr(nearest_law, "diagnose", stand_in.diagnose)
+    monkeypatch.setattr(diagnose, "diagnose_law", stand_in.diagnose)
 
     def never(*_: object) -> None:
         pytest.fail("something was drawn")
@@ -272,7 +273,7 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
 @pytest.mark.thorough
 @pytest.mark.usefixtures("by_hand")
 def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(nearest_law, "with_effects", lambda laws, effects: laws)
+    monkeypatch.setattr(diagnose, "with_effects", lambda laws, effects: laws)
     monkeypatch.setattr(thresholds, "STRICT", 0.5)
     report = lin_diagnosed(tmp_path)
     names = {path.name for path in (tmp_path / "run").iterdir()}
@@ -311,12 +312,12 @@ def test_laws_are_compared_again_with_the_missing_effect(
     """Behind a zone idm comes first. With the zone lin does, because the nearest law lacks the
     zone, or because lin does and idm imitates the zone well enough to need nothing."""
 
-    def diagnose(system: System, *arguments: Any, **how: Any) -> DiagnosisOutcome:
+    def diagnose_law(system: System, *arguments: Any, **how: Any) -> DiagnosisOutcome:
         outcome = stand_in.diagnose(system, *arguments, **how)
         keeps = imitated and system.order > 1
         return dataclasses.replace(outcome, searched=system) if keeps else outcome
 
-    monkeypatch.setattr(nearest_law, "diagnose", diagnose)
+    monkeypatch.setattr(diagnose, "diagnose_law", diagnose_law)
     monkeypatch.setattr(thresholds, "STRICT", 0.5)
     monkeypatch.setattr(thresholds, "LEVEL", 0.5)
     report = lin_diagnosed(tmp_path)

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from tests.app.conftest import Script
-from tests.discover.recorded import corridor, lane
+from tests.diagnosis.recorded import corridor, lane
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ from nnode.data.readers.sumo import SumoOptions, read_sumo
 from tests.app.conftest import ROOT, Script, environment
 from tests.app.forked import Forks
 from tests.builders import as_table
-from tests.discover import walkers
-from tests.discover.platoons import platoons
+from tests.diagnosis import walkers
+from tests.diagnosis.platoons import platoons
 from tests.exchange.by_sumo import configured
 
 #: Of vehicles and of people, of both orders.

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from nnode.app.check import check_file
-from nnode.discover.report.page import draw
+from nnode.diagnosis.report.page import draw
 from tests.browser.chromium import MISSING, Browser
 from tests.data.check.planted import cars, saved
-from tests.discover.conftest import Case, traffic  # noqa: F401  a fixture
-from tests.discover.report.test_page import CONFIG, with_faults
+from tests.diagnosis.conftest import Case, traffic  # noqa: F401  a fixture
+from tests.diagnosis.report.test_page import CONFIG, with_faults
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 

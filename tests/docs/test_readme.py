@@ -12,7 +12,7 @@ import pytest
 from tests.app.conftest import composed, examples
 from tests.app.following import table
 from tests.builders import as_table
-from tests.discover.platoons import platoons
+from tests.diagnosis.platoons import platoons
 from tests.docs.test_tutorials import ROOT, blocks
 
 README = ROOT / "README.md"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from nnode.discover.report.figures.marks import AFTER, BEFORE
+from nnode.diagnosis.report.figures.marks import AFTER, BEFORE
 from nnode.plots.quality import STYLES
 from nnode.plots.style import GREY, OKABE_ITO
 

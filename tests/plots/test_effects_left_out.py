@@ -8,7 +8,7 @@ from nnode.model.build import add_effects
 from nnode.plots.crowd import force_contours
 from nnode.plots.settings import six_settings
 from nnode.plots.traffic import speed_curves
-from tests.discover import stand_in  # noqa: F401 - registers an effect of crowds
+from tests.diagnosis import stand_in  # noqa: F401 - registers an effect of crowds
 
 LAW = {"name": "lin", "term": "lin", "leader": "measured", "v0": 20.0, "L": 8.0, "L_min": 2.0}
 FORCE = {**model_options("sf"), "A": 1.0, "k": 1.0, "kappa": 1.0, "B": 0.1, "mass": 1.0}

@@ -23,8 +23,8 @@ from nnode.population.drivers import Population, fit_drivers, refit, with_random
 from nnode.population.followers import longest_step, paths_of
 from nnode.population.intervals import deviation_intervals, influence
 from nnode.population.likelihood import NOISE
-from tests.discover.platoons import DT, LENGTH, V0
-from tests.discover.platoons import platoons as following
+from tests.diagnosis.platoons import DT, LENGTH, V0
+from tests.diagnosis.platoons import platoons as following
 
 #: Errors of measurement, m.
 ERROR = 0.05

@@ -8,7 +8,7 @@ import pytest
 from nnode.data.paths import smooth
 from nnode.data.sequence import Sequence
 from nnode.population.followers import LEADER_ERROR, drivers_differ, leader_error
-from tests.discover.platoons import lin, platoons
+from tests.diagnosis.platoons import lin, platoons
 
 SEED = 4
 #: Samples at the ends, where errors are larger.

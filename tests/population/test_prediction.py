@@ -13,7 +13,7 @@ from nnode.population.estimate import fit_deviations
 from nnode.population.followers import Followers, paths_of
 from nnode.population.likelihood import PushNoise, marginal
 from nnode.population.prediction import predict
-from tests.discover.platoons import lin
+from tests.diagnosis.platoons import lin
 from tests.population.test_drivers import ERROR, platoons
 
 NOISE = {"push": 0.2, "push_time": 4.0, "measurement": ERROR}

@@ -10,7 +10,7 @@ Examples:
   nnode discover model=lin data=ngsim 'discover.exclude=[inertia]' hydra.run.dir=DIR
 
 Networks (model=n2, n4, n10, nn) can represent effects of their inputs: diagnose a law to find
-them. python -m nnode.discover.catalogue lists the effects with formulas, units and sources.
+them. python -m nnode.diagnosis.catalogue lists the effects with formulas, units and sources.
 
 Results: report.html, report.json, and the extended model as model.yaml and checkpoints/best.pt;
 docs/discovery.md explains them, and how to write your own effect.

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from nnode.discover.report.files import amount, closed, interval, plain_report, sentence
-from nnode.discover.result import Clusters, DataFault, Diagnosis, Gap, NamedEffect, Place
+from nnode.diagnosis.report.files import amount, closed, interval, plain_report, sentence
+from nnode.diagnosis.result import Clusters, DataFault, Diagnosis, Gap, NamedEffect, Place
 from nnode.errors import ConfigError
 from nnode.files import xarray
 from nnode.model import System

@@ -18,7 +18,7 @@ from nnode.data.readers.jupedsim import WalkwayOptions
 from nnode.data.readers.table import TableOptions
 from nnode.errors import DataError
 from tests.app.conftest import Script
-from tests.discover.recorded import lane
+from tests.diagnosis.recorded import lane
 
 
 def numbered(path: Path) -> pd.DataFrame:

@@ -10,14 +10,14 @@ import pytest
 
 import nnode
 from nnode.app import discover as app
-from nnode.app import nearest_law
+from nnode.diagnosis import diagnose
 from nnode.errors import ConfigError
 from nnode.model.extend import effects_of
 from tests.app.following import table
 from tests.builders import as_table
-from tests.discover import stand_in
-from tests.discover.platoons import platoons
-from tests.discover.recorded import lane
+from tests.diagnosis import stand_in
+from tests.diagnosis.platoons import platoons
+from tests.diagnosis.recorded import lane
 
 #: No other law beside it, and no page.
 ALONE = app.DiscoverOptions(page=False, compare=[])
@@ -28,7 +28,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> nnode.Report:
     """Of results made by hand."""
     table = lane(tmp_path_factory.mktemp("lane") / "lane.csv", sequences=4, seconds=3.0, cars=3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nearest_law, "diagnose", stand_in.diagnose)
+        patch.setattr(diagnose, "diagnose_law", stand_in.diagnose)
         return nnode.diagnose(table, options=ALONE)
 
 
@@ -93,7 +93,7 @@ def test_the_order_of_rows_and_sequences_changes_no_diagnosis() -> None:
 def test_a_data_frame_is_kept_as_a_table_for_the_commands_that_the_report_tells(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(nearest_law, "diagnose", stand_in.diagnose)
+    monkeypatch.setattr(diagnose, "diagnose_law", stand_in.diagnose)
     frame = table(platoons=4, seconds=4.0)
     nnode.diagnose(frame, folder=tmp_path, options=ALONE)
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "table.parquet"), frame)

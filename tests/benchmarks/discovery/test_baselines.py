@@ -9,7 +9,7 @@ from benchmarks.discovery.baselines import _effect
 from benchmarks.discovery.regression import BASELINES
 from benchmarks.discovery.synthetic import evaluate
 from benchmarks.synthetic_cases import Case
-from nnode.discover.statistics.score import Trace
+from nnode.diagnosis.statistics.score import Trace
 from nnode.model.effects import CATALOGUE, Probe
 
 CELLS = [Probe({"a": 10.0 * i, "b": 10.0 * (i + 1)}, {"alpha": -0.1}) for i in range(6)]

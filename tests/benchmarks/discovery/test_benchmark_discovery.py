@@ -16,7 +16,7 @@ from benchmarks.discovery.run import benchmark_discovery
 from benchmarks.discovery.verdicts import share
 from benchmarks.synthetic_cases.case import first_seed
 from nnode.app import discover
-from nnode.discover import thresholds
+from nnode.diagnosis import thresholds
 from nnode.errors import ConfigError, DataError
 
 CALLS: list[dict[str, Any]] = []

@@ -15,7 +15,7 @@ from benchmarks.discovery.worlds import allowed, answered
 from benchmarks.programs.sumo import STEP
 from benchmarks.synthetic_cases.laws import RANGES
 from nnode.app import discover
-from nnode.app.nearest_law import LAWS
+from nnode.app.compared_laws import LAWS
 from nnode.model.effects import CATALOGUE
 
 

@@ -1,0 +1,151 @@
+"""Short windows in which every person is simulated alone among the others' measured paths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Many
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.data.sequence import PADDING_GAP, Batch, Sequence, collate
+from nnode.diagnosis.crowds.paths import Smoother
+from nnode.errors import DataError
+from nnode.model.scene import Scene
+from nnode.model.system import System
+from nnode.simulation.alone import Surroundings
+
+#: Longest step of a simulation, and the approximate interval of the residuals, s.
+STEP = 0.13
+INTERVAL = 0.1
+#: Smallest number of samples of a window; a start state has four numbers.
+LEAST = 5
+#: Windows are shortened until at most this share of the usable sequences is shorter.
+LEFT_OUT = 0.1
+#: A wall point further away than r + CUT * B is left out: exp(-CUT) of the force at contact.
+CUT = 11.0
+#: How far a simulated person may stray from the measured path before walls are missed, m.
+STRAY = 0.5
+
+
+class Windows:
+    """The windows of some sequences.
+
+    Args:
+        sequences: of people, equally sampled.
+        window: length, s.
+
+    Attributes:
+        batch: one simulation per window. Positions and velocities are the smoothed ones, at half
+            steps of the simulation.
+        measured: ``(L, W, N, 2)`` m: positions as they were measured, at the L residual times.
+        person: ``(P, 2)`` window and place of the P people of all windows who are real.
+        sequence, number: ``(W,)`` position of a window's sequence, and its own within it.
+        step: of the simulation, s. sub: steps between two residuals.
+        used: positions of the sequences that are long enough.
+        compared: of these the first sample that is compared, and the stride from each to the next.
+        variance: m², of the noise of one measured coordinate.
+
+    Raises:
+        DataError: no sequence is long enough, or another fault of the data.
+    """
+
+    def __init__(self, sequences: Many[Sequence], window: float = 1.5) -> None:
+        dt = sequences[0].dt
+        stride = max(1, round(INTERVAL / dt))
+        count = [(item.n_samples + stride - 1) // stride for item in sequences]
+        sufficient = sorted(number for number in count if number >= LEAST)
+        if not sufficient:
+            raise DataError(
+                f"the longest sequence has {max(item.n_samples for item in sequences)} samples "
+                f"of {dt:g} s, a window needs {LEAST * stride}; use longer sequences"
+            )
+        # a few long sequences must not exclude the short ones
+        longest = sufficient[int(LEFT_OUT * len(sufficient))]
+        length = min(max(LEAST + 1, round(window / (stride * dt))), longest)
+        self.used = [i for i, number in enumerate(count) if number >= length]
+        smoother = Smoother([sequences[i] for i in self.used])
+        self.variance = smoother.variance
+        self.sub = max(1, int(np.ceil(stride * dt / STEP)))
+        self.step = stride * dt / self.sub
+        self.length = length
+        half = np.arange(2 * self.sub * (length - 1) + 1) * self.step / 2
+        pieces, measured, sequence, number = [], [], [], []
+        self.compared: dict[int, tuple[int, int]] = {}
+        for i in self.used:
+            item, windows = sequences[i], count[i] // length
+            spare = (count[i] - windows * length) // 2
+            self.compared[i] = (spare * stride, stride)
+            for w in range(windows):
+                first = (spare + w * length) * stride
+                path = smoother.path(item, first * dt + half)
+                pieces.append(_piece(item, item.time[0] + first * dt + half, path.x, path.v))
+                measured.append(item.x[first::stride][:length])
+                sequence.append(i)
+                number.append(w)
+        self.batch = collate(pieces)
+        _park(self.batch)
+        self.measured = np.zeros((length, *self.batch.x.shape[1:]))
+        for w, x in enumerate(measured):
+            self.measured[:, w, : x.shape[1]] = x
+        self.person = np.argwhere(self.batch.agent.numpy())
+        self.sequence, self.number = np.array(sequence), np.array(number)
+
+    @property
+    def steps(self) -> int:
+        """Steps of the simulation of a window."""
+        return self.sub * (self.length - 1)
+
+    def around(self, system: System) -> Surroundings:
+        """The surroundings of the people whom ``system`` simulates."""
+        scene = system.scene(self.batch)
+        # terms read the paths from ``Surroundings``, so copies for many runs need only two samples
+        scene.measured, scene.measured_rate = scene.measured[:2], scene.measured_rate[:2]
+        force: Any = system.find_law("social_force")
+        if force is not None and scene.wall.shape[1]:
+            reach = force.r + CUT * force.B + STRAY
+            scene.near = _near(scene, self.batch.x[:: 2 * self.sub], reach)
+        window, person = torch.from_numpy(self.person).T
+        return Surroundings(scene, self.batch.x, self.batch.v, window, person, self.step)
+
+
+def _piece(item: Sequence, time: np.ndarray, x: np.ndarray, v: np.ndarray) -> Sequence:
+    destination = item.x[-1] if item.destination is None else item.destination
+    return Sequence(
+        name=item.name,
+        recording=item.recording,
+        time=time,
+        x=x,
+        v=v,
+        kind=item.kind,
+        group=item.group,
+        destination=destination,
+        preferred=item.preferred,
+        walls=item.walls,
+    )
+
+
+def _park(batch: Batch) -> None:
+    """Move padding agents far away from all others and from their destinations, so that directions
+    are finite."""
+    far = PADDING_GAP * torch.arange(1, batch.x.shape[2] + 1, dtype=batch.x.dtype)
+    place = far[:, None].expand(-1, 2)
+    batch.x = torch.where(batch.agent[..., None], batch.x, place)
+    batch.destination = torch.where(batch.agent[..., None], batch.destination, place + 10.0)
+
+
+def _near(scene: Scene, x: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The wall points within ``reach`` (m) of each person's path ``(L, B, N, 2)``."""
+    middle = (x.amax(0) + x.amin(0)) / 2
+    radius = torch.linalg.vector_norm(x - middle, dim=-1).amax(0)
+    d = torch.linalg.vector_norm(middle[:, :, None] - scene.wall[:, None], dim=-1)
+    real = (d < reach + radius[..., None]) & scene.wall_point[:, None]
+    n_points = max(int(real.sum(-1).max()), 1)
+    # real points first; the mask excludes the others
+    index = torch.argsort((~real).to(torch.int8), dim=-1, stable=True)[..., :n_points]
+    places = index[..., None].expand(*index.shape, 2)
+    shape = (*real.shape, 2)
+    wall = scene.wall[:, None].expand(shape).gather(2, places)
+    normal = scene.wall_normal[:, None].expand(shape).gather(2, places)
+    return wall, normal, real.gather(2, index)

@@ -1,0 +1,582 @@
+"""The diagnosis of one law: calibrate, locate deviations, select effects, confirm them, report."""
+
+from __future__ import annotations
+
+import copy
+import time
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
+from typing import Any
+
+import numpy as np
+import torch
+
+from nnode.data.clusters import least_number, level
+from nnode.data.sequence import Sequence
+from nnode.diagnosis import thresholds
+from nnode.diagnosis.compare import BetterLaw, explained_by_law
+from nnode.diagnosis.confirmation import ConfirmationSet
+from nnode.diagnosis.curves import curves, significant_curves
+from nnode.diagnosis.division import SETTLED, Division, divide, spacing, without_starts
+from nnode.diagnosis.eligibility import check_model, not_offered
+from nnode.diagnosis.lanes.followers import FollowersEngine
+from nnode.diagnosis.model_comparison import engine_of
+from nnode.diagnosis.options import DiscoverOptions, check_options
+from nnode.diagnosis.outcome import DiagnosisOutcome
+from nnode.diagnosis.residuals.engine import Engine, of_residuals, square_of
+from nnode.diagnosis.residuals.fit import Fit, refine
+from nnode.diagnosis.residuals.variables import Curves, Variable
+from nnode.diagnosis.result import (
+    Absence,
+    Clusters,
+    Diagnosis,
+    FirstScreen,
+    NamedEffect,
+    Place,
+    Variation,
+    Verdict,
+)
+from nnode.diagnosis.search import (
+    Selection,
+    best_fit,
+    converged_fit,
+    initial_fit,
+    likely_extensions,
+    search,
+    without_steps,
+)
+from nnode.diagnosis.statistics.bounds import parameters_at_bounds
+from nnode.diagnosis.statistics.combination import least_confirmation
+from nnode.diagnosis.statistics.power import PowerSimulation
+from nnode.diagnosis.statistics.random_effects import IndividualEstimate, estimate_individual
+from nnode.diagnosis.statistics.simultaneous import Simultaneous, simultaneous
+from nnode.diagnosis.verdict import (
+    absences,
+    agents_absent,
+    named,
+    named_agents,
+    places,
+    structure,
+)
+from nnode.errors import SimulationError
+from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
+from nnode.model.system import System
+from nnode.population.drivers import EXPLAINED, likeliest
+from nnode.population.followers import drivers_differ, without_errors
+from nnode.population.intervals import variations
+from nnode.progress import Stages
+
+#: Number of the strongest effects that the first screen lists.
+SCREENED = 3
+#: Why a model is not diagnosed whose simulations diverge.
+BLOWS_UP = (
+    "the model cannot be simulated on these data: it blows up from its own parameters and "
+    "from those near the measured rates; start from others, or look at the data"
+)
+
+
+#: Stages of a diagnosis, with the seconds that they take on 40 platoons of six by ``idm`` with a
+#: zone, beside other work.
+STAGES = {
+    "calibrating": 79.0,
+    "locating": 12.0,
+    "naming": 69.0,
+    "confirming": 30.0,
+}
+
+
+@dataclass
+class _Clock:
+    """Seconds that each part of the diagnosis took."""
+
+    last: float
+    seconds: dict[str, float]
+
+    def lap(self, name: str) -> None:
+        now = time.monotonic()
+        self.seconds[name] = round(now - self.last, 3)
+        self.last = now
+
+
+@dataclass
+class _Exploration:
+    """The results of the exploration sequences.
+
+    Attributes:
+        base: the calibrated model. base_curves: the curves in its residuals.
+        located: these curves in words.
+        selection: the effects that were added to it.
+        simultaneity: whether simultaneous clusters are independent, in the residuals of the
+            selected model.
+    """
+
+    division: Division
+    engine: Engine
+    base: Fit
+    base_system: System
+    variables: list[Variable]
+    base_curves: list[Curves]
+    located: list[Place]
+    selection: Selection
+    simultaneity: Simultaneous
+
+
+def diagnose_law(
+    system: System,
+    sequences: list[Sequence],
+    options: DiscoverOptions,
+    *,
+    stages: Stages | None = None,
+    nearer: BetterLaw | None = None,
+    hint: System | None = None,
+) -> DiagnosisOutcome:
+    """Diagnose which effects a model lacks on some sequences.
+
+    Args:
+        system: the model; it is not changed.
+        sequences: without faults, at least three of them.
+        options: see :class:`~nnode.diagnosis.options.DiscoverOptions`.
+        stages: shows how far the work is.
+        nearer: a law that fits these sequences better. An effect that this law does not need is
+            reported as not confirmed.
+        hint: the model, calibrated with effects that another law lacks.
+
+    Raises:
+        ConfigError: options that do not fit.
+        DataError: too few sequences.
+        SimulationError: the model cannot be simulated on these data at all.
+    """
+    names = check_options(options, system.domain, system.order)
+    check_model(system)
+    clock = _Clock(time.monotonic(), {})
+    stages = stages or Stages("diagnosis", STAGES)
+    differ = drivers_differ(system, sequences)
+    used, notes = _used(system, sequences, differ)
+    offered, refused = _offered(system, names, differ)
+    effects = [effect for effect in offered if not issubclass(effect, IndividualEffect)]
+    explore = partial(
+        _explore, system, sequences, used, options, effects, differ, clock, stages, hint
+    )
+    exploration = explore()
+    if exploration.simultaneity.together:
+        exploration = replace(explore(together=True), simultaneity=exploration.simultaneity)
+    division, engine = exploration.division, exploration.engine
+    base_system, selection = exploration.base_system, exploration.selection
+    notes += [division.note] if division.note else []
+    selection, imitations, law_at_bounds = _without_imitations(exploration, nearer, notes)
+    numbers = _clusters(exploration, options, len(effects))
+    testable = numbers.exploration >= numbers.least_exploration
+    stages.begin("confirming")
+    confirmation = ConfirmationSet(
+        engine,
+        base_system,
+        [used[i] for i in division.exploration],
+        [used[i] for i in division.confirmation],
+        division.label[division.confirmation],
+        numbers.confirmation,
+        options.alpha,
+        options.seed,
+    )
+    kinds = [effect for effect in offered if issubclass(effect, IndividualEffect)]
+    individuals = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
+    selection, unconfirmed = confirmation.confirmed(engine, selection)
+    law_at_bounds |= parameters_at_bounds(base_system, selection.fit, engine.cluster)
+    unexplained = _unexplained(exploration, selection)
+    assert selection.screen is not None
+    power = PowerSimulation(
+        selection.screen, options.alpha, numbers.confirmation if testable else 0
+    )
+    absent_effects = absences(selection, power)
+    corrected = confirmation.corrected(engine, selection)
+    if unconfirmed:
+        refitted = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
+        individuals = _less_significant(individuals, refitted)
+    estimates = _bonferroni([estimate for estimate in individuals if estimate is not None])
+    agents = [
+        confirmation.agents(estimate, corrected.system, bool(unexplained), testable)
+        for estimate in estimates
+    ]
+    tested = list(zip(estimates, agents, strict=True))
+    named_individuals = [estimate for estimate, agent in tested if agent.named]
+    absent_effects += [
+        agents_absent(estimate, options.alpha / len(estimates), testable)
+        for estimate, agent in tested
+        if not agent.found
+    ]
+    extended = base_system
+    if selection.steps or named_individuals:
+        extended = confirmation.with_agents(engine, corrected, named_individuals)
+    gap, errors, simulations = confirmation.gap(extended, named_individuals)
+    clock.lap("confirm")
+    effects_named = [
+        *(confirmation.named(engine, corrected, step) for step in selection.steps),
+        *(
+            named_agents(estimate, agent.confirmed, system.order)
+            for estimate, agent in tested
+            if agent.named
+        ),
+    ]
+    hypotheses = [
+        *unconfirmed,
+        *imitations,
+        *(
+            named_agents(estimate, agent.confirmed, system.order)
+            for estimate, agent in tested
+            if agent.found and not agent.named
+        ),
+    ]
+    diagnosis = Diagnosis(
+        verdict=_verdict(
+            selection,
+            unexplained,
+            1 - square_of(engine, selection.fit.system) / square_of(engine, base_system),
+            bool(named_individuals),
+            testable,
+            bool(imitations or law_at_bounds),
+            absent_effects,
+        ),
+        domain=system.domain,
+        model="",
+        clusters=numbers,
+        screen=_first_screen(selection, numbers),
+        confirmation=confirmation.confirmation(agents),
+        effects=effects_named,
+        hypotheses=hypotheses,
+        agents=agents,
+        drivers=_drivers(engine, selection.fit, options.seed, notes),
+        data_faults=[],
+        not_testable=[absence.name for absence in absent_effects if not absence.testable],
+        absences=absent_effects,
+        places=exploration.located,
+        unknown=structure(unexplained) if unexplained else None,
+        gap=gap,
+        base=_shift(base_system, extended),
+        split={
+            "exploration": [sequences[i].name for i in division.exploration],
+            "confirmation": [sequences[i].name for i in division.confirmation],
+        },
+        notes=notes,
+        law_at_bounds=sorted(law_at_bounds),
+        not_offered=refused,
+        seconds=clock.seconds,
+        confirmation_errors=errors,
+    )
+    return DiagnosisOutcome(
+        diagnosis=diagnosis,
+        base=base_system,
+        extended=extended,
+        searched=exploration.selection.fit.system,
+        exploration=division.exploration,
+        confirmation=division.confirmation,
+        simulated=simulations,
+    )
+
+
+def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves]:
+    """The curves that remain significant in the residuals of a selected model."""
+    engine, remaining = exploration.engine, exploration.base_curves
+    if selection.fit is not exploration.base:
+        remaining = curves(engine, selection.fit, exploration.variables)
+        remaining = significant_curves(engine, selection.fit, remaining, thresholds.STRICT)
+    return [c for c in remaining if c.relevant and c.removed > thresholds.SMALLEST_SHARE]
+
+
+def _used(
+    system: System, sequences: list[Sequence], differ: bool
+) -> tuple[list[Sequence], list[str]]:
+    """The sequences as they are used, and notes on what is left out.
+
+    Args:
+        differ: whether drivers differ.
+    """
+    if differ and system.order == 1 and without_errors(sequences):
+        return without_starts(sequences), [SETTLED]
+    return sequences, []
+
+
+def _offered(
+    system: System, names: list[str], differ: bool
+) -> tuple[list[type[Effect]], dict[str, str]]:
+    """The effects that are tested, and by name why others are not.
+
+    Args:
+        names: of all candidates.
+        differ: whether drivers differ.
+    """
+    catalogue = CATALOGUE.of(system.domain, system.order)
+    candidates = [effect for effect in catalogue if effect.name in names]
+    refused = {e.name: reason for e in candidates if (reason := not_offered(e, system, differ))}
+    return [effect for effect in candidates if effect.name not in refused], refused
+
+
+def _less_significant(
+    before: list[IndividualEstimate | None], after: list[IndividualEstimate | None]
+) -> list[IndividualEstimate | None]:
+    """The less significant estimates of two models, if both exist. An unconfirmed effect that was
+    removed could otherwise show as a difference between agents."""
+    pairs = [(a, b) for a, b in zip(before, after, strict=True) if a and b]
+    return [max(pair, key=lambda estimate: estimate.p_value) for pair in pairs]
+
+
+def _bonferroni(estimates: list[IndividualEstimate]) -> list[IndividualEstimate]:
+    """The estimates with p-values that are corrected for their number."""
+    number = len(estimates)
+    return [
+        replace(estimate, p_value=min(1.0, estimate.p_value * number)) for estimate in estimates
+    ]
+
+
+def _drivers(engine: Engine, fit: Fit, seed: int, notes: list[str]) -> list[Variation]:
+    """The variances between drivers and over time, under the model with all selected effects.
+
+    Args:
+        seed: of the simulations that correct their bias.
+        notes: notes are added to them if the estimation does not converge, and if pushes explain a
+            large part of the rates.
+    """
+    if not isinstance(engine, FollowersEngine):
+        return []
+    engine.fit_whitening(fit.system, torch.from_numpy(fit.row))
+    assert engine.population is not None
+    population = engine.drivers(seed)
+    if not population.estimate.converged:
+        notes.append(
+            "The estimation of the differences between drivers did not converge. They are not "
+            "corrected for their bias."
+        )
+    drivers = [Variation(name, **row) for name, row in variations(population).items()]
+    push = next(row for row in drivers if row.name == "push")
+    if push.at_bound == "high" or not engine.population.explains_rates:
+        rate = "accelerations" if fit.system.order > 1 else "speeds"
+        hint = ""
+        if without_errors(engine.sequences) and not engine.apart:
+            hint = " If positions were smoothed before, set discover.smoothed=true."
+        notes.append(
+            f"The law explains little of how {rate} vary: pushes have a standard deviation of "
+            f"{push.estimate:.3g} {push.unit}, more than {EXPLAINED:.0%} of that of the {rate}. "
+            f"Effects may be hidden behind them. Compare other laws.{hint}"
+        )
+    return drivers
+
+
+def _without_imitations(
+    exploration: _Exploration, nearer: BetterLaw | None, notes: list[str]
+) -> tuple[Selection, list[NamedEffect], set[str]]:
+    """Remove effects that imitate another law; they become hypotheses. They are those that a
+    better-fitting law does not need, and all if parameters of the diagnosed law end at bounds.
+
+    Args:
+        notes: the reason is added to them.
+
+    Returns:
+        The selection, the hypotheses, and the parameters at bounds.
+    """
+    engine, selection, division = exploration.engine, exploration.selection, exploration.division
+    law_at_bounds = parameters_at_bounds(exploration.base_system, selection.fit, engine.cluster)
+    steps = selection.steps if law_at_bounds else []
+    if nearer is not None and selection.steps and not law_at_bounds:
+        label = division.label[division.exploration]
+        steps, p_value = explained_by_law(engine, selection, label, nearer)
+        if steps:
+            names = ", ".join(step.chosen.name for step in steps)
+            notes.append(
+                f"{names}: {nearer.name} does without and predicts left-out clusters better than "
+                f"the model with it (one-sided p = {p_value:.2g}); it is a hypothesis."
+            )
+    imitations = [named(engine, selection.fit, step) for step in steps]
+    remaining = without_steps(engine, selection, steps, exploration.base_system)
+    return remaining, imitations, law_at_bounds
+
+
+def _explore(
+    system: System,
+    sequences: list[Sequence],
+    used: list[Sequence],
+    options: DiscoverOptions,
+    effects: list[type[Effect]],
+    differ: bool,
+    clock: _Clock,
+    stages: Stages,
+    hint: System | None,
+    together: bool = False,
+) -> _Exploration:
+    """Calibrate, locate deviations, and select effects on the exploration sequences.
+
+    Args:
+        sequences: as they are divided into clusters. used: the same, as they are compared.
+        differ: whether drivers differ.
+        together: simultaneous sequences form one cluster.
+    """
+    stages.begin("calibrating")
+    division = divide(sequences, options, together=together)
+    exploration_sequences = [used[i] for i in division.exploration]
+    label = division.label[division.exploration]
+    apart = spacing(used, options)
+    engine = engine_of(system, exploration_sequences, label, differ=differ, apart=apart)
+    testable = int(engine.cluster.max()) + 1 >= _least_clusters(options, len(effects))
+    initial = initial_fit(engine, copy.deepcopy(system).double())
+    if initial is None:
+        raise SimulationError(BLOWS_UP)
+    hints = [] if hint is None else [hint]
+    if isinstance(engine, FollowersEngine):
+        try:
+            populations = [engine.population_of(initial.system)]
+        except SimulationError as error:
+            raise SimulationError(BLOWS_UP) from error
+        if testable and not populations[0].plausible:
+            # a strong missing effect is attributed to pushes
+            usual = engine.with_usual_variances(initial.system)
+            extensions = likely_extensions(usual, refine(usual, initial.system), effects)
+            hints += extensions
+            for extension in extensions:
+                with suppress(SimulationError):
+                    populations.append(engine.population_of(extension))
+                if populations[-1].plausible:
+                    break
+        engine.set_population(likeliest(populations))
+        fit = best_fit(engine, [populations[0].system, initial.system])
+        if fit is None:
+            raise SimulationError(BLOWS_UP)
+        base = fit
+    else:
+        base = converged_fit(engine, initial.system)
+    base_system = copy.deepcopy(base.system)
+    clock.lap("calibrate")
+    stages.begin("locating")
+    variables = engine.variables() if options.structure else []
+    base_curves = significant_curves(
+        engine, base, curves(engine, base, variables), thresholds.STRICT
+    )
+    located = places(base_curves, _excess(engine, base))
+    clock.lap("locate")
+    stages.begin("naming")
+    selection = search(
+        engine,
+        base,
+        effects,
+        max_effects=options.max_effects if testable else 0,
+        seed=options.seed,
+        variables=variables,
+        levels=_levels(engine, effects),
+        within=stages.within,
+        hints=hints,
+    )
+    # a missing effect correlates the residuals of all clusters, so they are tested after selection
+    simultaneity = simultaneous(engine, selection.fit, options.seed)
+    clock.lap("name")
+    return _Exploration(
+        division=division,
+        engine=engine,
+        base=base,
+        base_system=base_system,
+        variables=variables,
+        base_curves=base_curves,
+        located=located,
+        selection=selection,
+        simultaneity=simultaneity,
+    )
+
+
+def _least_clusters(options: DiscoverOptions, effects: int) -> int:
+    """The number of exploration clusters that are needed to name any effect."""
+    return least_number(options.alpha, hypotheses=max(effects, 1))
+
+
+def _clusters(exploration: _Exploration, options: DiscoverOptions, effects: int) -> Clusters:
+    """The numbers of clusters, and the numbers that are needed."""
+    division, least_exploration = exploration.division, _least_clusters(options, effects)
+    sufficient = next(
+        number
+        for number in count(2)
+        if least_confirmation()
+        <= round(options.confirmation * number)
+        <= number - least_exploration
+    )
+    return Clusters(
+        exploration=int(exploration.engine.cluster.max()) + 1,
+        confirmation=0 if division.note else division.number(division.confirmation),
+        least_exploration=least_exploration,
+        least_confirmation=least_confirmation(),
+        enough=sufficient,
+        why=division.why,
+        simultaneous=exploration.simultaneity.plain(),
+        note=division.note,
+    )
+
+
+def _levels(engine: Engine, effects: list[type[Effect]]) -> dict[str, np.ndarray]:
+    """Recordings ``(n,)`` of the residuals, for effects of a covariate that is constant within
+    recordings."""
+    positions = np.arange(len(engine.sequences))
+    levels = {}
+    for effect in effects:
+        label = level(engine.sequences, positions, effect.covariate)
+        if label is not positions:
+            levels[effect.name] = of_residuals(label, engine.sequence)
+    return levels
+
+
+def _first_screen(selection: Selection, numbers: Clusters) -> FirstScreen:
+    """The scores of all effects against the calibrated model."""
+    best = min(selection.first, key=lambda score: score.p_value, default=None)
+    strongest = [
+        {"name": s.effect.name, "share": s.gain, "p_value": s.p_value, **s.amount}
+        for s in selection.first[:SCREENED]
+    ]
+    floor = 2.0 ** (1 - numbers.exploration)
+    if best is None:
+        return FirstScreen(None, "", numbers.exploration, floor)
+    return FirstScreen(best.p_value, best.effect.name, numbers.exploration, floor, strongest)
+
+
+def _excess(engine: Engine, fit: Fit) -> float:
+    """Share of the squared errors of positions that is not measurement noise."""
+    floor = engine.noise_floor()
+    return 1.0 if np.isnan(floor) else max(1 - floor / square_of(engine, fit.system), 1e-3)
+
+
+def _verdict(
+    selection: Selection,
+    unexplained: list[Curves],
+    removed: float,
+    individuals_named: bool,
+    testable: bool,
+    law_is_wrong: bool,
+    absences: list[Absence],
+) -> Verdict:
+    """The verdict.
+
+    Args:
+        removed: share of the squared errors that the named effects removed.
+        individuals_named: whether agent-specific parameters were confirmed.
+        law_is_wrong: whether effects were selected that a better-fitting law does not need, or
+            its own parameters are at bounds.
+        absences: the effects that were not found.
+    """
+    if not testable:
+        return "not_testable"
+    if selection.steps:
+        # the named effects may have removed less than nothing, without any structure that is left
+        limit = thresholds.UNEXPLAINED * removed
+        if unexplained and unexplained[0].removed * (1 - removed) > limit:
+            return "unknown"
+        return "indistinguishable" if any(step.rivals for step in selection.steps) else "named"
+    if individuals_named:
+        return "named"
+    if unexplained or law_is_wrong:
+        return "unknown"
+    if absences and not any(absence.testable for absence in absences):
+        return "not_testable"
+    return "none"
+
+
+def _shift(before: System, after: System) -> dict[str, dict[str, Any]]:
+    """The base model's parameters before and after effects were added."""
+    extended = after.physical()
+    return {
+        name: {"before": float(value), "after": float(extended[name][0]), "unit": unit}
+        for name, (value, unit) in before.physical().items()
+        if name in extended
+    }

@@ -1,1 +1,0 @@
-"""Comparison of base laws, before effects are selected."""

@@ -1,1 +1,0 @@
-"""Verdicts on the selected effects, and their confirmation on held-back clusters."""

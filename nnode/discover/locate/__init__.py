@@ -1,1 +1,0 @@
-"""Where the model deviates from the data: nonparametric curves of the residuals."""

@@ -1,1 +1,0 @@
-"""Stepwise selection of the effects of the catalogue that a model lacks."""

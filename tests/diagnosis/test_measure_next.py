@@ -1,0 +1,71 @@
+"""The leader behind whom two effects part most."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from nnode.diagnosis import measure_next
+from nnode.diagnosis.lanes.engine import TrafficEngine
+from nnode.diagnosis.measure_next import (
+    COMFORTABLE,
+    POWER,
+    best_profile,
+    distance,
+    evaluated_profiles,
+)
+from nnode.diagnosis.search import converged_fit
+from tests.diagnosis.platoons import V0, lin, platoons
+
+MEAN, PERIOD = 15.0, 8.0
+
+
+DELAY = {"name": "reaction_delay", "T": 0.3}
+INERTIA = {"name": "inertia", "tau_v": 0.3}
+
+
+@pytest.fixture(scope="module")
+def engine() -> TrafficEngine:
+    found = TrafficEngine(platoons(driver=0.8))
+    converged_fit(found, lin())
+    return found
+
+
+def test_what_own_parameters_mend_is_no_distance(engine: TrafficEngine) -> None:
+    other = distance(engine, lin(DELAY), lin(), MEAN, 2.0, PERIOD)
+    assert distance(engine, lin(), lin(), MEAN, 2.0, PERIOD) < 1e-4 * other
+    assert distance(engine, lin(), lin(v0=1.001 * V0), MEAN, 2.0, PERIOD) < 1e-2 * other
+
+
+def test_livelier_leaders_tell_more(engine: TrafficEngine) -> None:
+    calm, lively = (
+        distance(engine, lin(DELAY), lin(INERTIA), MEAN, swing, PERIOD) for swing in (0.2, 2.0)
+    )
+    assert lively > 50 * calm > 0
+
+
+@pytest.mark.thorough
+def test_the_number_of_platoons_tells_with_the_probability_that_is_asked_for(
+    engine: TrafficEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(measure_next, "distance", cache(distance))  # whatever the level
+    first, second = lin(DELAY), lin(INERTIA)
+    found = list(evaluated_profiles(engine, first, second, 0.05))
+    best = best_profile(engine, first, second, 0.05)
+    surer = best_profile(engine, first, second, 0.01)
+    assert best is not None
+    assert surer is not None
+    assert surer.platoons > best.platoons
+    assert best.platoons == min(one.platoons for one in found) < max(o.platoons for o in found)
+    for one in found:
+        assert one.swing * 2 * math.pi / one.period <= COMFORTABLE * (1 + 1e-9)
+    # clusters' sums of squares, were their residuals independent
+    rng, size = np.random.default_rng(4), 0.3
+    number = math.ceil(4 * (stats.norm.ppf(0.95) + stats.norm.ppf(POWER)) ** 2 / size**2)
+    rise = size**2 + 2 * size * rng.normal(size=(4000, number))
+    z = rise.mean(1) / (2 * size) * math.sqrt(number)
+    assert (z > stats.norm.ppf(0.95)).mean() == pytest.approx(POWER, abs=0.02)

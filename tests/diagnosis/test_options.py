@@ -1,0 +1,39 @@
+"""Options of the diagnosis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from nnode.diagnosis.options import DiscoverOptions, check_options
+from nnode.errors import ConfigError
+from nnode.model.effects import CATALOGUE
+from tests.diagnosis import stand_in
+
+
+def test_all_effects_of_the_domain_are_looked_for_unless_some_are_chosen() -> None:
+    known = [effect.name for effect in CATALOGUE.of("traffic")]
+    assert "speed_zone" in known
+    assert check_options(DiscoverOptions(), "traffic") == known
+    rest = check_options(DiscoverOptions(exclude=["speed_zone"]), "traffic")
+    assert rest == [name for name in known if name != "speed_zone"]
+    both = DiscoverOptions(effects=["inertia", "speed_zone"], exclude=["inertia"])
+    assert check_options(both, "traffic") == ["speed_zone"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"effects": ["speed_zon"]}, r"discover\.effects: .*did you mean speed_zone\?"),
+        ({"exclude": ["inertias"]}, r"discover\.exclude: .*did you mean inertia\?"),
+        ({"effects": [stand_in.Wind.name]}, "an effect of crowd models"),
+        ({"confirmation": 1.0}, r"discover\.confirmation=1\.0 must lie between 0 and 1"),
+        ({"alpha": 0.0}, r"discover\.alpha=0\.0 must lie between 0 and 1"),
+        ({"max_effects": -1}, r"discover\.max_effects=-1 must be at least 0"),
+        ({"step": 0.0}, r"discover\.step=0\.0 must be a positive number"),
+    ],
+)
+def test_what_no_diagnosis_can_work_with_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        check_options(DiscoverOptions(**change), "traffic")
