@@ -67,14 +67,14 @@ def baselines_on_table(
         sequences = read_inputs(data, Path(scratch)).sequences
     division = divide(sequences, DiscoverOptions(seed=seed))
     exploration, confirmation = division.exploration, division.confirmation
-    engine = windows_of(system, [sequences[i] for i in exploration], division.label[exploration])
+    engine = windows_of(system, exploration.sequences, exploration.label)
     fit = converged_fit(engine, copy.deepcopy(system).double())
     offered = [e for e in CATALOGUE.of(cast(Domain, domain)) if not issubclass(e, IndividualEffect)]
     columns = [trace for effect in offered for trace in traces(engine, fit, effect)]
     values = np.concatenate([trace.columns for trace in columns], axis=1)
     library = Library(values, -fit.residual, fit.tangents, engine.cluster)
 
-    whole = engine_of(system, [sequences[i] for i in confirmation], whole=True)
+    whole = engine_of(system, confirmation.sequences, whole=True)
     whole.fit_whitening(fit.system, ParameterVector(fit.system).row)
     before, floor = square_of(whole, fit.system), whole.noise_floor()
     reports = {}

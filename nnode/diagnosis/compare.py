@@ -25,7 +25,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import better
 from nnode.data.sequence import Sequence
 from nnode.diagnosis import thresholds
-from nnode.diagnosis.division import divide, spacing, without_starts
+from nnode.diagnosis.division import divide, spacing
 from nnode.diagnosis.eligibility import check_model, not_offered
 from nnode.diagnosis.lanes.followers import FollowersEngine
 from nnode.diagnosis.model_comparison import engine_of, windows_of
@@ -73,23 +73,19 @@ def compare_laws(
     Raises:
         DataError: too few sequences.
     """
-    division = divide(sequences, options)
-    exact = without_errors(sequences)
     asked = candidates[name]
     differ = drivers_differ(asked, sequences)
-    used = without_starts(sequences) if differ and exact else sequences
-    exploration = [used[i] for i in division.exploration]
-    label = division.label[division.exploration]
+    skip_starts = differ and without_errors(sequences)
+    part = divide(sequences, options, skip_starts=skip_starts).exploration
     formulas, refused = dict(candidates), dict[str, str]()
     engine: Engine
     if differ:
         formulas = {key: law for key, law in candidates.items() if follower_formula(law)}
         refused = {key: NO_FORMULA for key in candidates if key not in formulas}
-        engine = FollowersEngine(
-            exploration, label, large=np.inf, apart=spacing(sequences, options)
-        )
+        apart = spacing(sequences, options)
+        engine = FollowersEngine(part.sequences, part.label, large=np.inf, apart=apart)
     else:
-        engine = engine_of(asked, exploration, label, whole=True)
+        engine = engine_of(asked, part.sequences, part.label, whole=True)
     fits, failed = _calibrated(engine, formulas, within)
     refused |= failed
     if not fits:
@@ -101,7 +97,7 @@ def compare_laws(
     if isinstance(engine, FollowersEngine):
         compared = _by_likelihood(engine, formulas, fits, refused, within)
     else:
-        compared = _by_cost(windows_of(asked, exploration, label), fits, errors, within)
+        compared = _by_cost(windows_of(asked, part.sequences, part.label), fits, errors, within)
     ranking = [
         ComparedLaw(
             name=key,

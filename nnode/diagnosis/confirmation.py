@@ -14,6 +14,7 @@ from nnode.data.clusters import better
 from nnode.data.sequence import Sequence
 from nnode.diagnosis import thresholds
 from nnode.diagnosis.crowds.indirect_inference import bias_corrected
+from nnode.diagnosis.division import Part
 from nnode.diagnosis.held_out import MODELS, HeldOutErrors, held_out_errors
 from nnode.diagnosis.model_comparison import ModelComparison, engine_of, too_few
 from nnode.diagnosis.outcome import Simulation
@@ -128,8 +129,7 @@ class ConfirmationSet:
     Args:
         engine: of the exploration sequences.
         base: the model as it was given, calibrated.
-        exploration, confirmation: sequences.
-        label: ``(S,)`` clusters of the confirmation sequences.
+        exploration: sequences. confirmation: sequences with their clusters.
         clusters: the number of them that are independent of the exploration clusters.
         alpha: level of exploration and confirmation clusters together.
         seed: of simulations.
@@ -143,17 +143,19 @@ class ConfirmationSet:
         engine: Engine,
         base: System,
         exploration: list[Sequence],
-        confirmation: list[Sequence],
-        label: np.ndarray,
+        confirmation: Part,
         clusters: int,
         alpha: float,
         seed: int,
     ) -> None:
         self.alpha, self.n_exploration = alpha, int(engine.cluster.max()) + 1
         self.domain = str(base.domain)
-        self.base, self.exploration, self.sequences = base, exploration, confirmation
-        self.label, self.clusters, self.seed = label, clusters, seed
-        self.comparison = ModelComparison(engine_of(base, confirmation, label, like=engine), base)
+        self.base, self.exploration = base, exploration
+        self.sequences, self.label = confirmation.sequences, confirmation.label
+        self.clusters, self.seed = clusters, seed
+        self.comparison = ModelComparison(
+            engine_of(base, self.sequences, self.label, like=engine), base
+        )
         self.before = self.comparison.squares(base)
         self.tests: dict[str, _ModelTest] = {}
         self._corrected_fit: Fit | None = None

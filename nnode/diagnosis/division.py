@@ -27,30 +27,48 @@ SETTLED = (
 
 
 @dataclass(frozen=True)
+class Part:
+    """Some of the sequences of a diagnosis.
+
+    Attributes:
+        places: their positions in the list of all sequences.
+        sequences: as they are used.
+        label: ``(S,)`` their clusters, numbered over all sequences.
+    """
+
+    places: list[int]
+    sequences: list[Sequence]
+    label: np.ndarray
+
+    @property
+    def clusters(self) -> int:
+        """The number of clusters."""
+        return len(np.unique(self.label))
+
+
+@dataclass(frozen=True)
 class Division:
     """Exploration and confirmation sequences.
 
     Attributes:
-        label: ``(S,)`` cluster of each sequence.
-        exploration, confirmation: positions of the sequences. No cluster is on both sides, unless
-            there is only one: then a block of time is held back, and ``note`` says so.
+        exploration, confirmation: the parts. No cluster is in both, unless there is only one: then
+            a block of time is held back, and ``note`` says so.
         why: the definition of a cluster, in words.
         note: a restriction of the confirmation set; empty: none.
     """
 
-    label: np.ndarray
-    exploration: list[int]
-    confirmation: list[int]
+    exploration: Part
+    confirmation: Part
     why: str
     note: str = ""
 
-    def number(self, places: list[int]) -> int:
-        """The number of clusters of some sequences."""
-        return len(np.unique(self.label[places]))
-
 
 def divide(
-    sequences: list[Sequence], options: DiscoverOptions, *, together: bool = False
+    sequences: list[Sequence],
+    options: DiscoverOptions,
+    *,
+    together: bool = False,
+    skip_starts: bool = False,
 ) -> Division:
     """Hold back a share of the clusters, but at most half of the sequences.
 
@@ -59,6 +77,7 @@ def divide(
 
     Args:
         together: simultaneous sequences form one cluster.
+        skip_starts: leave out the time in which a simulation adapts to its start.
 
     Raises:
         DataError: fewer than three sequences, or none that could be held back.
@@ -72,21 +91,21 @@ def divide(
     label = clusters(index, options.gap, together=together)
     why = f"sequences of a site that {relation(index, options.gap)}"
     why += " or overlap in time" if together else ""
-    number = int(label.max()) + 1
-    wanted = round(options.confirmation * number)
-    if number > 1:
-        held = _drawn(label, max(wanted, 1), np.random.default_rng(options.seed))
-        if held:
-            out = np.isin(label, held)
-            return Division(label, np.flatnonzero(~out).tolist(), np.flatnonzero(out).tolist(), why)
-    parts = split(
-        index, SplitOptions(heldout=options.confirmation, gap=options.gap, seed=options.seed)
-    )
-    note = (
-        "All sequences are connected. The confirmation sequences are a block of time and are not "
-        "independent of the exploration sequences."
-    )
-    return Division(label, parts.train, parts.heldout, why, note)
+    wanted = max(round(options.confirmation * (int(label.max()) + 1)), 1)
+    held_back = np.isin(label, _drawn(label, wanted, np.random.default_rng(options.seed)))
+    places, note = [np.flatnonzero(~held_back).tolist(), np.flatnonzero(held_back).tolist()], ""
+    if not held_back.any():
+        parts = split(
+            index, SplitOptions(heldout=options.confirmation, gap=options.gap, seed=options.seed)
+        )
+        places = [parts.train, parts.heldout]
+        note = (
+            "All sequences are connected. The confirmation sequences are a block of time and are "
+            "not independent of the exploration sequences."
+        )
+    used = [_without_start(s) for s in sequences] if skip_starts else sequences
+    exploration, confirmation = (Part(p, [used[i] for i in p], label[p]) for p in places)
+    return Division(exploration, confirmation, why, note)
 
 
 def _drawn(label: np.ndarray, wanted: int, rng: np.random.Generator) -> list[int]:
@@ -105,9 +124,7 @@ def spacing(sequences: list[Sequence], options: DiscoverOptions) -> float:
     return APART if options.smoothed and without_errors(sequences) else 0.0
 
 
-def without_starts(sequences: list[Sequence]) -> list[Sequence]:
-    """The sequences without the time in which a simulation adapts to its start."""
-    shares = [min(SETTLING / max(np.ptp(s.time), s.dt), SETTLING_SHARE) for s in sequences]
-    return [
-        replace(s.part(share, 1.0), name=s.name) for s, share in zip(sequences, shares, strict=True)
-    ]
+def _without_start(sequence: Sequence) -> Sequence:
+    """The sequence without the time in which a simulation adapts to its start."""
+    share = min(SETTLING / max(np.ptp(sequence.time), sequence.dt), SETTLING_SHARE)
+    return replace(sequence.part(share, 1.0), name=sequence.name)

@@ -19,7 +19,7 @@ from nnode.diagnosis import thresholds
 from nnode.diagnosis.compare import BetterLaw, explained_by_law
 from nnode.diagnosis.confirmation import ConfirmationSet
 from nnode.diagnosis.curves import curves, significant_curves
-from nnode.diagnosis.division import SETTLED, Division, divide, spacing, without_starts
+from nnode.diagnosis.division import SETTLED, Division, divide, spacing
 from nnode.diagnosis.eligibility import check_model, not_offered
 from nnode.diagnosis.lanes.followers import FollowersEngine
 from nnode.diagnosis.model_comparison import engine_of
@@ -153,11 +153,12 @@ def diagnose_law(
     clock = _Clock(time.monotonic(), {})
     stages = stages or Stages("diagnosis", STAGES)
     differ = drivers_differ(system, sequences)
-    used, notes = _used(system, sequences, differ)
+    skip_starts = differ and system.order == 1 and without_errors(sequences)
+    notes = [SETTLED] if skip_starts else []
     offered, refused = _offered(system, names, differ)
     effects = [effect for effect in offered if not issubclass(effect, IndividualEffect)]
     explore = partial(
-        _explore, system, sequences, used, options, effects, differ, clock, stages, hint
+        _explore, system, sequences, options, effects, differ, skip_starts, clock, stages, hint
     )
     exploration = explore()
     if exploration.simultaneity.together:
@@ -172,9 +173,8 @@ def diagnose_law(
     confirmation = ConfirmationSet(
         engine,
         base_system,
-        [used[i] for i in division.exploration],
-        [used[i] for i in division.confirmation],
-        division.label[division.confirmation],
+        division.exploration.sequences,
+        division.confirmation,
         numbers.confirmation,
         options.alpha,
         options.seed,
@@ -254,8 +254,8 @@ def diagnose_law(
         gap=gap,
         base=_shift(base_system, extended),
         split={
-            "exploration": [sequences[i].name for i in division.exploration],
-            "confirmation": [sequences[i].name for i in division.confirmation],
+            "exploration": [s.name for s in division.exploration.sequences],
+            "confirmation": [s.name for s in division.confirmation.sequences],
         },
         notes=notes,
         law_at_bounds=sorted(law_at_bounds),
@@ -268,8 +268,8 @@ def diagnose_law(
         base=base_system,
         extended=extended,
         searched=exploration.selection.fit.system,
-        exploration=division.exploration,
-        confirmation=division.confirmation,
+        exploration=division.exploration.places,
+        confirmation=division.confirmation.places,
         simulated=simulations,
     )
 
@@ -281,19 +281,6 @@ def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves
         remaining = curves(engine, selection.fit, exploration.variables)
         remaining = significant_curves(engine, selection.fit, remaining, thresholds.STRICT)
     return [c for c in remaining if c.relevant and c.removed > thresholds.SMALLEST_SHARE]
-
-
-def _used(
-    system: System, sequences: list[Sequence], differ: bool
-) -> tuple[list[Sequence], list[str]]:
-    """The sequences as they are used, and notes on what is left out.
-
-    Args:
-        differ: whether drivers differ.
-    """
-    if differ and system.order == 1 and without_errors(sequences):
-        return without_starts(sequences), [SETTLED]
-    return sequences, []
 
 
 def _offered(
@@ -377,7 +364,7 @@ def _without_imitations(
     law_at_bounds = parameters_at_bounds(exploration.base_system, selection.fit, engine.cluster)
     steps = selection.steps if law_at_bounds else []
     if nearer is not None and selection.steps and not law_at_bounds:
-        label = division.label[division.exploration]
+        label = division.exploration.label
         steps, p_value = explained_by_law(engine, selection, label, nearer)
         if steps:
             names = ", ".join(step.chosen.name for step in steps)
@@ -393,10 +380,10 @@ def _without_imitations(
 def _explore(
     system: System,
     sequences: list[Sequence],
-    used: list[Sequence],
     options: DiscoverOptions,
     effects: list[type[Effect]],
     differ: bool,
+    skip_starts: bool,
     clock: _Clock,
     stages: Stages,
     hint: System | None,
@@ -405,16 +392,14 @@ def _explore(
     """Calibrate, locate deviations, and select effects on the exploration sequences.
 
     Args:
-        sequences: as they are divided into clusters. used: the same, as they are compared.
         differ: whether drivers differ.
+        skip_starts: leave out the time in which a simulation adapts to its start.
         together: simultaneous sequences form one cluster.
     """
     stages.begin("calibrating")
-    division = divide(sequences, options, together=together)
-    exploration_sequences = [used[i] for i in division.exploration]
-    label = division.label[division.exploration]
-    apart = spacing(used, options)
-    engine = engine_of(system, exploration_sequences, label, differ=differ, apart=apart)
+    division = divide(sequences, options, together=together, skip_starts=skip_starts)
+    part, apart = division.exploration, spacing(sequences, options)
+    engine = engine_of(system, part.sequences, part.label, differ=differ, apart=apart)
     testable = int(engine.cluster.max()) + 1 >= _least_clusters(options, len(effects))
     initial = initial_fit(engine, copy.deepcopy(system).double())
     if initial is None:
@@ -496,7 +481,7 @@ def _clusters(exploration: _Exploration, options: DiscoverOptions, effects: int)
     )
     return Clusters(
         exploration=int(exploration.engine.cluster.max()) + 1,
-        confirmation=0 if division.note else division.number(division.confirmation),
+        confirmation=0 if division.note else division.confirmation.clusters,
         least_exploration=least_exploration,
         least_confirmation=least_confirmation(),
         enough=sufficient,

@@ -33,7 +33,7 @@ LAW = lin(v0=25.0, length=7.0)
 def turned() -> list[Sequence]:
     """Platoons whose confirmation ones react the other way round."""
     forth, back = (platoons(relative_speed(s * KAPPA), **MANY) for s in (1, -1))
-    confirmation = divide(forth, OPTIONS).confirmation
+    confirmation = divide(forth, OPTIONS).confirmation.places
     return [back[i] if i in confirmation else one for i, one in enumerate(forth)]
 
 
@@ -121,10 +121,7 @@ def test_with_too_few_clusters_nothing_is_named_and_it_says_how_many_would_do() 
     for number, do in ((d.clusters.enough, True), (d.clusters.enough - 3, False)):
         parts = divide(platoons(number=number, seconds=1.0), DiscoverOptions())
         least = d.clusters.least_exploration, d.clusters.least_confirmation
-        enough = (
-            parts.number(parts.exploration) >= least[0]
-            and parts.number(parts.confirmation) >= least[1]
-        )
+        enough = parts.exploration.clusters >= least[0] and parts.confirmation.clusters >= least[1]
         assert enough == do
     # what one would look at first is told all the same
     assert d.screen.strongest[0]["name"] in ("relative_speed", "asymmetric_response")

@@ -42,9 +42,11 @@ def alone(number: int) -> list[Sequence]:
 
 def assert_sound(found: Division, sequences: list[Sequence]) -> None:
     """Every sequence once, no cluster on both sides, at least half of them open."""
-    assert sorted(found.exploration + found.confirmation) == list(range(len(sequences)))
-    assert not set(found.label[found.exploration]) & set(found.label[found.confirmation])
-    assert 0 < len(found.confirmation) <= len(sequences) / 2
+    assert sorted(found.exploration.places + found.confirmation.places) == list(
+        range(len(sequences))
+    )
+    assert not set(found.exploration.label) & set(found.confirmation.label)
+    assert 0 < len(found.confirmation.places) <= len(sequences) / 2
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -52,14 +54,16 @@ def test_five_of_sixteen_clusters_are_sealed_as_it_takes_to_confirm(seed: int) -
     sequences = alone(16)
     found = divide(sequences, DiscoverOptions(seed=seed))
     assert_sound(found, sequences)
-    assert (found.number(found.exploration), found.number(found.confirmation)) == (11, 5)
+    assert (found.exploration.clusters, found.confirmation.clusters) == (11, 5)
     assert found.note == ""
     again = divide(sequences, DiscoverOptions(seed=seed))
-    assert (again.exploration, again.confirmation) == (found.exploration, found.confirmation)
+    assert again.exploration.places == found.exploration.places
+    assert again.confirmation.places == found.confirmation.places
 
 
 def test_another_seed_seals_other_clusters() -> None:
-    drawn = {tuple(divide(alone(16), DiscoverOptions(seed=seed)).confirmation) for seed in range(5)}
+    parts = [divide(alone(16), DiscoverOptions(seed=seed)).confirmation for seed in range(5)]
+    drawn = {tuple(part.places) for part in parts}
     assert len(drawn) > 1
 
 
@@ -73,8 +77,8 @@ def test_whole_clusters_are_sealed_but_never_more_than_half_of_the_sequences(see
     for share in (0.1, 0.3, 0.6, 0.9):
         found = divide(sequences, DiscoverOptions(seed=seed, confirmation=share))
         assert_sound(found, sequences)
-        assert found.number([*found.exploration, *found.confirmation]) == len(sizes)
-        assert found.number(found.confirmation) <= max(round(share * len(sizes)), 1)
+        assert found.exploration.clusters + found.confirmation.clusters == len(sizes)
+        assert found.confirmation.clusters <= max(round(share * len(sizes)), 1)
         assert found.note == ""
 
 
@@ -82,12 +86,12 @@ def test_one_cluster_alone_gives_a_block_of_time_and_says_so() -> None:
     # everybody is in two sequences: all of them hang together
     sequences = recorded(chr(200 + i) + chr(201 + i) for i in range(20))
     found = divide(sequences, DiscoverOptions())
-    assert found.number(found.exploration) == found.number(found.confirmation) == 1
+    assert found.exploration.clusters == found.confirmation.clusters == 1
     assert "are not independent of the exploration sequences" in found.note
-    first, last = min(found.confirmation), max(found.confirmation)
-    assert found.confirmation == list(range(first, last + 1))
-    who = {agent for i in found.confirmation for agent in sequences[i].agents}
-    assert not who & {agent for i in found.exploration for agent in sequences[i].agents}
+    places = found.confirmation.places
+    assert places == list(range(min(places), max(places) + 1))
+    who = {agent for i in places for agent in sequences[i].agents}
+    assert not who & {agent for i in found.exploration.places for agent in sequences[i].agents}
 
 
 def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
@@ -96,15 +100,15 @@ def test_what_is_simultaneous_is_on_one_side_where_that_is_asked_for() -> None:
     for together, number in ((False, 32), (True, 16)):
         found = divide(sequences, DiscoverOptions(), together=together)
         assert_sound(found, sequences)
-        assert found.number([*found.exploration, *found.confirmation]) == number
+        assert found.exploration.clusters + found.confirmation.clusters == number
         assert found.why.endswith("or overlap in time") == together
-    assert len(found.confirmation) == 10
+    assert len(found.confirmation.places) == 10
 
 
 def test_the_gap_between_sequences_without_names_is_an_option() -> None:
     sequences = recorded([""] * 16, lambda number: 6.0 * number)
     found = divide(sequences, DiscoverOptions(gap=3.0))
-    assert found.number(found.exploration) == 11
+    assert found.exploration.clusters == 11
     assert "are closer than 3 s in time" in found.why
     assert divide(sequences, DiscoverOptions()).note  # 4 s apart, so one chain
 
