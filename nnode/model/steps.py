@@ -33,7 +33,7 @@ def stepped(lane: LaneDynamics, method: str) -> LaneDynamics:
     Raises:
         ConfigError: the law names ``dt``, and the method has intermediate stages.
     """
-    if method == "rk4" and "dt" in lane.symbols:
+    if method == "rk4" and lane.is_map:
         raise ConfigError(
             "the law names dt, the length of a step: it says what holds one step later, and "
             "solver.method=rk4 has stages in between; take euler, semi_implicit or ballistic"

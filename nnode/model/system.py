@@ -60,6 +60,11 @@ class System(nn.Module):
         return None
 
     @property
+    def is_map(self) -> bool:
+        """Whether it is a formula that maps one step to the next."""
+        return self.formula is not None and self.formula.is_map
+
+    @property
     def depends_on_position(self) -> bool:
         """Whether rates depend on the origin of positions, as with a speed zone. It is True as
         well for models without a formula, where this is unknown."""
@@ -198,7 +203,7 @@ class Traffic(System):
     def step(self) -> str:
         law = self.terms[0] if len(self.terms) else None
         method = law.step if isinstance(law, Law) else None
-        if method == "rk4" and self.formula is not None and "dt" in self.formula.symbols:
+        if method == "rk4" and self.is_map:
             method = None  # an effect that remembers step by step has no stages in between
         return method or ("ballistic" if self.order > 1 else "euler")
 

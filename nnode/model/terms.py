@@ -273,6 +273,12 @@ class Dynamics:
         """Symbols in its formulas."""
         return frozenset(symbols(self.outputs))
 
+    @property
+    def is_map(self) -> bool:
+        """Whether it names ``dt``, the length of a step: a map from one step to the next, which has
+        no rates in between."""
+        return "dt" in self.symbols
+
     @cached_property
     def is_formula(self) -> bool:
         """Whether it contains no calls of code."""

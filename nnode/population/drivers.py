@@ -271,7 +271,7 @@ def obstacle(system: System, sequences: list[Sequence], needed: int = LEAST_DRIV
         return "the model is no formula of a lane"
     if any(name not in ("x", "v") for name, _ in lane.ahead):
         return "the model reads what other drivers remember, which was not measured"
-    if "dt" in getattr(system.formula, "symbols", ()):
+    if system.is_map:
         return "the law is a map from step to step"
     n_followers = sum(s.n_agents - 1 for s in sequences)
     if n_followers < needed:

@@ -228,7 +228,7 @@ class FollowersEngine(TrafficEngine):
             for probe in probes:
                 small = replace(probe, steps={name: SMALL * x for name, x in probe.steps.items()})
                 simulated += with_each_strength(run.system, effect, small)
-        elif effect.consecutive and "dt" in run.model.lane.symbols:
+        elif effect.consecutive and run.system.is_map:
             for probe in probes:
                 simulated += with_each_strength(run.system, effect, probe)
         if simulated:

@@ -10,7 +10,7 @@ import torch
 
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import SimulationError
-from nnode.model import System, Traffic
+from nnode.model import System
 from nnode.simulation import TorchdiffeqSolver
 
 #: Method and longest step, s; their error is invisible in figures.
@@ -82,9 +82,8 @@ def _together(system: System, sequences: list[Sequence], step: float | None) -> 
     batch = collate(sequences).to(like.device, like.dtype)
     longest = STEP[system.domain] if step is None else step
     dt = batch.dt / max(1, math.ceil(batch.dt / longest - 1e-6))
-    lane = system.formula if isinstance(system, Traffic) else None
-    # a law that is a map from step to step cannot be evaluated within a step
-    method = system.step if lane is not None and "dt" in lane.symbols else METHOD[system.domain]
+    # a map from step to step cannot be evaluated within a step
+    method = system.step if system.is_map else METHOD[system.domain]
     x = TorchdiffeqSolver(method, dt=dt)(system, batch).x.double().cpu().numpy()
     return [x[: s.n_samples, i, : s.n_agents] for i, s in enumerate(sequences)]
 
