@@ -1,4 +1,4 @@
-"""The packages' line is kept: imports go one way, and never in a circle."""
+"""Contracts of imports: layers and no cycles."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ LINT = "from importlinter.cli import lint_imports; raise SystemExit(lint_imports
 
 
 def lint(root: Path) -> subprocess.CompletedProcess[str]:
-    """Hold the package in a folder against the contracts of its ``pyproject.toml``."""
-    # in a process of its own: the package to look at is the one that Python would import
+    """Check the package in a folder with the contracts of its ``pyproject.toml``."""
+    # in a subprocess, because import-linter imports the package from the current folder
     return subprocess.run(
         [sys.executable, "-c", LINT], cwd=root, capture_output=True, text=True, check=False
     )
 
 
-def test_imports_go_one_way() -> None:
-    done = lint(ROOT)
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_contracts_hold() -> None:
+    result = lint(ROOT)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
-#: A line at the end of a file, and what the contracts say of it.
+#: A file, a line at its end, and the message of the broken contract.
 WRONG = [
     ("nnode/data/store.py", "import nnode.model.term", "nnode.data -> nnode.model"),
     (
@@ -60,8 +60,8 @@ WRONG = [
 
 
 @pytest.fixture(scope="module")
-def complaints(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """What is said of a copy of the packages that has all wrong lines."""
+def output(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The report on a copy of the packages with all wrong lines."""
     folder = tmp_path_factory.mktemp("wrong")
     for package in ("nnode", "studies", "benchmarks"):
         ignore = shutil.ignore_patterns("__pycache__")
@@ -70,11 +70,11 @@ def complaints(tmp_path_factory: pytest.TempPathFactory) -> str:
     for file, line, _ in WRONG:
         with (folder / file).open("a", encoding="utf-8") as source:
             source.write(f"\n{line}\n")
-    done = lint(folder)
-    assert done.returncode == 1
-    return done.stdout
+    result = lint(folder)
+    assert result.returncode == 1
+    return result.stdout
 
 
-@pytest.mark.parametrize(("file", "line", "words"), WRONG)
-def test_a_wrong_import_is_found(complaints: str, file: str, line: str, words: str) -> None:
-    assert words.replace(" -> ", " is not allowed to import ") in complaints
+@pytest.mark.parametrize("message", [message for _, _, message in WRONG])
+def test_wrong_imports_are_reported(output: str, message: str) -> None:
+    assert message.replace(" -> ", " is not allowed to import ") in output

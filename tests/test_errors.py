@@ -1,4 +1,4 @@
-"""Messages can be shown: they are short, and a terminal obeys nothing in them."""
+"""Error messages are limited in length and contain no control characters."""
 
 from __future__ import annotations
 
@@ -10,13 +10,19 @@ from nnode.errors import LONGEST, DataError, NotFittedError, printable
 from nnode.model.parse import FormulaError
 
 
-def test_a_message_that_is_sound_stays_as_it_is() -> None:
-    text = "file.csv, line 3:\n\tcolumn 'größe' holds 'x' – expected a number in m²"
+@pytest.mark.parametrize(
+    "text",
+    [
+        "file.csv, line 3:\n\tcolumn 'größe' holds 'x' – expected a number in m²",
+        "x" * LONGEST,
+    ],
+    ids=["printable", "longest"],
+)
+def test_printable_message_is_unchanged(text: str) -> None:
     assert str(DataError(text)) == text
-    assert str(DataError("x" * LONGEST)) == "x" * LONGEST
 
 
-def test_a_long_message_keeps_its_place_and_what_to_do() -> None:
+def test_long_message_keeps_its_start_and_end() -> None:
     text = str(DataError("cars.csv, line 3: found " + "x" * 5_000_000 + "; expected a number"))
     assert len(text) == LONGEST
     assert text.startswith("cars.csv, line 3: found x")
@@ -25,23 +31,20 @@ def test_a_long_message_keeps_its_place_and_what_to_do() -> None:
 
 
 @pytest.mark.parametrize("kind", [DataError, NotFittedError])
-def test_control_characters_are_written_as_escapes(kind: type[Exception]) -> None:
+def test_control_characters_are_escaped(kind: type[Exception]) -> None:
     error = kind("a\x1b]0;t\x07b\r\x9b31m\u202ec\udc80\u2028d")
     assert str(error) == r"a\x1b]0;t\x07b\r\x9b31m\u202ec\udc80\u2028d"
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-def test_escapes_do_not_make_a_message_longer() -> None:
-    assert len(str(DataError("\x1b" * LONGEST))) == LONGEST
-
-
-def test_other_arguments_stay() -> None:
+def test_arguments_are_kept() -> None:
     assert DataError("a", 3).args == ("a", 3)
 
 
-def test_a_formula_is_shown_without_control_characters() -> None:
+def test_control_characters_of_formulas_are_escaped() -> None:
     assert "\x1b" not in str(FormulaError("gap \x1b[31m", 3, "no \x1b"))
 
 
-def test_a_limit_of_ones_own() -> None:
+def test_length_is_limited() -> None:
+    assert len(str(DataError("\x1b" * LONGEST))) == LONGEST
     assert len(printable("y" * 1000, 100)) == 100

@@ -1,4 +1,4 @@
-"""Names of files, and what files of others may contain."""
+"""Safe file names, and interpolations in the content of files."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from nnode.files import file_name, interpolation
 
-USUAL = ["sf", "n4", "sf_1-1_1_seed 3", "a.b", "sf'", "größe", "1,5 m"]
+SAFE = ["sf", "n4", "sf_1-1_1_seed 3", "a.b", "sf'", "größe", "1,5 m"]
 
 
 @pytest.mark.parametrize(
-    ("name", "found"),
+    ("name", "expected"),
     [
-        *zip(USUAL, USUAL, strict=True),
+        *zip(SAFE, SAFE, strict=True),
         ("../../escaped", "__.._escaped"),
         ("/etc/passwd", "_etc_passwd"),
         ("..", "_"),
@@ -28,25 +28,25 @@ USUAL = ["sf", "n4", "sf_1-1_1_seed 3", "a.b", "sf'", "größe", "1,5 m"]
         ("a" * 300, "a" * 100),
     ],
 )
-def test_usual_names_stay_and_signs_of_paths_do_not(name: str, found: str) -> None:
-    assert file_name(name) == found
+def test_path_characters_are_replaced(name: str, expected: str) -> None:
+    assert file_name(name) == expected
 
 
 @given(st.text(max_size=300))
-def test_any_name_is_a_file_of_the_folder(name: str) -> None:
+def test_any_name_stays_in_the_folder(name: str) -> None:
     path = Path("/run/folder") / f"{file_name(name)}.png"
     assert path.parent == Path("/run/folder")
     assert path.resolve() == path
     assert len(path.stem) <= 100
 
 
-def test_interpolations_are_found_wherever_they_are() -> None:
+def test_nested_interpolations_are_found() -> None:
     for content in ("${a}", ["b", ("${a}",)], {"b": {"c": "${a}"}}, {"${a}": 1}, [{"x": ["${a}"]}]):
         assert interpolation(content) == "${a}"
     assert interpolation({"a": ["$", "{a}", 1, None, 2.5, {"b": "$ {a}"}]}) is None
 
 
-def test_content_without_an_end_is_told() -> None:
+def test_endless_content_is_refused() -> None:
     endless: list[object] = []
     endless.append(endless)
     with pytest.raises(ValueError, match="nested more than"):

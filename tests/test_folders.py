@@ -1,4 +1,4 @@
-"""A clone has the folders that the scripts write to, and they stay."""
+"""The output folders of the scripts and their documentation."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ ROOT = Path(__file__).parents[1]
 PAGES = ("runs/README.md", "data/README.md")
 
 
-def git(*words: str) -> subprocess.CompletedProcess[str]:
+def git(*arguments: str) -> subprocess.CompletedProcess[str]:
     if not (ROOT / ".git").exists() or shutil.which("git") is None:
-        pytest.skip("this is no clone")
-    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+        pytest.skip("there is no git repository")
+    return subprocess.run(
+        ["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_the_folder_says_what_lands_there_and_what_may_be_deleted(page: str) -> None:
+def test_pages_describe_the_contents(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     assert "written by" in text
     assert "may be deleted" in text
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_the_page_is_committed_and_nothing_else_of_the_folder(page: str) -> None:
+def test_only_the_page_is_committed(page: str) -> None:
     folder = page.partition("/")[0]
     assert git("ls-files", folder).stdout.split() == [page]
     assert git("check-ignore", "--no-index", "--quiet", page).returncode == 1
@@ -36,13 +38,13 @@ def test_the_page_is_committed_and_nothing_else_of_the_folder(page: str) -> None
 
 
 @pytest.mark.thorough
-def test_every_folder_that_a_script_writes_to_is_listed() -> None:
+def test_output_folders_of_scripts_are_listed() -> None:
     pages = {page.partition("/")[0]: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
     for script in (ROOT / "scripts").glob("*.py"):
         settings = composed(script.stem).hydra
         for place in (settings.run.dir, settings.sweep.dir):
-            top, _, rest = place.partition("/")
-            assert f"`{rest.partition('/')[0]}/" in pages[top], place
+            top, name = place.split("/")[:2]
+            assert f"`{name}/" in pages[top], place
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="there is no make")

@@ -1,4 +1,4 @@
-"""One run at a time in a folder, and no lock that outlives its process."""
+"""Locks of run folders, and partial files of killed runs."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ sys.stdin.read()
 
 
 def holder(folder: Path) -> subprocess.Popen[str]:
+    """A process that holds the lock of a folder."""
     process = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(folder)],
         stdin=subprocess.PIPE,
@@ -35,64 +36,67 @@ def holder(folder: Path) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_second_process_is_told_who_works_there(tmp_path: Path) -> None:
+def test_locked_folder_is_refused_with_the_process_id(tmp_path: Path) -> None:
     process = holder(tmp_path)
     try:
-        words = rf"another run works in .* \(process {process.pid} on .*hydra\.run\.dir="
-        with pytest.raises(FolderInUseError, match=words):
+        message = rf"another run works in .* \(process {process.pid} on .*hydra\.run\.dir="
+        with pytest.raises(FolderInUseError, match=message):
             take(tmp_path)
     finally:
         process.kill()
         process.communicate()
-    with alone(tmp_path):  # the killed one's lock is still there, and blocks nobody
+    with alone(tmp_path):  # the lock of a killed process is ignored
         assert str(os.getpid()) in (tmp_path / LOCK).read_text()
     assert not (tmp_path / LOCK).exists()
 
 
-def test_a_process_may_take_a_folder_twice(tmp_path: Path) -> None:
+def test_lock_is_reentrant(tmp_path: Path) -> None:
     with alone(tmp_path):
         with alone(tmp_path / "." / ""):
             pass
         assert (tmp_path / LOCK).exists()
-    give(tmp_path)  # and giving back what is not held does nothing
+    give(tmp_path)  # releasing a free folder has no effect
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_run_left_half_written_is_removed(tmp_path: Path) -> None:
+def test_partial_files_of_killed_runs_are_removed(tmp_path: Path) -> None:
     (tmp_path / "checkpoints").mkdir()
-    half = [tmp_path / ".report.json.123.partial", tmp_path / "checkpoints" / ".last.pt.9.partial"]
-    own = [tmp_path / "notes.partial", tmp_path / ".hidden", tmp_path / ".x.partial"]
-    for path in half + own:
+    partial = [
+        tmp_path / ".report.json.123.partial",
+        tmp_path / "checkpoints" / ".last.pt.9.partial",
+    ]
+    other = [tmp_path / "notes.partial", tmp_path / ".hidden", tmp_path / ".x.partial"]
+    for path in partial + other:
         path.write_text("x")
     with alone(tmp_path):
-        assert not any(path.exists() for path in half)
-        assert all(path.exists() for path in own)
+        assert not any(path.exists() for path in partial)
+        assert all(path.exists() for path in other)
 
 
-def test_what_a_live_run_in_a_folder_below_writes_is_kept(tmp_path: Path) -> None:
+def test_partial_files_of_running_nested_runs_are_kept(tmp_path: Path) -> None:
     inner = tmp_path / "sweep" / "inner"
     code = f"from pathlib import Path\nfrom nnode.lock import take\ntake(Path({str(tmp_path)!r}))"
     (inner / "checkpoints").mkdir(parents=True)
-    beside = tmp_path / "sweep" / ".result.json.7.partial"
-    beside.write_text("of a killed run")
+    stale = tmp_path / "sweep" / ".result.json.7.partial"
+    stale.write_text("of a killed run")
     with alone(inner), replacing(inner / "checkpoints" / "last.pt") as temporary:
         temporary.write_text("new")
         subprocess.run([sys.executable, "-c", code], check=True)
-        assert not beside.exists()
+        assert not stale.exists()
     assert (inner / "checkpoints" / "last.pt").read_text() == "new"
 
 
-def test_a_link_in_place_of_a_rest_is_removed_and_not_followed(tmp_path: Path) -> None:
+def test_partial_links_are_removed_and_not_followed(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
-    (tmp_path / "else").mkdir()
-    (tmp_path / "else" / "data").write_text("")
-    (tmp_path / "run" / ".a.1.partial").symlink_to(tmp_path / "else")
+    target = write_text(tmp_path / "target" / "data", "")
+    link = tmp_path / "run" / ".a.1.partial"
+    link.symlink_to(target.parent)
     with alone(tmp_path / "run"):
-        assert not os.path.lexists(tmp_path / "run" / ".a.1.partial")
-    assert (tmp_path / "else" / "data").exists()
+        assert not os.path.lexists(link)
+    assert target.exists()
 
 
-def test_a_full_disk_is_told_in_words_and_other_errors_pass(tmp_path: Path) -> None:
+def test_full_disk_is_reported_and_other_errors_are_raised(tmp_path: Path) -> None:
     path = write_text(tmp_path / "a", "before")
     with (
         pytest.raises(WriteError, match=r"cannot be written: No space .* kept; make room"),

@@ -1,4 +1,4 @@
-"""What ``import nnode`` offers."""
+"""Public names of the package."""
 
 from __future__ import annotations
 
@@ -29,13 +29,15 @@ NAMES = [
 ]
 
 
-def test_completion_finds_the_public_names_without_loading_torch() -> None:
+def test_dir_lists_public_names_without_importing_torch() -> None:
     code = "import sys, nnode; print(*dir(nnode)); print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == [" ".join(NAMES), "False"]
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.splitlines() == [" ".join(NAMES), "False"]
 
 
-def test_every_public_name_is_there() -> None:
+def test_public_names_exist() -> None:
     assert sorted(nnode.__all__) == dir(nnode)
     for name in dir(nnode):
         assert getattr(nnode, name) is not None

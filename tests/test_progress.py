@@ -1,4 +1,4 @@
-"""Progress: a bar with the time left on a terminal, a quiet line now and then elsewhere."""
+"""Progress bars on terminals and log lines elsewhere."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def test_time_left_follows_the_shares_of_the_stages(clock: list[float]) -> None:
+def test_time_left_follows_from_shares_of_stages(clock: list[float]) -> None:
     stages = Stages("work", {"reading": 1.0, "thinking": 3.0})
     stages.begin("reading")
     assert stages.text() == "reading"
@@ -37,11 +37,11 @@ def test_time_left_follows_the_shares_of_the_stages(clock: list[float]) -> None:
     clock[0] = 10.0
     stages.within(1 / 3)
     assert stages.text() == "thinking, about 10 s left"
-    stages.within(7.0)  # a guess that was too low
+    stages.within(7.0)  # longer than estimated
     assert stages.text() == "thinking, about 0 s left"
     clock[0] = 11.0
     assert stages.text() == "thinking, longer than estimated"
-    stages.begin("reading")  # the work is done twice
+    stages.begin("reading")  # the stages are repeated
     clock[0] = 13.0
     stages.within(0.5)
     assert stages.text() == "reading, about 14 s left"
@@ -49,7 +49,7 @@ def test_time_left_follows_the_shares_of_the_stages(clock: list[float]) -> None:
     assert stages.text() == "reading, about 10 s left"
 
 
-def test_elsewhere_a_line_comes_seldom_and_nothing_before_ten_seconds(
+def test_log_lines_every_ten_seconds(
     clock: list[float], caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with caplog.at_level(logging.INFO), Stages("work", {"a": 1.0, "b": 1.0}) as stages:
@@ -64,7 +64,7 @@ def test_elsewhere_a_line_comes_seldom_and_nothing_before_ten_seconds(
     assert capfd.readouterr() == ("", "")
 
 
-def test_elsewhere_a_line_comes_during_a_long_step_as_well(
+def test_log_lines_during_long_steps(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(progress, "LINE_EVERY", 0.05)
@@ -81,11 +81,11 @@ def test_elsewhere_a_line_comes_during_a_long_step_as_well(
             "training: step 0 of 7",
             "study: 1 of 3 tasks",
         )
-    assert not [one for one in threading.enumerate() if one.name == "progress"]
+    assert "progress" not in {thread.name for thread in threading.enumerate()}
 
 
 @pytest.mark.parametrize("forks", [False, True])
-def test_on_a_terminal_there_is_a_bar_on_standard_error_alone(tmp_path: Path, forks: bool) -> None:
+def test_terminal_shows_a_bar_on_standard_error(tmp_path: Path, forks: bool) -> None:
     leader, follower = pty.openpty()
 
     def work() -> None:
@@ -95,7 +95,7 @@ def test_on_a_terminal_there_is_a_bar_on_standard_error_alone(tmp_path: Path, fo
         with Stages("work", {"a": 1.0, "b": 1.0}, forks=forks) as stages:
             stages.begin("a")
             stages.begin("b")
-            logging.warning("by the way")
+            logging.warning("a message")
             stages.within(0.5)
         print("result: 7")
 
@@ -110,7 +110,7 @@ def test_on_a_terminal_there_is_a_bar_on_standard_error_alone(tmp_path: Path, fo
     assert child.status() == 0
     assert (tmp_path / "out").read_text() == "result: 7\n"
     assert re.search(rb"work .*0:00:00", shown)
-    if not forks:  # above the bar, in a line of its own
+    if not forks:  # in a separate line above the bar
         assert re.search(
-            rb"\nby the way *\r?\n", re.sub(rb"\x1b\[[0-9;?]*[a-zA-Z]|\r", b"\n", shown)
+            rb"\na message *\r?\n", re.sub(rb"\x1b\[[0-9;?]*[a-zA-Z]|\r", b"\n", shown)
         )

@@ -1,4 +1,4 @@
-"""The wheel works alone: built, installed into an empty environment, used far from the checkout."""
+"""The wheel in an empty environment, outside of the checkout."""
 
 from __future__ import annotations
 
@@ -28,26 +28,27 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def alone(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Run a command of the environment."""
     return installed(wheel, tmp_path_factory.mktemp("environment"))
 
 
 @pytest.mark.thorough
-def test_the_package_comes_from_the_wheel(alone: Run) -> None:
-    done = alone("python", "-c", "import nnode, os; print(os.getcwd(), nnode.__file__)")
+def test_package_is_imported_from_the_wheel(run: Run) -> None:
+    done = run("python", "-c", "import nnode, os; print(os.getcwd(), nnode.__file__)")
     folder, file = map(Path, done.stdout.split())
     assert ROOT not in (*folder.parents, *file.parents)
     assert "site-packages" in file.parts
 
 
 @pytest.mark.thorough
-def test_the_program_lists_its_commands(alone: Run) -> None:
-    done = alone("nnode", "--help")
+def test_help_lists_commands(run: Run) -> None:
+    done = run("nnode", "--help")
     assert done.returncode == 0, done.stderr
     commands = {path.stem for path in (ROOT / "nnode" / "app" / "commands").glob("[a-z]*.py")}
     assert set(re.findall(r"^  (\w+)  ", done.stdout, re.M)) == commands
     assert "scripts" not in done.stdout
-    wrong = alone("nnode", "trian")
+    wrong = run("nnode", "trian")
     assert wrong.returncode == 2
     assert "did you mean train?" in wrong.stderr
 
@@ -56,9 +57,9 @@ def test_the_program_lists_its_commands(alone: Run) -> None:
 @pytest.mark.parametrize(
     "name", ["train", "discover", "study", "evaluate", "export", "plot_forces", "prepare_data"]
 )
-def test_a_command_takes_what_its_script_takes(alone: Run, name: str) -> None:
-    installed = alone("nnode", name, "--help")
-    assert installed.returncode == 0, installed.stderr
+def test_help_of_a_command_as_of_its_script(run: Run, name: str) -> None:
+    command = run("nnode", name, "--help")
+    assert command.returncode == 0, command.stderr
     script = subprocess.run(
         [sys.executable, f"scripts/{name}.py", "--help"],
         cwd=ROOT,
@@ -67,15 +68,23 @@ def test_a_command_takes_what_its_script_takes(alone: Run, name: str) -> None:
         env={**os.environ, "NNODE_DATA": ""},
         check=False,
     )
-    assert installed.stdout == script.stdout
+    assert command.stdout == script.stdout
+
+
+@pytest.fixture
+def work(run: Run) -> Path:
+    """The working folder of the environment's commands."""
+    return Path(run("python", "-c", "import os; print(os.getcwd())").stdout.strip())
 
 
 @pytest.mark.thorough
-def test_a_table_of_one_s_own_is_calibrated_evaluated_and_gone_on_with(alone: Run) -> None:
-    work = Path(alone("python", "-c", "import os; print(os.getcwd())").stdout.strip())
+def test_train_evaluate_and_resume(run: Run, work: Path) -> None:
+    def nnode(*arguments: str) -> None:
+        done = run("nnode", *arguments)
+        assert done.returncode == 0, done.stderr
+
     as_table(platoons(number=4, seconds=6.0)).to_csv(work / "mine.csv", index=False)
-    done = alone(
-        "nnode",
+    nnode(
         "train",
         "model=lin",
         "model.leader=measured",
@@ -87,35 +96,26 @@ def test_a_table_of_one_s_own_is_calibrated_evaluated_and_gone_on_with(alone: Ru
         "trainer.max_epochs=3",
         "hydra.run.dir=run",
     )
-    assert done.returncode == 0, done.stderr
     result = json.loads((work / "run" / "result.json").read_text())
     assert result["summary"]["cost_train"] < result["summary"]["cost_start"]
-    done = alone("nnode", "evaluate", "checkpoint=run/checkpoints/best.pt", "hydra.run.dir=e")
-    assert done.returncode == 0, done.stderr
+    nnode("evaluate", "checkpoint=run/checkpoints/best.pt", "hydra.run.dir=e")
     metrics = json.loads((work / "e" / "metrics.json").read_text())
     assert metrics["J"] == pytest.approx(result["summary"]["cost_heldout"], rel=1e-9)
-    done = alone(
-        "nnode",
-        "train",
-        "resume=run/checkpoints/last.pt",
-        "trainer.max_epochs=5",
-        "hydra.run.dir=run",
-    )
-    assert done.returncode == 0, done.stderr
+    nnode("train", "resume=run/checkpoints/last.pt", "trainer.max_epochs=5", "hydra.run.dir=run")
     assert json.loads((work / "run" / "result.json").read_text())["history"][-1]["epoch"] == 5
 
 
-#: In an environment without what is optional.
+#: In an environment without optional packages.
 ESTIMATOR = """
 import sys
 sys.modules.update(dict.fromkeys(("sklearn", "xarray")))
 import nnode
 import pandas as pd
 table = pd.read_csv("pairs.csv")
-one = nnode.Calibrator(model="idm", method="ballistic").fit(table)  # as the table was made
-print(one.parameters_.estimate["idm.T"], one.predict(table).score(table))
+fitted = nnode.Calibrator(model="idm", method="ballistic").fit(table)
+print(fitted.parameters_.estimate["idm.T"], fitted.predict(table).score(table))
 try:
-    one.result_.to_xarray()
+    fitted.result_.to_xarray()
 except nnode.errors.ConfigError as error:
     print(error)
 assert "sklearn" not in {name for name, module in sys.modules.items() if module}
@@ -123,42 +123,41 @@ assert "sklearn" not in {name for name, module in sys.modules.items() if module}
 
 
 @pytest.mark.thorough
-def test_the_estimator_works_without_scikit_learn(alone: Run) -> None:
-    work = Path(alone("python", "-c", "import os; print(os.getcwd())").stdout.strip())
+def test_estimator_works_without_scikit_learn(run: Run, work: Path) -> None:
     pairs(number=4, seconds=20.0).to_csv(work / "pairs.csv", index=False)
-    done = alone("python", "-c", ESTIMATOR)
+    done = run("python", "-c", ESTIMATOR)
     assert done.returncode == 0, done.stderr
-    found, said = done.stdout.splitlines()
-    T, score = map(float, found.split())
+    numbers, message = done.stdout.splitlines()
+    T, score = map(float, numbers.split())
     assert pytest.approx(TRUE["T"], rel=1e-3) == T
     assert -1e-3 < score <= 0
-    assert "pip install 'nnode[xarray]'" in said
+    assert "pip install 'nnode[xarray]'" in message
 
 
 @pytest.mark.thorough
-def test_an_index_can_show_what_the_wheel_says_of_itself(wheel: Path) -> None:
+def test_metadata_and_files_of_the_wheel(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
-        told = message_from_string(archive.read(name).decode())
         names = archive.namelist()
-    assert told["Description-Content-Type"] == "text/markdown"
-    assert told["License-Expression"] == "MIT"
-    assert told.get_all("Project-URL")
-    page = str(told.get_payload())
+        (name,) = (n for n in names if n.endswith(".dist-info/METADATA"))
+        metadata = message_from_string(archive.read(name).decode())
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    assert metadata["License-Expression"] == "MIT"
+    assert metadata.get_all("Project-URL")
+    page = str(metadata.get_payload())
     assert "# nnode" in page
     targets = re.findall(r"\]\(([^)]+)\)", page)
     assert [target for target in targets if not target.startswith(("https://", "#"))] == []
     assert not [n for n in names if n.startswith(("benchmarks", "scripts", "tests", "setup"))]
     assert not [n for n in names if "benchmark" in n or "fault_injection" in n]
-    shipped = {n for n in names if n.startswith("nnode/conf/")}
-    ours = {f"nnode/conf/{p.relative_to(ROOT / 'conf')}" for p in (ROOT / "conf").rglob("*.yaml")}
-    assert {n for n in ours if "benchmark" not in n and "fault_injection" not in n} == shipped
+    packaged = {n for n in names if n.startswith("nnode/conf/")}
+    conf = {f"nnode/conf/{p.relative_to(ROOT / 'conf')}" for p in (ROOT / "conf").rglob("*.yaml")}
+    assert {n for n in conf if "benchmark" not in n and "fault_injection" not in n} == packaged
     model = {str(p.relative_to(ROOT)) for p in (ROOT / "nnode/model").rglob("*.yaml")}
     assert model
     assert model <= set(names)
 
 
-def test_pictures_and_links_lead_into_a_repository_where_it_is_known() -> None:
+def test_links_of_the_description_point_to_the_repository() -> None:
     described = runpy.run_path(str(ROOT / "setup.py"), run_name="setup")["described"]
     text = (
         "a [page](docs/a.md#b), [paper](https://x)\n\n![alt](docs/p.png)\n\n*What it shows.*\n\nb"

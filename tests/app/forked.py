@@ -1,9 +1,8 @@
-"""Scripts in processes forked from one that has loaded the libraries: no seconds of imports each.
+"""Scripts run in processes forked from a server that has already imported the libraries.
 
-This file is also the program of that process: it is asked on its standard input, a line of JSON
-for scripts to start at a time or for ones to wait for, and answers with their numbers or their exit
-statuses. It is started afresh and never works itself, so that no thread, no compiled code and no
-random state is inherited.
+This file is also the server's program. Each line of JSON on its standard input starts a script or
+waits for one; the answer is a process number or an exit status. The server runs no script itself.
+Its children therefore inherit no thread, no compiled code and no random state.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from typing import Any
 
 from benchmarks.fault_injection.child import Child, script
 
-#: What scripts use of the libraries and of the package.
+#: Modules that scripts import.
 LOADED = (
     "matplotlib.pyplot",
     "scipy.optimize",
@@ -30,21 +29,21 @@ LOADED = (
     *(f"nnode.app.{name}" for name in ("discover", "drive", "evaluate", "export")),
     *(f"nnode.app.{name}" for name in ("forces", "prepare", "train")),
     "studies.command",
-    # what the first optimiser, unit, table and command load
+    # imported by the first optimiser, unit, table and command
     *("torch._dynamo", "torch.distributed.nn", "sympy", "pint", "pyarrow.parquet"),
     *("nnode.app.cli.run", "nnode.app.commands.discover", "nnode.app.commands.train"),
 )
 
 
 class Forked:
-    """A process, with what is needed of ``subprocess.Popen``."""
+    """A process with a part of the interface of ``subprocess.Popen``."""
 
     def __init__(self, forks: Forks, pid: int, order: dict[str, Any]) -> None:
         self.pid, self.returncode = pid, None
         self._forks, self._order = forks, order
 
     def poll(self, seconds: float = 0.0) -> int | None:
-        """Its exit status; None where it still works after ``seconds``."""
+        """The exit status; None if the process still runs after ``seconds``."""
         if self.returncode is None:
             self.returncode = self._forks.ask({"pid": self.pid, "seconds": seconds})
         return self.returncode
@@ -53,7 +52,7 @@ class Forked:
         os.kill(self.pid, number)
 
     def communicate(self, timeout: float = 1500.0) -> tuple[str, str]:
-        """What it printed, at its end; one that works for longer is ended."""
+        """Standard output and errors after the end; the process is killed after ``timeout``."""
         if self.poll(timeout) is None:
             self.send_signal(signal.SIGKILL)
             self.poll(60.0)
@@ -62,11 +61,11 @@ class Forked:
 
 
 class Forks:
-    """Runs ``scripts/<name>.py``; the process it forks from is started with the first of them.
+    """Runs ``scripts/<name>.py``; the first script starts the server.
 
     Args:
-        root: of the checkout, where the scripts run.
-        environment: of the processes.
+        root: the checkout, which is the working directory.
+        environment: of all processes.
     """
 
     def __init__(self, root: Path, environment: dict[str, str]) -> None:
@@ -76,19 +75,26 @@ class Forks:
         self._number = 0
 
     def run(
-        self, name: str, *overrides: str, status: int | None = 0, **env: str
+        self,
+        name: str,
+        *overrides: str,
+        folder: Path | None = None,
+        status: int | None = 0,
+        **env: str,
     ) -> subprocess.CompletedProcess[str]:
-        """As ``subprocess.run`` with captured text.
+        """As ``subprocess.run`` with captured text; checks the exit status unless it is None.
 
-        The exit status must be ``status``; None allows any.
+        Args:
+            folder: the folder of the run.
         """
-        process = self.start(name, *overrides, **env)
+        run_folder = () if folder is None else (f"hydra.run.dir={folder}",)
+        process = self.start(name, *overrides, *run_folder, **env)
         out, errors = process.communicate()
         assert status in (None, process.returncode), out + errors
         return subprocess.CompletedProcess(name, process.returncode or 0, out, errors)
 
     def start(self, name: str, *overrides: str, **env: str) -> Forked:
-        """As ``subprocess.Popen``; in place of a script's name may stand code, of several lines."""
+        """As ``subprocess.Popen``. A ``name`` with line breaks is code instead of a script."""
         self._number += 1
         order = {
             "name": name,
@@ -99,7 +105,7 @@ class Forks:
         return Forked(self, self.ask(order), order)
 
     def ask(self, order: dict[str, Any]) -> Any:
-        """What the process that is forked from answers."""
+        """The server's answer to an order."""
         if self._server is None:
             self._server = subprocess.Popen(
                 [sys.executable, "-m", "tests.app.forked"],
@@ -115,20 +121,20 @@ class Forks:
         return json.loads(self._server.stdout.readline())
 
     def close(self) -> None:
-        """End the process that was forked from."""
+        """End the server."""
         if self._server is not None:
             self._server.communicate()
         self._folder.cleanup()
 
 
-def typed(order: dict[str, Any]) -> None:
-    """What a child does; its environment and streams are those of the order."""
+def run_child(order: dict[str, Any]) -> None:
+    """Run an order's script with the order's environment and streams."""
     os.environ.clear()
     os.environ.update(order["env"])
     descriptor = os.open(order["errors"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(descriptor, 2)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    # a script that forks replaces these files, which must not close the descriptors
+    # a forking script replaces these files; the descriptors must stay open
     sys.stdin, sys.stdout, sys.stderr = (
         open(number, mode, closefd=False)  # noqa: SIM115
         for number, mode in enumerate(("r", "w", "w"))
@@ -146,7 +152,7 @@ def main() -> None:
         importlib.import_module(module)
     from tests.app.conftest import composed
 
-    composed("train")  # the children share what Hydra looks up once
+    composed("train")  # fills Hydra's caches
     gc.collect()
     gc.freeze()
     children: dict[int, Child] = {}
@@ -155,11 +161,11 @@ def main() -> None:
         if "pid" in order:
             answer = children[order["pid"]].status(order["seconds"])
         else:
-            child = Child(partial(typed, order), Path(order["out"]))
+            child = Child(partial(run_child, order), Path(order["out"]))
             answer, children[child.pid] = child.pid, child
         print(json.dumps(answer), flush=True)
     for child in children.values():
-        child.kill()  # one that nobody waited for
+        child.kill()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Data as they come: how a table is written down, and where its origin lies, changes no result."""
+"""Results do not depend on a table's units, order, names, or origin."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Form = Callable[[pd.DataFrame], pd.DataFrame]
 STAMP = pd.Timestamp("2024-05-06 07:08:09")
 
 
-#: Name to what changes, and the options that go with it.
+#: Changes of the table, and the options that they need.
 FORMS: dict[str, tuple[Form, dict[str, Any]]] = {
     "at map coordinates": (lambda t: t.assign(x=t.x + 5_340_000.0), {}),
     "later": (lambda t: t.assign(time=t.time + 1e6), {}),
@@ -36,7 +36,7 @@ FORMS: dict[str, tuple[Form, dict[str, Any]]] = {
         lambda t: t.assign(time=STAMP.value + (t.time * 1e9).round().astype("int64")),
         {"time_unit": "ns"},
     ),
-    # in the order of the names before, so that clusters are drawn alike
+    # the order of the names is kept, so that the random split is the same
     "renamed": (
         lambda t: t.assign(
             agent="car no. " + t.agent.astype(str), sequence="run " + t.sequence.astype(str)
@@ -55,8 +55,10 @@ FORMS: dict[str, tuple[Form, dict[str, Any]]] = {
 }
 
 
-def fitted(given: nnode.Sequences) -> pd.DataFrame:
-    result: pd.DataFrame = nnode.Calibrator("idm", epochs=6, drivers="none").fit(given).parameters_
+def fitted(sequences: nnode.Sequences) -> pd.DataFrame:
+    result: pd.DataFrame = (
+        nnode.Calibrator("idm", epochs=6, drivers="none").fit(sequences).parameters_
+    )
     return result
 
 
@@ -72,43 +74,40 @@ def expected(platoons: pd.DataFrame) -> pd.DataFrame:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("form", FORMS)
-def test_a_fit_does_not_depend_on_how_the_table_is_written(
+def test_fit_is_independent_of_the_table_s_form(
     platoons: pd.DataFrame, expected: pd.DataFrame, form: str
 ) -> None:
     change, options = FORMS[form]
     result = fitted(nnode.sequences(change(platoons), **options))
-    # at a map's coordinates positions have lost the digits below 1e-9 m
+    # map coordinates have a resolution of 1e-9 m
     np.testing.assert_allclose(result.estimate, expected.estimate, rtol=1e-5)
 
 
-def test_samples_that_are_missing_or_late_hardly_change_a_fit(
+def test_missing_samples_and_jitter_hardly_change_a_fit(
     platoons: pd.DataFrame, expected: pd.DataFrame
 ) -> None:
-    """2 % of the rows are missing; times jitter by up to 0.01 s, and positions with them."""
+    """2 % of the rows are missing, or times jitter by up to 0.01 s."""
     rng = np.random.default_rng(8)
-    lacking = platoons[rng.random(len(platoons)) > 0.02]
-    given = nnode.sequences(lacking)
-    assert sum(s.filled for s in given) > 0
-    result = fitted(given)
-    parts = []
-    for _, own in platoons.groupby(["sequence", "agent"]):
-        late = np.where(own.time.between(0.2, 5.8), rng.uniform(-0.01, 0.01, len(own)), 0.0)
-        path = CubicSpline(own.time, own.x)
-        parts.append(own.assign(time=own.time + late, x=path(own.time + late)))
-    jitter = pd.concat(parts)
-    given = nnode.sequences(jitter)
-    assert "times are uneven" in given.manifest["notes"][0]
-    for one in (result, fitted(given)):
+    incomplete = nnode.sequences(platoons[rng.random(len(platoons)) > 0.02])
+    assert sum(s.filled for s in incomplete) > 0
+    tracks = []
+    for _, track in platoons.groupby(["sequence", "agent"]):
+        inner = track.time.between(0.2, 5.8)
+        time = track.time + np.where(inner, rng.uniform(-0.01, 0.01, len(track)), 0.0)
+        tracks.append(track.assign(time=time, x=CubicSpline(track.time, track.x)(time)))
+    uneven = nnode.sequences(pd.concat(tracks))
+    assert "times are uneven" in uneven.manifest["notes"][0]
+    for result in (fitted(incomplete), fitted(uneven)):
         for name in ("idm.T", "idm.s0"):
-            assert one.estimate[name] == pytest.approx(expected.estimate[name], rel=0.1)
+            assert result.estimate[name] == pytest.approx(expected.estimate[name], rel=0.1)
 
 
-def moved_people(s: Sequence, by: Callable[[np.ndarray], np.ndarray]) -> Sequence:
-    """Positions, destinations and velocities under a motion of the plane."""
+def moved_people(s: Sequence, motion: Callable[[np.ndarray], np.ndarray]) -> Sequence:
+    """Apply a motion of the plane to positions, destinations and velocities."""
     assert s.v is not None
     assert s.destination is not None
-    origin = by(np.zeros(2))
-    return replace(s, x=by(s.x), v=by(s.v) - origin, destination=by(s.destination))
+    velocity = motion(s.v) - motion(np.zeros(2))
+    return replace(s, x=motion(s.x), v=velocity, destination=motion(s.destination))
 
 
 def reversed_people(s: Sequence) -> Sequence:
@@ -128,7 +127,7 @@ PEOPLE: dict[str, Callable[[Sequence], Sequence]] = {
     "in a mirrored corridor": lambda s: moved_people(s, lambda x: x * [1.0, -1.0]),
     "in a corridor along y": lambda s: moved_people(s, lambda x: x[..., ::-1]),
     "later": lambda s: replace(s, time=s.time + 1e6),
-    # in another order of names as well
+    # the names also have another order
     "under other names": lambda s: replace(
         s, agents=tuple(f"no. {9 - i}" for i in range(s.n_agents))
     ),
@@ -137,7 +136,7 @@ PEOPLE: dict[str, Callable[[Sequence], Sequence]] = {
 
 
 @pytest.mark.parametrize("form", PEOPLE)
-def test_the_social_force_does_not_depend_on_where_people_walk(form: str) -> None:
+def test_social_force_is_independent_of_coordinates(form: str) -> None:
     start = {**model_options("sf"), "A": 0.4, "k": 35.0, "kappa": 11.0}
     people = [PEOPLE[form](crowd(seed)) for seed in range(4)]
     fitted = nnode.Calibrator(start, optimizer="gauss_newton").fit(people)

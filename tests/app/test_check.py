@@ -1,4 +1,4 @@
-"""``nnode check`` from a file to a page, and to the options that read the file."""
+"""``nnode check`` and ``nnode.check``: the printed summary, the page, and the options."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from tests.data.check.planted import cars, people, saved, text
 
 
 @pytest.mark.thorough
-def test_what_is_told_reads_the_file(script: Script, tmp_path: Path) -> None:
+def test_printed_command_reads_the_file(script: Script, tmp_path: Path) -> None:
     table = cars()
     table["t"] = (1000 * table["t"]).round().astype(int)
     table["x"] /= -0.3048
     table["length"] /= 0.3048
     file = saved(table.rename(columns={"veh": "Vehicle ID"}), tmp_path, "my cars.csv")
-    done = script("check", str(file), f"hydra.run.dir={tmp_path / 'run'}")
+    done = script("check", str(file), folder=tmp_path / "run")
     assert "12 vehicles, 4812 positions, sampled every 0.1 s: 0 errors and 1 warning" in done.stdout
     assert "WARN  direction: all vehicles drive towards smaller positions" in done.stdout
     page = (tmp_path / "run" / "check.html").read_text(encoding="utf-8")
     assert "Check of my cars.csv" in page
     (line,) = [line for line in done.stdout.splitlines() if "nnode prepare_data" in line]
     words = shlex.split(line)[2:]
-    script("prepare_data", *words, f"hydra.run.dir={tmp_path / 'data'}")
+    script("prepare_data", *words, folder=tmp_path / "data")
     options = Store(tmp_path / "data").manifest["options"]
     assert (options["position_unit"], options["time_unit"]) == ("ft", "ms")
     assert options["direction"] == -1
@@ -41,7 +41,7 @@ def pedpy(tmp_path: Path) -> Path:
     return text(people(), tmp_path, "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n", 100.0)
 
 
-def test_in_python_it_is_an_object(pedpy: Path, tmp_path: Path) -> None:
+def test_check_in_python(pedpy: Path, tmp_path: Path) -> None:
     result = nnode.check(pedpy)
     assert isinstance(result, nnode.Check)
     assert result.sentence.startswith("40 people, ")

@@ -1,4 +1,4 @@
-"""Which sequences an evaluation takes, whatever was trained on before."""
+"""The sequences that an evaluation takes, given the training's split."""
 
 from __future__ import annotations
 
@@ -39,40 +39,40 @@ def checkpoint(tmp_path: Path) -> Checkpoint:
     ("recordings", "part", "expected"),
     [
         ("ab", "auto", ("heldout", ["a/1", "b/2"], 0)),
-        ("a", "auto", ("heldout", ["a/1"], 0)),  # fewer recordings than in training
-        ("abc", "auto", ("heldout", ["a/1", "b/2"], 0)),  # more
+        ("a", "auto", ("heldout", ["a/1"], 0)),  # fewer recordings than in the training
+        ("abc", "auto", ("heldout", ["a/1", "b/2"], 0)),  # more recordings
         ("abc", "unseen", ("unseen", ["a/1", "b/2", "c/0", "c/1", "c/2"], 0)),
         ("c", "auto", ("unseen", ["c/0", "c/1", "c/2"], 0)),
         ("a", "all", ("all", ["a/0", "a/1", "a/2"], 1)),
         ("b", "train", ("train", ["b/0", "b/1"], 2)),
     ],
 )
-def test_parts(
+def test_selected_part(
     tmp_path: Path,
     checkpoint: Checkpoint,
     recordings: str,
     part: str,
     expected: tuple[str, list[str], int],
 ) -> None:
-    now = store(tmp_path / "now", recordings, t_seq=1.0, faults="keep", recording=recordings)
-    result, indices, trained = choose(now, checkpoint, part)
-    assert (result, [now.index[i]["name"] for i in indices], trained) == expected
+    present = store(tmp_path / "now", recordings, t_seq=1.0, faults="keep", recording=recordings)
+    result, indices, trained = choose(present, checkpoint, part)
+    assert (result, [present.index[i]["name"] for i in indices], trained) == expected
 
 
-def test_another_cutting_cannot_be_told_apart(tmp_path: Path, checkpoint: Checkpoint) -> None:
-    now = store(tmp_path / "now", "a", t_seq=2.0)
-    assert choose(now, checkpoint, "auto") == ("all", [0, 1, 2], None)
+def test_other_sequence_lengths_select_all(tmp_path: Path, checkpoint: Checkpoint) -> None:
+    present = store(tmp_path / "now", "a", t_seq=2.0)
+    assert choose(present, checkpoint, "auto") == ("all", [0, 1, 2], None)
     with pytest.raises(ConfigError, match="part=heldout"):
-        choose(now, checkpoint, "heldout")
+        choose(present, checkpoint, "heldout")
 
 
-def test_options_that_a_checkpoint_does_not_know_are_not_compared(
+def test_options_missing_in_the_checkpoint_are_ignored(
     tmp_path: Path, checkpoint: Checkpoint
 ) -> None:
-    now = store(tmp_path / "now", "ab", t_seq=1.0, fill=0.5)
-    assert choose(now, checkpoint, "auto") == ("heldout", [1, 5], 0)
+    present = store(tmp_path / "now", "ab", t_seq=1.0, fill=0.5)
+    assert choose(present, checkpoint, "auto") == ("heldout", [1, 5], 0)
 
 
-def test_an_unknown_part_is_refused(tmp_path: Path, checkpoint: Checkpoint) -> None:
+def test_unknown_part_is_refused(tmp_path: Path, checkpoint: Checkpoint) -> None:
     with pytest.raises(ConfigError, match="part=test is unknown"):
         choose(store(tmp_path / "now", "a"), checkpoint, "test")

@@ -1,4 +1,4 @@
-"""The diagnosis as a command, with results made by hand, and what takes the extended model."""
+"""``nnode discover`` with substituted results, and commands that take the extended model."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from nnode.diagnosis.outcome import DiagnosisOutcome
 from nnode.diagnosis.report import page
 from nnode.errors import ConfigError
 from nnode.model import System
-from tests.app.conftest import Script, composed
+from tests.app.conftest import Script, composed, read_json
 from tests.app.forked import Forks
 from tests.diagnosis import stand_in
 from tests.diagnosis.recorded import ALPHA, ZONE, corridor, lane
 
-#: The script with results made by hand.
+#: The command with substituted results.
 CODE = """
 import sys
 from nnode.app import discover
@@ -54,8 +54,7 @@ def overrides(table: Path, folder: Path) -> list[str]:
     ]
 
 
-#: The diagnosis by hand, then scripts that take its model, all in one process: loading the
-#: libraries takes longer than they do.
+#: The same, then the commands that take its model, in one process because imports are slow.
 CHAIN = """
 import runpy
 import shutil
@@ -92,7 +91,7 @@ if __name__ == "__main__":
 """
 
 
-def with_a_fault(path: Path) -> Path:
+def faulty_lane(path: Path) -> Path:
     """A table in which a vehicle of the first sequence jumps after 3 s."""
     frame = pd.read_csv(lane(path, sequences=6, seconds=4.0, cars=3))
     frame.loc[(frame["agent"] == "v0-1") & (frame["time"] > 3), "x"] += 40
@@ -102,34 +101,33 @@ def with_a_fault(path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def run(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished diagnosis on a table in which one sequence is faulty, and what takes its model."""
+    """The folder of a diagnosis of a table with one faulty sequence."""
     folder = tmp_path_factory.mktemp("discover")
-    table = with_a_fault(folder / "lane.csv")
-    given = [*overrides(table, folder / "run"), "discover.replay=false"]
-    done = script(CHAIN, str(folder), *given)
+    options = overrides(faulty_lane(folder / "lane.csv"), folder / "run")
+    done = script(CHAIN, str(folder), *options, "discover.replay=false")
     (folder / "run" / "shown.txt").write_text(done.stdout.partition("== evaluate")[0])
     return folder / "run"
 
 
-def test_the_command_prints_what_was_found_and_where_it_is(run: Path) -> None:
+def test_command_prints_verdict_and_paths(run: Path) -> None:
     shown = (run / "shown.txt").read_text()
     assert "verdict: named" in shown
     assert "The model lin lacks speed_zone" in shown
     assert "  speed_zone: alpha = 0.650 [0.627, 0.680], a = 400.0 [392.0, 400.0] m" in shown
     assert "not distinguishable from speed_period without platoons at other times" in shown
-    for what, name in (
+    for label, name in (
         ("report", "report.json"),
         ("page", "report.html"),
         ("extended model", "model.yaml"),
         ("checkpoint", "checkpoints/best.pt"),
     ):
-        assert f"{what}: {run / name}" in shown.splitlines()
+        assert f"{label}: {run / name}" in shown.splitlines()
         assert (run / name).is_file()
     assert not list(run.rglob(".*.tmp")) + [p for p in run.iterdir() if p.name.startswith(".r")]
 
 
-def test_the_report_names_faults_by_the_agents_own_names(run: Path) -> None:
-    report = json.loads((run / "report.json").read_text())
+def test_report_has_faults_and_commands(run: Path) -> None:
+    report = read_json(run / "report.json")
     assert report["model"] == "lin"
     assert report["verdict"] == "named"
     fault = report["data_faults"][0]
@@ -149,62 +147,63 @@ def test_the_report_names_faults_by_the_agents_own_names(run: Path) -> None:
     assert f"data.path={run.parent / 'lane.csv'}" in train
 
 
-def test_the_checkpoint_is_evaluated_on_the_sealed_sequences(run: Path) -> None:
-    metrics = json.loads((run.parent / "evaluate" / "metrics.json").read_text())
-    report = json.loads((run / "report.json").read_text())
+def test_checkpoint_is_evaluated_on_confirmation_data(run: Path) -> None:
+    metrics = read_json(run.parent / "evaluate" / "metrics.json")
+    report = read_json(run / "report.json")
     assert metrics["part"] == "heldout"
     assert metrics["trained_on"] == 0
     assert sorted(metrics["costs"]) == sorted(report["split"]["confirmation"])
     assert metrics["parameters"]["speed_zone.alpha"] == pytest.approx(0.65)
-    # the mean square error over the followers, of a simulation with another step
+    # both are mean square errors of followers; the steps differ
     assert metrics["rmse"] ** 2 == pytest.approx(report["gap"]["after"], rel=0.2)
 
 
-def test_force_plots_take_the_checkpoint(run: Path) -> None:
+def test_plot_forces_takes_the_checkpoint(run: Path) -> None:
     forces = run.parent / "forces"
     assert (forces / "forces.png").stat().st_size > 10_000
     assert list(pd.read_csv(forces / "forces.csv"))[-1] == "lin_with_speed_zone"
 
 
-def test_the_configuration_trains_from_the_estimates(run: Path) -> None:
-    result = json.loads((run.parent / "train" / "result.json").read_text())
-    first = result["history"][0]
-    assert first["parameters/speed_zone.alpha"] == pytest.approx(0.65)
-    assert first["parameters/speed_zone.a"] == pytest.approx(ZONE[0])
+def test_model_yaml_starts_training_from_the_estimates(run: Path) -> None:
+    start = read_json(run.parent / "train" / "result.json")["history"][0]
+    assert start["parameters/speed_zone.alpha"] == pytest.approx(0.65)
+    assert start["parameters/speed_zone.a"] == pytest.approx(ZONE[0])
     checkpoint = load_checkpoint(run.parent / "train" / "checkpoints" / "last.pt")
-    assert checkpoint.history[-1]["parameters/speed_zone.alpha"] != 0.65  # it is calibrated
+    assert checkpoint.history[-1]["parameters/speed_zone.alpha"] != 0.65
 
 
 @pytest.mark.slow
-def test_training_goes_on_with_the_open_sequences(
-    script: Script, run: Path, tmp_path: Path
-) -> None:
+def test_training_resumes_with_exploration_data(script: Script, run: Path, tmp_path: Path) -> None:
     resume = f"resume={run / 'checkpoints' / 'best.pt'}"
-    script("train", resume, "trainer.max_epochs=1", f"hydra.run.dir={tmp_path}")
+    script("train", resume, "trainer.max_epochs=1", folder=tmp_path)
     before = load_checkpoint(run / "checkpoints" / "best.pt")
     after = load_checkpoint(tmp_path / "checkpoints" / "last.pt")
-    report = json.loads((run / "report.json").read_text())
+    report = read_json(run / "report.json")
     assert after.split["heldout"] == before.split["heldout"] == report["split"]["confirmation"]
     assert after.split["train"] == report["split"]["exploration"]
     assert after.history[0]["parameters/speed_zone.alpha"] == pytest.approx(0.65)
 
 
-def test_a_signal_leaves_no_half_report(forks: Forks, run: Path, tmp_path: Path) -> None:
-    sign = tmp_path / "sign"
-    given = overrides(run.parent / "lane.csv", tmp_path / "run")
-    process = forks.start(CODE, *given, **{stand_in.WAIT: str(sign)})
-    while process.poll() is None and not sign.exists():
+def test_signal_leaves_no_partial_report(forks: Forks, run: Path, tmp_path: Path) -> None:
+    started = tmp_path / "started"
+    options = overrides(run.parent / "lane.csv", tmp_path / "run")
+    process = forks.start(CODE, *options, **{stand_in.WAIT: str(started)})
+    while process.poll() is None and not started.exists():
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM, errors
     assert "stopped by SIGTERM: the diagnosis was not finished and nothing of it" in errors
     assert "Traceback" not in errors
-    left = {p.name for p in (tmp_path / "run").iterdir()}
-    assert left <= {"data", ".hydra", ".lock", "discover.log"}
+    assert {p.name for p in (tmp_path / "run").iterdir()} <= {
+        "data",
+        ".hydra",
+        ".lock",
+        "discover.log",
+    }
 
 
-def test_effects_can_be_given_on_the_command_line() -> None:
+def test_effects_on_the_command_line() -> None:
     effects = composed("train", "model.effects=[{name: relative_speed, kappa: 0.3}]").model.effects
     assert effects == [{"name": "relative_speed", "kappa": 0.3}]
 
@@ -220,10 +219,10 @@ def test_effects_can_be_given_on_the_command_line() -> None:
         ({"term": "lin", "v0": "fast"}, None, "v0|fast"),
     ],
 )
-def test_wrong_options_are_refused_before_any_data_are_read(
+def test_wrong_options_are_refused_before_reading(
     tmp_path: Path, model: dict[str, Any], effects: list[str] | None, message: str
 ) -> None:
-    table = tmp_path / "one_vehicle.csv"  # which no reader takes
+    table = tmp_path / "one_vehicle.csv"  # invalid data
     table.write_text("sequence,time,agent,x\n0,0,a,0\n0,1,a,9\n")
     options = DiscoverOptions(effects=effects)
     with pytest.raises(ConfigError, match=message):
@@ -231,27 +230,24 @@ def test_wrong_options_are_refused_before_any_data_are_read(
 
 
 @pytest.fixture
-def by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results made by hand, and nothing that could be drawn."""
+def substituted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Substituted results; drawing fails the test."""
     monkeypatch.setattr(diagnose, "diagnose_law", stand_in.diagnose)
 
-    def never(*_: object) -> None:
-        pytest.fail("something was drawn")
-
-    monkeypatch.setattr(page, "draw", never)
+    monkeypatch.setattr(page, "draw", lambda *_: pytest.fail("a page was drawn"))
 
 
 def lin_diagnosed(folder: Path) -> Report:
-    """The diagnosis of the linear law by hand, without a page; the law is compared with idm."""
+    """The diagnosis of the linear law without a page; the law is compared with the IDM."""
     table = lane(folder / "lane.csv", sequences=4, seconds=3.0, cars=3)
-    chosen = DiscoverOptions(page=False, compare=["idm"])
+    options = DiscoverOptions(page=False, compare=["idm"])
     return app.diagnose_table(
-        table, "traffic", model={"term": "lin"}, folder=folder / "run", options=chosen
+        table, "traffic", model={"term": "lin"}, folder=folder / "run", options=options
     )
 
 
-@pytest.mark.usefixtures("by_hand")
-def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.usefixtures("substituted")
+def test_without_a_folder_no_file_is_written(tmp_path: Path, monkeypatch) -> None:
     table, walls = corridor(tmp_path / "walk.csv", sequences=4, seconds=2.0, people=4)
     before = sorted(tmp_path.iterdir())
     monkeypatch.chdir(tmp_path)
@@ -271,8 +267,8 @@ def test_a_table_is_diagnosed_without_a_trace(tmp_path: Path, monkeypatch) -> No
 
 
 @pytest.mark.thorough
-@pytest.mark.usefixtures("by_hand")
-def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.usefixtures("substituted")
+def test_better_fitting_law_is_diagnosed_as_well(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(diagnose, "with_effects", lambda laws, effects: laws)
     monkeypatch.setattr(thresholds, "STRICT", 0.5)
     report = lin_diagnosed(tmp_path)
@@ -280,19 +276,19 @@ def test_without_a_page_nothing_is_drawn(tmp_path: Path, monkeypatch) -> None:
     assert report.nearest is not None
     assert report.nearest.diagnosis.model == "idm"
     assert report.nearest.diagnosis.laws is None
-    nearest = json.loads((tmp_path / "run" / "nearest_law" / "report.json").read_text())
+    nearest = read_json(tmp_path / "run" / "nearest_law" / "report.json")
     assert nearest == report.nearest.plain()
     report = report.plain()
-    assert [one["name"] for one in report["laws"]["ranking"]] == ["idm", "lin"]
+    assert [law["name"] for law in report["laws"]["ranking"]] == ["idm", "lin"]
     assert report["laws"]["nearest"] == "idm"
     assert names == {"checkpoints", "model.yaml", "report.json", "nearest_law"}
-    assert json.loads((tmp_path / "run" / "report.json").read_text()) == report
+    assert read_json(tmp_path / "run" / "report.json") == report
     assert load_checkpoint(tmp_path / "run" / "checkpoints" / "best.pt").config["seed"] == 0
 
 
 @pytest.mark.thorough
-@pytest.mark.usefixtures("by_hand")
-def test_a_law_that_is_not_rejected_is_diagnosed_alone(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("substituted")
+def test_law_that_is_not_rejected_is_diagnosed_alone(tmp_path: Path) -> None:
     report = lin_diagnosed(tmp_path)
     laws = report.plain()["laws"]
     assert laws["ranking"][0]["name"] == "idm"
@@ -304,18 +300,19 @@ def test_a_law_that_is_not_rejected_is_diagnosed_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.usefixtures("by_hand")
+@pytest.mark.usefixtures("substituted")
 @pytest.mark.parametrize("imitated", [False, True])
-def test_laws_are_compared_again_with_the_missing_effect(
+def test_laws_are_compared_again_with_the_effect(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, imitated: bool
 ) -> None:
-    """Behind a zone idm comes first. With the zone lin does, because the nearest law lacks the
-    zone, or because lin does and idm imitates the zone well enough to need nothing."""
+    """Without the zone, the IDM fits best. With it, lin does, also where the IDM imitates the zone
+    and therefore needs no effect."""
 
-    def diagnose_law(system: System, *arguments: Any, **how: Any) -> DiagnosisOutcome:
-        outcome = stand_in.diagnose(system, *arguments, **how)
-        keeps = imitated and system.order > 1
-        return dataclasses.replace(outcome, searched=system) if keeps else outcome
+    def diagnose_law(system: System, *arguments: Any, **options: Any) -> DiagnosisOutcome:
+        outcome = stand_in.diagnose(system, *arguments, **options)
+        if imitated and system.order > 1:
+            return dataclasses.replace(outcome, searched=system)
+        return outcome
 
     monkeypatch.setattr(diagnose, "diagnose_law", diagnose_law)
     monkeypatch.setattr(thresholds, "STRICT", 0.5)
@@ -330,9 +327,9 @@ def test_laws_are_compared_again_with_the_missing_effect(
     assert repeated.ranking[1].behind > 0
 
 
-@pytest.mark.usefixtures("by_hand")
-def test_faults_stand_beside_the_verdict(tmp_path: Path) -> None:
-    table, options = with_a_fault(tmp_path / "lane.csv"), DiscoverOptions(compare=[])
+@pytest.mark.usefixtures("substituted")
+def test_faulty_sequences_are_reported_and_left_out(tmp_path: Path) -> None:
+    table, options = faulty_lane(tmp_path / "lane.csv"), DiscoverOptions(compare=[])
     report = app.diagnose_table(table, "traffic", model={"term": "lin"}, options=options).plain()
     assert report["verdict"] == "named"
     faults = [(fault["sequence"], *fault["agents"]) for fault in report["data_faults"]]
@@ -341,7 +338,7 @@ def test_faults_stand_beside_the_verdict(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_slow_zone_of_made_up_platoons_is_named(tmp_path: Path) -> None:
+def test_simulated_speed_zone_is_named(tmp_path: Path) -> None:
     table = lane(tmp_path / "lane.csv", sequences=12, seconds=20.0, cars=6)
     report = app.diagnose_table(
         table,

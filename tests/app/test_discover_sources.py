@@ -1,21 +1,20 @@
-"""A diagnosis of files in the formats of other programs, as the script makes it."""
+"""``nnode discover`` on files in the formats of other programs."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
 
-from tests.app.conftest import Script
+from tests.app.conftest import Script, read_json
 from tests.diagnosis.recorded import corridor, lane
 
 
 @pytest.fixture
 def highd(tmp_path: Path) -> Path:
-    """Platoons of cars, each in a lane of its own, 5 frames/s."""
+    """Platoons of cars in separate lanes, 5 frames/s."""
     table = pd.read_csv(lane(tmp_path / "lane.csv", sequences=9, seconds=8.0, cars=3))
     number = pd.factorize(table["agent"])[0] + 1
     frame = ((table["time"] - 40 * table["sequence"]) * 5).round().astype(int)
@@ -37,7 +36,7 @@ def highd(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def pedpy(tmp_path: Path) -> Path:
-    """People in a corridor, 10 frames/s, a text with the area beside it."""
+    """People in a corridor, 10 frames/s; the walkable area lies in the same folder."""
     table = pd.read_csv(corridor(tmp_path / "walk.csv", sequences=9, seconds=2.0, people=4)[0])
     number = pd.factorize(table["agent"])[0] + 1
     rows = zip(
@@ -53,34 +52,29 @@ def pedpy(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("source", "options"),
     [
-        # their law has no inertia
+        # the true law has no inertia
         (
             "highd",
-            [
-                "model=lin",
-                "model.leader=measured",
-                "data.window=null",
-                "discover.effects=[inertia]",
-            ],
+            "model=lin model.leader=measured data.window=null discover.effects=[inertia]",
         ),
-        # nobody sways
-        ("pedpy", ["model=sf", "model.B=0.3", "data.t_seq=2", "discover.effects=[gait_sway]"]),
+        # the true motion has no sway
+        ("pedpy", "model=sf model.B=0.3 data.t_seq=2 discover.effects=[gait_sway]"),
     ],
 )
 def test_a_diagnosis_ends_with_a_verdict(
-    request: pytest.FixtureRequest, script: Script, tmp_path: Path, source: str, options: list[str]
+    request: pytest.FixtureRequest, script: Script, tmp_path: Path, source: str, options: str
 ) -> None:
     path: Path = request.getfixturevalue(source)
-    given = [*options, f"data={source}", f"data.path={path}"]
-    given += [f"data.geometry={area}" for area in path.parent.glob("area.wkt")]
     folder = tmp_path / "run"
-    given += ["discover.page=false", "discover.compare=[]", f"hydra.run.dir={folder}"]
-    done = script("discover", *given)
-    report: dict[str, Any] = json.loads((folder / "report.json").read_text())
+    words = [*options.split(), f"data={source}", f"data.path={path}"]
+    words += [f"data.geometry={area}" for area in path.parent.glob("area.wkt")]
+    words += ["discover.page=false", "discover.compare=[]", f"hydra.run.dir={folder}"]
+    done = script("discover", *words)
+    report: dict[str, Any] = read_json(folder / "report.json")
     assert f"verdict: {report['verdict']}" in done.stdout
-    # six open clusters are as many as it takes to test one effect
+    # six clusters are the minimum for a test of one effect
     assert report["clusters"]["exploration"] == report["clusters"]["least_exploration"] == 6
-    # with so few clusters the effect may be one that cannot be tested
+    # with so few clusters the effect may not be testable
     absences = report["absences"]
     testable = not absences or any(absence["testable"] for absence in absences)
     assert report["verdict"] in ("unknown", "none" if testable else "not_testable")

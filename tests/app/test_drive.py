@@ -1,8 +1,7 @@
-"""A run drives vehicles in SUMO: the script, ``nnode.drive``, and what is refused beforehand."""
+"""``nnode drive`` and ``nnode.drive``: a calibrated model drives vehicles in SUMO."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from nnode.data.readers.table import TableOptions
 from nnode.errors import CheckpointError, ConfigError
 from nnode.exchange.running_sumo import Steps
 from nnode.model import build_model
-from tests.app.conftest import Script
+from tests.app.conftest import Script, read_json
 from tests.data.tables import saved, tidy
 from tests.exchange.by_sumo import configured
 
@@ -31,23 +30,22 @@ def sumo() -> Path:
 
 
 def run_of(folder: Path, name: str, *effects: dict[str, Any], **solver: Any) -> Path:
-    """The folder of a training of which only the checkpoint is left."""
+    """A run's folder that holds only the checkpoint."""
     options = {**model_options(name, "measured"), "effects": list(effects)}
-    config = {
-        "model": options,
-        "seed": 0,
-        "trainer": {"dtype": "float64"},
-        "data": {"name": "sumo"},
-        "solver": {"name": "fused", "dt": 0.1, "method": None, **solver},
-    }
-    made = Checkpoint(
-        config=config,
+    checkpoint = Checkpoint(
+        config={
+            "model": options,
+            "seed": 0,
+            "trainer": {"dtype": "float64"},
+            "data": {"name": "sumo"},
+            "solver": {"name": "fused", "dt": 0.1, "method": None, **solver},
+        },
         manifest={"dt": 0.2},
         model=build_model(options).state_dict(),
         optimizer={},
         progress={},
     )
-    save_checkpoint(made, folder / "checkpoints" / "best.pt")
+    save_checkpoint(checkpoint, folder / "checkpoints" / "best.pt")
     return folder
 
 
@@ -59,12 +57,12 @@ def scene(sumo: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.thorough
-def test_the_script(script: Script, scene: Path, tmp_path: Path) -> None:
+def test_command(script: Script, scene: Path, tmp_path: Path) -> None:
     run, out = run_of(tmp_path / "run", "idm"), tmp_path / "out"
     options = [f"run={run}", f"sumo={scene}", "program=traci", "lengths=true"]
-    done = script("drive", *options, "vehicles=own", f"hydra.run.dir={out}")
-    account = json.loads((out / "drive.json").read_text())
-    assert (account["driven"], account["steps"], account["collisions"]) == (7, 200, 0)
+    done = script("drive", *options, "vehicles=own", folder=out)
+    summary = read_json(out / "drive.json")
+    assert (summary["driven"], summary["steps"], summary["collisions"]) == (7, 200, 0)
     assert "driven: 7 vehicles, mean " in done.stdout
     assert "200 ballistic steps of 0.1 s" in done.stdout
     (observed,) = read_sumo(out / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
@@ -73,11 +71,11 @@ def test_the_script(script: Script, scene: Path, tmp_path: Path) -> None:
     store = prepare(SumoOptions(path=str(out / "fcd.xml.gz")), tmp_path / "store")
     assert len(store) == 1
 
-    done = script("drive", *options, "vehicles=car", f"hydra.run.dir={out}", status=2)
+    done = script("drive", *options, "vehicles=car", folder=out, status=2)
     assert "error: vehicles=car is no vehicle type of the scenario, it has lead, own" in done.stderr
 
 
-def test_from_python(scene: Path, tmp_path: Path) -> None:
+def test_drive_in_python(scene: Path, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", "idm")
     result = nnode.drive(run, sumo=scene, vehicles=["own", "lead"], program="traci", lengths=True)
     assert result.driven == 8
@@ -87,27 +85,23 @@ def test_from_python(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_steps_are_those_of_the_run(scene: Path, tmp_path: Path) -> None:
+def test_conflicting_steps_need_a_choice(scene: Path, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", "idm", dt=0.05, method="semi_implicit")
-    options: dict[str, Any] = {
-        "sumo": scene,
-        "vehicles": "own",
-        "program": "traci",
-        "lengths": True,
-    }
+    options: dict[str, Any] = {"sumo": scene, "vehicles": "own", "program": "traci"}
+    options.update(folder=tmp_path, lengths=True)
     words = r"ballistic steps of 0\.1 s.*semi_implicit steps of 0\.05 s.*solver\.dt=0\.1"
     with pytest.raises(ConfigError, match=words):
-        nnode.drive(run, folder=tmp_path, **options)
-    result = nnode.drive(run, folder=tmp_path, steps="run", **options)
+        nnode.drive(run, **options)
+    result = nnode.drive(run, steps="run", **options)
     assert (result.step, result.method, result.steps) == (0.05, "semi_implicit", 400)
-    result = nnode.drive(run, folder=tmp_path, steps="scenario", **options)
+    result = nnode.drive(run, steps="scenario", **options)
     assert (result.step, result.method, result.steps) == (0.1, "ballistic", 200)
     with pytest.raises(ConfigError, match="steps=any is unknown, expected one of match"):
-        nnode.drive(run, folder=tmp_path, steps="any", **options)
+        nnode.drive(run, steps="any", **options)
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "expected"),
+    ("name", "solver", "expected"),
     [
         ("idm", {}, Steps(0.1, "ballistic")),
         ("krauss", {}, Steps(0.1, "semi_implicit")),
@@ -116,15 +110,13 @@ def test_steps_are_those_of_the_run(scene: Path, tmp_path: Path) -> None:
         ("lin", {"dt": 0.2}, Steps(0.2, "euler")),
     ],
 )
-def test_which_steps_a_run_made(
-    name: str, given: dict[str, Any], expected: Steps, tmp_path: Path
-) -> None:
-    checkpoint = load_checkpoint(run_of(tmp_path, name, **given) / "checkpoints" / "best.pt")
+def test_steps_of_a_run(name: str, solver: dict[str, Any], expected: Steps, tmp_path: Path) -> None:
+    checkpoint = load_checkpoint(run_of(tmp_path, name, **solver) / "checkpoints" / "best.pt")
     result = steps_of(checkpoint, checkpoint.build())
     assert (result.seconds, result.method) == (pytest.approx(expected.seconds), expected.method)
 
 
-def test_what_is_refused_before_sumo_runs(tmp_path: Path) -> None:
+def test_unsuitable_runs_are_refused(tmp_path: Path) -> None:
     options: dict[str, Any] = {"sumo": tmp_path / "a.sumocfg", "vehicles": "car"}
     with pytest.raises(CheckpointError, match=r"no checkpoint .*best\.pt"):
         nnode.drive(tmp_path / "none", **options)
@@ -136,15 +128,15 @@ def test_what_is_refused_before_sumo_runs(tmp_path: Path) -> None:
         nnode.drive(run_of(tmp_path / "rk", "idm", method="rk4"), steps="run", **options)
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_lengths_are_asked_for_as_the_data_had_them(known: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("with_length", [True, False])
+def test_lengths_follow_the_training_data(with_length: bool, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", "idm")
     checkpoint = load_checkpoint(run / "checkpoints" / "best.pt")
     with pytest.raises(ConfigError, match=r"run/data, are not there.*lengths=true"):
         _has_lengths(checkpoint, str(run), checkpoint.build())
     table = tidy(samples=20, agents=2)
-    path = saved(tmp_path / "a.csv", table.assign(length=4.5) if known else table)
+    path = saved(tmp_path / "a.csv", table.assign(length=4.5) if with_length else table)
     prepare(TableOptions(domain="traffic", path=str(path)), run / "data")
-    assert _has_lengths(checkpoint, str(run), checkpoint.build()) is known
-    # a law that does not ask
+    assert _has_lengths(checkpoint, str(run), checkpoint.build()) is with_length
+    # a law without lengths needs no data
     assert _has_lengths(checkpoint, str(tmp_path), build_model(model_options("lin", "measured")))

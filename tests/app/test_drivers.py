@@ -1,4 +1,4 @@
-"""Calibrating to drivers who differ, in Python and by the command."""
+"""Calibration with driver-specific parameters, in Python and by the command."""
 
 from __future__ import annotations
 
@@ -19,25 +19,24 @@ from nnode.calibrate.options import TrainerOptions
 from nnode.errors import ConfigError
 from nnode.model import build_model
 from nnode.population import drivers as population
-from tests.app.conftest import Script, background
-from tests.app.different import LASTING, PUSH, TRUE, table
+from tests.app.conftest import Script, background, read_json
+from tests.app.different import PUSH, PUSH_TIME, TRUE, table
 from tests.app.following import TRUE as EXACT
 from tests.app.following import pairs
 
 DIFFER = {"T": 0.15}
 
-
-Own = dict[str, np.ndarray]
+DriverValues = dict[str, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def drawn() -> tuple[pd.DataFrame, Own]:
+def simulated() -> tuple[pd.DataFrame, DriverValues]:
     return table(1, platoons=6, cars=4, seconds=30.0, noise=0.05, differ=DIFFER)
 
 
 @pytest.fixture(scope="module")
-def small(drawn: tuple[pd.DataFrame, Own]) -> pd.DataFrame:
-    return drawn[0]
+def small(simulated: tuple[pd.DataFrame, DriverValues]) -> pd.DataFrame:
+    return simulated[0]
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +45,8 @@ def fitted(small: pd.DataFrame) -> nnode.Calibrator:
 
 
 @pytest.mark.thorough
-def test_the_typical_driver_and_every_driver_are_found(
-    drawn: tuple[pd.DataFrame, Own], fitted: nnode.Calibrator
+def test_typical_and_individual_drivers_are_recovered(
+    simulated: tuple[pd.DataFrame, DriverValues], fitted: nnode.Calibrator
 ) -> None:
     result = fitted.result_
     assert result.drivers is not None
@@ -55,30 +54,30 @@ def test_the_typical_driver_and_every_driver_are_found(
         row = result.parameters.loc[f"idm.{name}"]
         assert row["lower"] < TRUE[name] < row["upper"] < 2 * row["lower"]
     rows = result.drivers.variability
-    for name, true in {"T": 15.0, "push": PUSH, "push_time": LASTING}.items():
+    for name, true in {"T": 15.0, "push": PUSH, "push_time": PUSH_TIME}.items():
         assert rows.lower[name] < true < rows.upper[name]
     assert list(rows.unit) == ["m/s²", "s", "m", "%"]
     assert rows.estimate["measurement"] == pytest.approx(0.05, rel=0.1)
-    own = drawn[1]["T"]
+    true_T = simulated[1]["T"]
     drivers = result.drivers.table.set_index("driver")
-    true = {str(10 * b + i + 1): own[b, i] for b in range(6) for i in range(3)}
-    away = (drivers["T"] - pd.Series(true)) / drivers["T_error"]
+    true = pd.Series({str(10 * b + i + 1): true_T[b, i] for b in range(6) for i in range(3)})
+    z = ((drivers["T"] - true) / drivers["T_error"]).abs()
     assert len(drivers) == 18
-    assert away.abs().max() < 5
-    assert (away.abs() < 2).mean() > 0.8
+    assert z.max() < 5
+    assert (z < 2).mean() > 0.8
     assert (drivers["T_shrinkage"] < 0.2).all()
     assert "18 drivers; parameters that differ" in result.summary()
-    usual = result.conf_int()
+    intervals = result.conf_int()
     for end in ("lower", "upper"):
-        own = result.parameters[end].to_numpy(dtype=float)
-        assert usual[end].to_numpy() == pytest.approx(own, rel=1e-6, nan_ok=True)
+        expected = result.parameters[end].to_numpy(dtype=float)
+        assert intervals[end].to_numpy() == pytest.approx(expected, rel=1e-6, nan_ok=True)
     assert result.fit.likelihood == "mixed-effects model"
     assert np.isfinite(result.fit.bic)
     assert result.drivers.plot().axes[0].get_xlabel() == "T (s)"
 
 
 def options(table: pd.DataFrame, folder: Path) -> list[str]:
-    """Of the same calibration by the command."""
+    """Options of the command for the calibration of `fitted`."""
     table.to_parquet(folder / "table.parquet")
     return [
         "model=idm",
@@ -93,19 +92,19 @@ def options(table: pd.DataFrame, folder: Path) -> list[str]:
 
 
 @pytest.mark.thorough
-def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
+def test_command_writes_the_results_of_python(
     script: Script, tmp_path: Path, small: pd.DataFrame, fitted: nnode.Calibrator
 ) -> None:
     script("train", *options(small, tmp_path))
     run = tmp_path / "run"
-    written = json.loads((run / "result.json").read_text())
+    written = read_json(run / "result.json")
     result = fitted.result_
     assert result.drivers is not None
-    ours = result.plain(written["paths"])
+    expected = result.plain(written["paths"])
     for key in ("parameters", "drivers"):
-        assert json.dumps(ours[key], sort_keys=True) == json.dumps(written[key], sort_keys=True)
-    own = pd.read_csv(run / "drivers.csv", dtype={"driver": str})
-    pd.testing.assert_frame_equal(own, result.drivers.table)
+        assert json.dumps(written[key], sort_keys=True) == json.dumps(expected[key], sort_keys=True)
+    drivers = pd.read_csv(run / "drivers.csv", dtype={"driver": str})
+    pd.testing.assert_frame_equal(drivers, result.drivers.table)
     model = nnode.load(run / "checkpoints" / "best.pt")
     values = {name: float(value) for name, (value, _) in model.physical().items()}
     assert values == {name: row["value"] for name, row in written["parameters"].items()}
@@ -115,13 +114,13 @@ def test_the_command_writes_the_same_and_its_checkpoint_has_the_parameters(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("model", ["idm", "fvdm"])
-def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model: str) -> None:
-    given = pairs(number=6, seconds=20.0)
-    calibrator = nnode.Calibrator(model, drivers="auto", method="ballistic").fit(given)
+def test_identical_drivers_keep_shared_parameters(model: str) -> None:
+    calibrator = nnode.Calibrator(model, drivers="auto", method="ballistic")
+    calibrator.fit(pairs(number=6, seconds=20.0))
     if model == "idm":
         assert calibrator.result_.drivers is None
         assert calibrator.parameters_.estimate["idm.T"] == pytest.approx(EXACT["T"], rel=1e-4)
-    else:  # another law leaves more than that
+    else:  # the wrong law leaves residuals
         assert calibrator.result_.drivers is not None
 
 
@@ -138,19 +137,19 @@ def test_paths_that_all_drivers_explain_exactly_keep_the_common_parameters(model
         ("lin", True, {"drivers": ["v0"]}, ["v0"]),
     ],
 )
-def test_drivers_differ_by_default_in_laws_of_second_order(
+def test_default_treatment_of_drivers(
     small: pd.DataFrame, model: str, noise: bool, options: dict[str, Any], plan: Any
 ) -> None:
-    given = list(nnode.sequences(small if noise else pairs(number=6, seconds=20.0)))
+    sequences = list(nnode.sequences(small if noise else pairs(number=6, seconds=20.0)))
     system = build_model(model_options(model, "measured"), 0)
     for exact in (True, False):
         if plan == "alone" and not exact:
-            continue  # refused, see below
-        result = planned(TrainerOptions(**options), system, lambda: given, exact)
+            continue  # refused: test_invalid_options_are_refused
+        result = planned(TrainerOptions(**options), system, lambda: sequences, exact)
         assert result == (plan if exact or options.get("drivers") else "none")
 
 
-def test_simulations_that_blow_up_are_refused_but_by_default_all_share_their_parameters(
+def test_diverging_simulations_share_parameters_or_are_refused(
     small: pd.DataFrame, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(population, "_simulated_finitely", lambda model: False)
@@ -162,7 +161,7 @@ def test_simulations_that_blow_up_are_refused_but_by_default_all_share_their_par
 
 
 @pytest.mark.thorough
-def test_a_short_delay_is_simulated_in_short_steps(small: pd.DataFrame) -> None:
+def test_reaction_delay_with_different_drivers(small: pd.DataFrame) -> None:
     delay = {"name": "reaction_delay", "T": 0.3}
     result = nnode.Calibrator("idm", effects=[delay], drivers=["T"], epochs=3).fit(small).result_
     assert result.drivers is not None
@@ -185,14 +184,14 @@ def test_a_short_delay_is_simulated_in_short_steps(small: pd.DataFrame) -> None:
         ({"drivers": "alone", "optimizer": "lbfgs"}, r"alone needs optimizer=gauss_newton"),
     ],
 )
-def test_what_has_no_place_is_refused(
+def test_invalid_options_are_refused(
     small: pd.DataFrame, options: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ConfigError, match=words):
         nnode.Calibrator(**{"model": "idm", **options}).fit(small)
 
 
-def test_people_share_their_parameters() -> None:
+def test_driver_specific_parameters_of_people_are_refused() -> None:
     rows = [(0, 0.1 * k, a, 0.1 * k + a, 1.0 * a) for k in range(4) for a in range(2)]
     people = pd.DataFrame(rows, columns=["sequence", "time", "agent", "x", "y"])
     with pytest.raises(ConfigError, match="people meet everybody"):
@@ -205,7 +204,7 @@ def test_too_few_followers_are_refused(small: pd.DataFrame) -> None:
 
 
 @pytest.mark.thorough
-def test_a_run_that_is_stopped_while_drivers_are_told_apart_goes_on(
+def test_interrupted_estimation_of_drivers_resumes(
     script: Script, tmp_path: Path, small: pd.DataFrame, fitted: nnode.Calibrator
 ) -> None:
     folder = tmp_path / "run"
@@ -221,16 +220,15 @@ def test_a_run_that_is_stopped_while_drivers_are_told_apart_goes_on(
     last = folder / "checkpoints" / "last.pt"
     assert f"resume={last} hydra.run.dir={folder}" in errors
     assert not (folder / "drivers.csv").exists()
-    script("train", f"resume={last}", f"hydra.run.dir={folder}")
-    written = json.loads((folder / "result.json").read_text())["parameters"]
+    script("train", f"resume={last}", folder=folder)
+    written = read_json(folder / "result.json")["parameters"]
     for name, row in fitted.parameters_.iterrows():
         assert written[name]["value"] == pytest.approx(row["estimate"], rel=1e-9)
         assert written[name]["value"] != float(before[name][0])
 
 
 @pytest.mark.thorough
-def test_drivers_of_noisy_positions_are_told_apart() -> None:
-    """Twenty platoons of five cars, whose positions a satellite's receiver measures."""
+def test_drivers_are_recovered_from_noisy_positions() -> None:
     differ = {"T": 0.15, "v0": 0.15}
     measured, _ = table(201, platoons=20, cars=5, seconds=60.0, noise=0.3, differ=differ)
     result = nnode.fit(measured, model="idm", heldout=0.0)
@@ -244,10 +242,10 @@ def test_drivers_of_noisy_positions_are_told_apart() -> None:
 
 
 @pytest.mark.thorough
-def test_the_summary_says_what_is_at_a_bound(fitted: nnode.Calibrator) -> None:
+def test_summary_names_estimates_at_a_bound(fitted: nnode.Calibrator) -> None:
     drivers = fitted.result_.drivers
     assert drivers is not None
-    assert not [line for line in drivers.summary() if "allowed value" in line]
+    assert "allowed value" not in "".join(drivers.summary())
     variability = drivers.variability.copy()
     variability.loc["T", "at_bound"] = "low"
     (line,) = [

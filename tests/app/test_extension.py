@@ -1,7 +1,7 @@
-"""A new law is one YAML file, and a new effect is one entry of a YAML file: with nothing else
-written, both work in every engine, in training, in the diagnosis, on its page and in a drive.
+"""A new law needs only a YAML file and a new effect only an entry of a YAML file.
 
-The files lie in a copy of the package, or where a user's own files lie.
+Both then work in every engine, in training, in the diagnosis and its page, and in SUMO. The files
+lie in a copy of the package or in a user's folders.
 """
 
 from __future__ import annotations
@@ -19,14 +19,16 @@ import pytest
 
 from benchmarks.programs import sumo as by_sumo
 from nnode.data.readers.sumo import SumoOptions, read_sumo
-from tests.app.conftest import ROOT, Script, environment
+from tests.app.conftest import ROOT, Script, environment, read_json
 from tests.app.forked import Forks
 from tests.builders import as_table
 from tests.diagnosis import walkers
 from tests.diagnosis.platoons import platoons
 from tests.exchange.by_sumo import configured
 
-#: Of vehicles and of people, of both orders.
+pytestmark = pytest.mark.thorough
+
+#: Laws of vehicles and of people, of first and second order.
 LAWS = {
     "saturating": """
   parameters: {v0: {value: 25 m/s, low: 1 m/s}, reach: {value: 15 m, low: 1 m}}
@@ -63,7 +65,7 @@ class Hills(Effect):
     rules = {1: Rule(rate="W + w*sin(x/long)", constants={"long": (60.0, "m")})}
     strengths = {"w": Strength(0.0, 0.2, Interval(-6.0, 6.0), "m/s", min_effect_size=1.0)}
 """
-#: Entries of the package's effects, of lanes and of crowds.
+#: Entries appended to the package's effects of lanes and of crowds.
 EFFECTS = {
     "lane": """
 hills:
@@ -82,11 +84,11 @@ waves:
   rules: {2: {rate: [c*sin(x/long), c*cos(x/long)], constants: {long: [1.5, m]}}}
 """,
 }
-#: What the made-up drivers and people do.
+#: Parameters of the simulated drivers and people.
 V0, REACH, W, C = 27.0, 14.0, 2.5, 0.6
 TRUTH = {"saturating.v0": V0, "saturating.reach": REACH, "hills.w": W}
-#: Run in the copy: every engine, and what SUMO's vehicles are given in a step. The generated code
-#: of lanes runs in the interpreter here; a training compiles it.
+#: Run in the copy: a comparison of all engines, and the speeds of SUMO's vehicles in one step. The
+#: generated code of lanes is interpreted here; a training compiles it.
 PROGRAM = """
 import json
 import numpy as np
@@ -112,68 +114,64 @@ model = build_model(model_options("saturating", "measured", [{"name": "hills", "
 drivers = Drivers(model, 0.1, "euler")
 drivers.enter([(), ()])
 gap, nobody = np.array([20.0, 30.0]), np.full(2, np.inf)
-seen = DriverInputs(v=np.full(2, 9.0), gap=gap, v_1=np.full(2, 9.0), length_1=np.full(2, 5.0),
+inputs = DriverInputs(v=np.full(2, 9.0), gap=gap, v_1=np.full(2, 9.0), length_1=np.full(2, 5.0),
             lead=np.full(2, -1), gap_1=nobody, v_2=np.full(2, 9.0), x=np.array([35.0, 80.0]))
-print(json.dumps({"package": nnode.__file__, "speeds": drivers.speeds(0.0, seen).tolist()}))
+print(json.dumps({"package": nnode.__file__, "speeds": drivers.speeds(0.0, inputs).tolist()}))
 """
 
 
 def speeds(x: np.ndarray) -> np.ndarray:
-    """Of followers, m/s, by law and effect; ``x`` with the leader's place behind."""
+    """Speeds of followers (m/s) by law and effect; the leader's position is last in ``x``."""
     law: np.ndarray = V0 * (1 - np.exp(-np.diff(x) / REACH))
     return law + W * np.sin(x[..., :-1] / 60)
 
 
 def waves(x: np.ndarray) -> np.ndarray:
-    """Of people at ``(..., 2)``, m/s²."""
+    """Accelerations (m/s²) of people at ``(..., 2)``."""
     phase = x[..., 0] / 1.5
     return C * np.stack([np.sin(phase), np.cos(phase)], -1)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a copy of the package that has the new files, and tables of both domains."""
-    found = tmp_path_factory.mktemp("extended")
+    """A copy of the package with the new files, and tables of both domains."""
+    copied = tmp_path_factory.mktemp("extended")
     for part in ("nnode", "conf", "scripts"):
-        shutil.copytree(ROOT / part, found / part, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / part, copied / part, ignore=shutil.ignore_patterns("__pycache__"))
     for rank, (name, text) in enumerate(LAWS.items(), 90):
         head = f"  about: A law.\n  source: none\n  rank: {rank}"
-        (found / "nnode" / "model" / "laws" / f"{name}.yaml").write_text(head + text, "utf-8")
+        (copied / "nnode" / "model" / "laws" / f"{name}.yaml").write_text(head + text, "utf-8")
     for name, text in EFFECTS.items():
-        with (found / "nnode" / "model" / "effects" / f"{name}.yaml").open(
-            "a", encoding="utf-8"
-        ) as file:
-            file.write(text)
+        path = copied / "nnode" / "model" / "effects" / f"{name}.yaml"
+        path.write_text(path.read_text("utf-8") + text, "utf-8")
     driven = platoons(lambda x, *_: speeds(x), number=16, vehicles=4, seconds=16.0, seed=4)
-    as_table(driven).to_csv(found / "platoons.csv", index=False)
+    as_table(driven).to_csv(copied / "platoons.csv", index=False)
     walked = walkers.crowd(lambda x, *_: waves(x), sequences=17, samples=40)
-    as_table(walked).to_csv(found / "people.csv", index=False)
+    as_table(walked).to_csv(copied / "people.csv", index=False)
     walls = pd.DataFrame(walkers.WALLS, columns=["x1", "y1", "x2", "y2"])
-    walls.to_csv(found / "walls.csv", index=False)
-    return found
+    walls.to_csv(copied / "walls.csv", index=False)
+    return copied
 
 
 @pytest.fixture(scope="module")
 def copy(folder: Path) -> Iterator[Script]:
-    """Run a script of the copy, or code."""
+    """Runs a script of the copy, or code."""
     path = os.pathsep.join([str(folder), str(ROOT), os.environ.get("PYTHONPATH", "")])
     processes = Forks(folder, {**environment(), "PYTHONPATH": path, "PYTHONSAFEPATH": "1"})
     yield processes.run
     processes.close()
 
 
-@pytest.mark.thorough
-def test_every_engine_and_what_drivers_do(copy: Script, folder: Path) -> None:
-    done = copy(PROGRAM)
-    found = json.loads(done.stdout)
-    assert Path(found["package"]).parents[1] == folder
+def test_engines_agree_and_sumo_s_speeds_are_right(copy: Script, folder: Path) -> None:
+    result = json.loads(copy(PROGRAM).stdout)
+    assert Path(result["package"]).parents[1] == folder
     x, gap = np.array([35.0, 80.0]), np.array([20.0, 30.0])
-    wanted = 25 * (1 - np.exp(-gap / 15)) + W * np.sin(x / 60)
-    np.testing.assert_allclose(found["speeds"], wanted, rtol=1e-6)
+    expected = 25 * (1 - np.exp(-gap / 15)) + W * np.sin(x / 60)
+    np.testing.assert_allclose(result["speeds"], expected, rtol=1e-6)
 
 
 def options(folder: Path, run: Path) -> list[str]:
-    """Of a training of the law and the effect of lanes."""
+    """Options of a training of the traffic law with the effect."""
     return [
         "model.effects=[hills]",
         "data=table",
@@ -188,62 +186,52 @@ def options(folder: Path, run: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def trained(copy: Script, folder: Path) -> Path:
-    """The folder of a run."""
+    """The folder of a training in the copy."""
     run = folder / "run"
     copy("train", "model=saturating", "model.leader=measured", *options(folder, run))
     return run
 
 
 def estimates(run: Path) -> dict[str, float]:
-    result = json.loads((run / "result.json").read_text())
+    result = read_json(run / "result.json")
     assert result["solver"] == {"name": "fused", "uncompiled": None}
-    return {
-        name: result["summary"][name] for name in ("saturating.v0", "saturating.reach", "hills.w")
-    }
+    return {name: result["summary"][name] for name in TRUTH}
 
 
-@pytest.mark.thorough
-def test_training_recovers_the_truth(trained: Path) -> None:
+def test_training_recovers_the_parameters(trained: Path) -> None:
     assert estimates(trained) == pytest.approx(TRUTH, rel=0.02)
 
 
-@pytest.mark.thorough
-def test_a_user_s_files_do_the_same(script: Script, folder: Path, tmp_path: Path) -> None:
-    """The law stands in a folder of configurations, the effect in a file of ``NNODE_EFFECTS``."""
+def test_user_s_files_give_the_same(script: Script, folder: Path, tmp_path: Path) -> None:
+    """The law lies in a configuration folder, the effect in a file named by ``NNODE_EFFECTS``."""
     conf = tmp_path / "conf" / "model"
     conf.mkdir(parents=True)
     head = "defaults: [formula_schema, _self_]\nname: saturating\nleader: measured\nlaw:"
     (conf / "mine.yaml").write_text(head + LAWS["saturating"], "utf-8")
     (tmp_path / "effects.py").write_text(IMPORTS + HILLS)
-    given = ["--config-dir", str(conf.parent), "model=mine", *options(folder, tmp_path / "run")]
-    script("train", *given, NNODE_EFFECTS=str(tmp_path / "effects.py"))
+    words = ["--config-dir", str(conf.parent), "model=mine", *options(folder, tmp_path / "run")]
+    script("train", *words, NNODE_EFFECTS=str(tmp_path / "effects.py"))
     assert estimates(tmp_path / "run") == pytest.approx(TRUTH, rel=0.02)
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("law", ["polite", "strolling"])
-def test_people_are_trained(copy: Script, law: str, tmp_path: Path) -> None:
+def test_training_of_people(copy: Script, law: str, tmp_path: Path) -> None:
     copy(
         "train",
         f"model={law}",
         *["model.effects=[waves]"] * (law == "polite"),
-        "data=table",
-        "data.domain=crowd",
-        "data.path=people.csv",
-        "data.walls=walls.csv",
-        "solver=fused",
-        "trainer.max_epochs=1",
-        f"hydra.run.dir={tmp_path}",
+        *("data=table", "data.domain=crowd", "data.path=people.csv", "data.walls=walls.csv"),
+        *("solver=fused", "trainer.max_epochs=1"),
+        folder=tmp_path,
     )
-    result = json.loads((tmp_path / "result.json").read_text())
+    result = read_json(tmp_path / "result.json")
     assert result["solver"] == {"name": "fused", "uncompiled": None}
     assert {f"{law}.A", f"{law}.B"} <= set(result["summary"])
     assert ("waves.c" in result["summary"]) is (law == "polite")
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("effect", "strength", "value", "given"),
+    ("effect", "strength", "value", "options"),
     [
         (
             "hills",
@@ -259,39 +247,34 @@ def test_people_are_trained(copy: Script, law: str, tmp_path: Path) -> None:
         ),
     ],
 )
-def test_it_is_found_and_shown(
-    copy: Script, effect: str, strength: str, value: float, given: str, tmp_path: Path
+def test_diagnosis_names_the_effect(
+    copy: Script, effect: str, strength: str, value: float, options: str, tmp_path: Path
 ) -> None:
-    alone = ["discover.compare=[]", "discover.structure=false", f"hydra.run.dir={tmp_path}"]
-    copy("discover", "data=table", *given.split(), *alone)
-    found = json.loads((tmp_path / "report.json").read_text())
-    assert (found["verdict"], [one["name"] for one in found["effects"]]) == ("named", [effect])
-    (named,) = found["effects"]
-    interval = [named["coefficients"][strength][end] for end in ("low", "high")]
-    # errors of 2 cm leave intervals of 0.03 %, and smoothed leaders shift estimates by as much
-    assert interval[0] - 1e-3 * value < value < interval[1] + 1e-3 * value
+    only_this_law = ["discover.compare=[]", "discover.structure=false"]
+    folder = f"hydra.run.dir={tmp_path}"
+    copy("discover", "data=table", *options.split(), *only_this_law, folder)
+    report = read_json(tmp_path / "report.json")
+    assert report["verdict"] == "named"
+    (named,) = report["effects"]
+    assert named["name"] == effect
+    low, high = (named["coefficients"][strength][end] for end in ("low", "high"))
+    # errors of 2 cm give intervals of 0.03 %, and smoothed leaders shift estimates by as much
+    assert low - 1e-3 * value < value < high + 1e-3 * value
     page = html.unescape((tmp_path / "report.html").read_text())
     assert effect in page
     assert "sin" in named["formula"]
     assert named["formula"] in page
 
 
-@pytest.mark.thorough
-def test_it_drives_in_sumo(copy: Script, trained: Path, tmp_path: Path) -> None:
+def test_vehicles_in_sumo_follow_the_law(copy: Script, trained: Path, tmp_path: Path) -> None:
     by_sumo.write_scene(
         Path(pytest.importorskip("sumo").SUMO_HOME), tmp_path, "Krauss", {"decel": 4.5}
     )
     path = configured(tmp_path, end=20.0)
-    copy(
-        "drive",
-        f"run={trained}",
-        f"sumo={path}",
-        "vehicles=own",
-        "steps=scenario",
-        f"hydra.run.dir={tmp_path / 'out'}",
-    )
+    words = (f"run={trained}", f"sumo={path}", "vehicles=own", "steps=scenario")
+    copy("drive", *words, folder=tmp_path / "out")
     (observed,) = read_sumo(tmp_path / "out" / "fcd.xml.gz", SumoOptions(path="", dt=0.1))
     v0, reach, w = estimates(trained).values()
     x = observed.x[..., 0]
-    wanted = v0 * (1 - np.exp(-np.diff(x) / reach)) + w * np.sin(x[:, :-1] / 60)
-    np.testing.assert_allclose(np.diff(x[1:, :-1], axis=0) / 0.1, wanted[1:-1], atol=1e-6)
+    expected = v0 * (1 - np.exp(-np.diff(x) / reach)) + w * np.sin(x[:, :-1] / 60)
+    np.testing.assert_allclose(np.diff(x[1:, :-1], axis=0) / 0.1, expected[1:-1], atol=1e-6)

@@ -22,13 +22,12 @@ def pair(number: int, samples: int) -> Sequence:
 
 
 def late(batch: Batch) -> Trajectory:
-    """Followers of pair b are b + 1 m back after the first sample, and 0.5 m/s slow."""
+    """Followers of pair b lag by b + 1 m after the first sample, at 0.5 m/s less."""
     x, v = batch.x.clone(), batch.v.clone()
     for b in range(len(batch)):
         x[1:, b, 0] -= b + 1
         v[1:, b, 0] -= 0.5
-    given = torch.zeros(len(batch), 2, dtype=torch.bool)
-    given[:, 1] = True
+    given = torch.tensor([[False, True]]).expand(len(batch), 2)
     return Trajectory(x, v, given)
 
 
@@ -47,7 +46,7 @@ def test_errors_by_pair_and_driver(tmp_path: Path, capsys: pytest.CaptureFixture
         np.testing.assert_allclose(rows[key], expected, atol=1e-12)
     (driver,) = by_driver(rows).to_dict("records")
     assert (driver["driver"], driver["sequences"], driver["samples"]) == ("driver", 2, 30)
-    # all samples together: 20 of 1 m and 10 of 2 m
+    # 20 samples of 1 m and 10 samples of 2 m
     assert driver["spacing_rmse"] == pytest.approx(np.sqrt((20 + 10 * 4) / 30))
     assert driver["spacing_bias"] == pytest.approx((20 + 20) / 30)
     assert driver["final_error"] == pytest.approx(1.5)
@@ -58,20 +57,20 @@ def test_errors_by_pair_and_driver(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "run/2" in printed
 
 
-def test_models_without_speeds_have_those_of_their_paths() -> None:
+def test_speeds_are_differentiated_if_absent() -> None:
     def slow(batch: Batch) -> Trajectory:
         return Trajectory(batch.x[:1] + 0.8 * (batch.x - batch.x[:1]), None)
 
-    nameless = [replace(pair(1, 11), agents=())]
-    rows = follower_errors(slow, [collate(nameless)], index_of(nameless))
+    anonymous = [replace(pair(1, 11), agents=())]
+    rows = follower_errors(slow, [collate(anonymous)], index_of(anonymous))
     assert rows["driver"].tolist() == ["run/1 0"]
     np.testing.assert_allclose(rows["speed_bias"], -2.0, atol=1e-9)
-    # both vehicles are as late as each other
+    # leader and follower lag equally
     np.testing.assert_allclose(rows["spacing_rmse"], 0.0, atol=1e-9)
     np.testing.assert_allclose(rows["final_error"], 2.0, atol=1e-9)
 
 
-def test_one_identifier_in_two_recordings_is_two_drivers() -> None:
+def test_drivers_are_distinct_between_recordings() -> None:
     sequences = [pair(1, 11), replace(pair(2, 11), recording="other")]
     rows = follower_errors(late, [collate(sequences)], index_of(sequences))
     assert by_driver(rows)["recording"].tolist() == ["run", "other"]

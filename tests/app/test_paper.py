@@ -1,13 +1,12 @@
-"""The printed costs of recording 1-1_1, reached with the paper's optimiser and step."""
+"""The paper's optimiser and step reach its printed costs of recording 1-1_1."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
-from tests.app.conftest import Script
+from tests.app.conftest import Script, read_json
 
 
 @pytest.mark.slow
@@ -24,6 +23,6 @@ def test_printed_cost_is_reached(
         "data.loader.batch_size=0",
         f"data.source={real_data}",
         f"trainer.max_epochs={epochs}",
-        f"hydra.run.dir={tmp_path}",
+        folder=tmp_path,
     )
-    assert json.loads((tmp_path / "result.json").read_text())["summary"]["cost_train"] <= printed
+    assert read_json(tmp_path / "result.json")["summary"]["cost_train"] <= printed

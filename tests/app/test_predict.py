@@ -1,8 +1,7 @@
-"""``nnode predict`` and ``nnode.predict``: drivers predicted from their first seconds."""
+"""``nnode predict`` and ``nnode.predict``: predictions from drivers' first seconds."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 
 import nnode
 from nnode.errors import CheckpointError, ConfigError
-from tests.app.conftest import Script, trained_idm
+from tests.app.conftest import Script, read_json, trained_idm
 from tests.app.different import table
 
 DIFFER = {"T": 0.15}
@@ -23,34 +22,34 @@ def drives(seed: int) -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def run(script: Script, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A training with drivers who differ."""
+    """A training with driver-specific parameters."""
     folder = tmp_path_factory.mktemp("predict")
     return trained_idm(script, folder, drives(1), "trainer.drivers=[T]", "trainer.max_epochs=20")
 
 
-def test_new_drivers_are_predicted_better_than_the_typical_one(run: Path) -> None:
+def test_drivers_are_predicted_better_than_the_typical_driver(run: Path) -> None:
     predictions = nnode.predict(run, drives(2), seconds=10.0, part="all")
     assert predictions.rmse < 0.7 * predictions.rmse_typical
     assert predictions.difference.high < 0
-    assert 0.8 < predictions.covered <= 1.0  # 18 drivers, whose errors last
+    assert 0.8 < predictions.covered <= 1.0  # 18 drivers with autocorrelated errors
     rows = predictions.table
     assert len(rows.groupby(["sequence", "agent"])) == 6 * 3
     assert rows.loc[rows["given"], "time"].max() == pytest.approx(10.0)
-    expected = rows[rows["given"]]
-    assert ((expected["predicted"] - expected["measured"]).abs() < 0.3).all()
+    given = rows[rows["given"]]
+    assert ((given["predicted"] - given["measured"]).abs() < 0.3).all()
     assert "18 followers predicted from their first 10 s" in repr(predictions)
 
 
-def test_the_command_writes_what_python_returns(script: Script, run: Path, tmp_path: Path) -> None:
-    done = script("predict", f"run={run}", "seconds=5", f"hydra.run.dir={tmp_path}")
+def test_command_writes_the_result_of_python(script: Script, run: Path, tmp_path: Path) -> None:
+    done = script("predict", f"run={run}", "seconds=5", folder=tmp_path)
     assert "band of 95%" in done.stdout
-    same = nnode.predict(run, seconds=5.0)
-    assert json.loads((tmp_path / "prediction.json").read_text()) == same.plain()
-    assert len(pd.read_csv(tmp_path / "prediction.csv")) == len(same.table)
+    predictions = nnode.predict(run, seconds=5.0)
+    assert read_json(tmp_path / "prediction.json") == predictions.plain()
+    assert len(pd.read_csv(tmp_path / "prediction.csv")) == len(predictions.table)
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
 
 
-def test_runs_and_beginnings_that_do_not_serve_are_refused(run: Path, tmp_path: Path) -> None:
+def test_unsuitable_runs_and_durations_are_refused(run: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"seconds=1: expected at least 2 s"):
         nnode.predict(run, seconds=1.0)
     with pytest.raises(ConfigError, match=r"seconds=40: none of the \d sequences is longer"):

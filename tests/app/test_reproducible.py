@@ -1,4 +1,4 @@
-"""The same seed gives the same bits: with loading processes or without; threads change rounding."""
+"""Results are bit-identical for the same seed; threads change only the rounding."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.synthetic import demo_data
 from tests.app.conftest import Script
 
-#: Relative difference of parameters that sums in another order may make in three epochs.
+#: Relative difference of parameters after three epochs with another order of summation.
 ROUNDING = 1e-9
 
 
@@ -34,18 +34,15 @@ def trained(script: Script, raw: Path, folder: Path, *overrides: str) -> dict[st
 
 
 @pytest.mark.slow
-def test_workers_change_no_bit_and_threads_only_the_rounding(
-    script: Script,
-    tmp_path: Path,
-) -> None:
+def test_workers_and_threads_do_not_change_results(script: Script, tmp_path: Path) -> None:
     raw = tmp_path / "raw"
     demo_data(raw)
     first = trained(script, raw, tmp_path / "0", "trainer.threads=1")
     assert len(set(first.values())) > 10
     for workers in (0, 1, 2):
-        place = tmp_path / f"workers{workers}"
+        folder = tmp_path / f"workers{workers}"
         repeated = trained(
-            script, raw, place, "trainer.threads=1", f"data.loader.workers={workers}"
+            script, raw, folder, "trainer.threads=1", f"data.loader.workers={workers}"
         )
         assert repeated == first
     threads = trained(script, raw, tmp_path / "threads", "trainer.threads=2")

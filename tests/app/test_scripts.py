@@ -1,8 +1,7 @@
-"""The scripts from end to end, on synthetic recordings in the raw formats."""
+"""Commands from end to end on synthetic recordings in the raw formats."""
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import signal
@@ -14,11 +13,11 @@ import pytest
 import torch
 
 from nnode.calibrate.checkpoint import load_checkpoint
-from tests.app.conftest import ROOT, Script, background
+from tests.app.conftest import ROOT, Script, background, read_json
 
 
 def files_outside(folder: Path) -> set[Path]:
-    """Files of the repository that a script might have written."""
+    """Files in the repository's folders of runs and data."""
     return {p for name in ("runs", "data") for p in (ROOT / name).rglob("*") if p.is_file()}
 
 
@@ -27,34 +26,33 @@ def traffic(raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished training on synthetic traffic."""
     folder = tmp_path_factory.mktemp("run") / "traffic"
     before = files_outside(folder)
-    # in a Python of its own, as a user starts it
-    given = ["experiment=demo_traffic", f"data.source={raw}", f"hydra.run.dir={folder}"]
-    process = background(*given)
-    shown, errors = process.communicate(timeout=1500)
+    # in a new Python process, as a user starts it
+    process = background("experiment=demo_traffic", f"data.source={raw}", f"hydra.run.dir={folder}")
+    output, errors = process.communicate(timeout=1500)
     assert process.returncode == 0, errors
     assert files_outside(folder) == before
     for name in ("tensorboard", "checkpoints/best.pt", "checkpoints/last.pt"):
-        assert str(folder / name) in shown
+        assert str(folder / name) in output
         assert (folder / name).exists()
     return folder
 
 
-def test_training_recovers_the_generator_s_parameters(traffic: Path) -> None:
-    result = json.loads((traffic / "result.json").read_text())["summary"]
-    # the generator's: v0 = 25 m/s, L = 6 m, noise 0.05 m; Euler with 0.02 s
+def test_training_recovers_the_parameters(traffic: Path) -> None:
+    result = read_json(traffic / "result.json")["summary"]
+    # true values: v0 = 25 m/s, L = 6 m; noise 0.05 m; Euler steps of 0.02 s
     assert result["lin.v0"] == pytest.approx(25, abs=0.1)
     assert result["lin.L"] == pytest.approx(6, abs=0.1)
     assert result["cost_train"] < 0.01 * result["cost_start"]
     assert result["cost_heldout"] < 0.01 * result["cost_start"]
 
 
-def test_evaluate_beats_the_baselines_and_agrees_with_training(
+def test_evaluation_agrees_with_training_and_beats_baselines(
     script: Script, traffic: Path, raw: Path, tmp_path: Path
 ) -> None:
     best = traffic / "checkpoints" / "best.pt"
-    script("evaluate", f"checkpoint={best}", f"hydra.run.dir={tmp_path}")
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
-    result = json.loads((traffic / "result.json").read_text())["summary"]
+    script("evaluate", f"checkpoint={best}", folder=tmp_path)
+    metrics = read_json(tmp_path / "metrics.json")
+    result = read_json(traffic / "result.json")["summary"]
     assert metrics["part"] == "heldout"
     page = (tmp_path / "replay.html").read_text(encoding="utf-8")
     assert page.count('"measured":[') == metrics["sequences"]
@@ -68,37 +66,28 @@ def test_evaluate_beats_the_baselines_and_agrees_with_training(
         "data=demo_traffic",
         f"data.source={raw}",
         "data.faults=keep",
-        f"hydra.run.dir={tmp_path / 'all'}",
+        folder=tmp_path / "all",
     )
-    everything = json.loads((tmp_path / "all" / "metrics.json").read_text())
-    assert everything["part"] == "heldout"  # the same files: the checkpoint's held-out part
-    assert everything["J"] == metrics["J"]  # and there is no fault to keep in them
+    everything = read_json(tmp_path / "all" / "metrics.json")
+    assert everything["part"] == "heldout"  # the split of the checkpoint, for the same files
+    assert everything["J"] == metrics["J"]  # the files have no faults
 
 
 @pytest.mark.thorough
-def test_plot_forces_draws_one_and_many(script: Script, traffic: Path, tmp_path: Path) -> None:
+def test_plot_forces_of_two_checkpoints(script: Script, traffic: Path, tmp_path: Path) -> None:
     paths = ",".join(str(traffic / "checkpoints" / name) for name in ("best.pt", "last.pt"))
-    script("plot_forces", f"checkpoint=[{paths}]", f"hydra.run.dir={tmp_path}")
+    script("plot_forces", f"checkpoint=[{paths}]", folder=tmp_path)
     assert (tmp_path / "forces.png").stat().st_size > 10_000
     assert len(pd.read_csv(tmp_path / "forces.csv")) > 10
 
 
 @pytest.mark.thorough
-def test_crowd_from_raw_file_to_plots(script: Script, raw: Path, tmp_path: Path) -> None:
+def test_crowd_from_raw_data_to_plots(script: Script, raw: Path, tmp_path: Path) -> None:
     run = tmp_path / "crowd"
-    script(
-        "train",
-        "experiment=demo_crowd",
-        "model=sf",
-        "trainer.max_epochs=2",
-        f"data.source={raw}",
-        f"hydra.run.dir={run}",
-    )
-    script(
-        "plot_forces",
-        f"checkpoint=[{run / 'checkpoints' / 'best.pt'}]",
-        f"hydra.run.dir={tmp_path / 'plots'}",
-    )
+    options = ("experiment=demo_crowd", "model=sf", "trainer.max_epochs=2", f"data.source={raw}")
+    script("train", *options, folder=run)
+    best = run / "checkpoints" / "best.pt"
+    script("plot_forces", f"checkpoint=[{best}]", folder=tmp_path / "plots")
     names = {p.name for p in (tmp_path / "plots").glob("sf_*")}
     assert names == {"sf_force_x.png", "sf_force_y.png", "sf_settings.png", "sf_settings.csv"}
 
@@ -110,10 +99,10 @@ def test_crowd_from_raw_file_to_plots(script: Script, raw: Path, tmp_path: Path)
         pytest.param(10, 40, marks=pytest.mark.slow),
     ],
 )
-def test_signals_at_random_moments_change_no_bit(
+def test_interrupted_and_resumed_run_is_bit_identical(
     raw: Path, tmp_path: Path, stops: int, epochs: int
 ) -> None:
-    """Of a run that is stopped alternately by SIGTERM and SIGKILL."""
+    """SIGTERM and SIGKILL alternate at random times."""
     common = [
         "experiment=demo_traffic",
         "model=n2",
@@ -122,49 +111,47 @@ def test_signals_at_random_moments_change_no_bit(
         "trainer.save_every=0.1",
         f"data.source={raw}",
     ]
-    straight, broken = tmp_path / "straight", tmp_path / "broken"
-    done = background(*common, f"hydra.run.dir={straight}")
+    uninterrupted, resumed = tmp_path / "uninterrupted", tmp_path / "resumed"
+    done = background(*common, f"hydra.run.dir={uninterrupted}")
     _, errors = done.communicate(timeout=300)
     assert done.returncode == 0, errors
-    draw, arguments = random.Random(0), [*common, f"hydra.run.dir={broken}"]
-    last = broken / "checkpoints" / "last.pt"
+    rng, arguments = random.Random(0), [*common, f"hydra.run.dir={resumed}"]
+    last = resumed / "checkpoints" / "last.pt"
     for stop in range(stops):
         process = background(*arguments)
-        # wait for the first checkpoint of this start, then a random moment longer
+        # wait for this process's first checkpoint and then for a random time
         before = last.stat().st_mtime_ns if last.exists() else 0
         while process.poll() is None and (not last.exists() or last.stat().st_mtime_ns == before):
             time.sleep(0.005)
-        time.sleep(draw.uniform(0, 0.15))
+        time.sleep(rng.uniform(0, 0.15))
         kill = stop % 2 == 1
         process.send_signal(signal.SIGKILL if kill else signal.SIGTERM)
         _, errors = process.communicate(timeout=60)
         assert process.returncode == (-signal.SIGKILL if kill else 128 + signal.SIGTERM), errors
-        arguments = [f"resume={last}", f"data.source={raw}", f"hydra.run.dir={broken}"]
+        arguments = [f"resume={last}", f"data.source={raw}", f"hydra.run.dir={resumed}"]
         if not kill:
-            assert f"resume={last} hydra.run.dir={broken}" in errors
+            assert f"resume={last} hydra.run.dir={resumed}" in errors
     done = background(*arguments)
     _, errors = done.communicate(timeout=300)
     assert done.returncode == 0, errors
     for name in ("last.pt", "best.pt"):
-        a = load_checkpoint(straight / "checkpoints" / name)
-        b = load_checkpoint(broken / "checkpoints" / name)
+        a = load_checkpoint(uninterrupted / "checkpoints" / name)
+        b = load_checkpoint(resumed / "checkpoints" / name)
         assert a.model.keys() == b.model.keys()
         assert all(torch.equal(a.model[key], b.model[key]) for key in a.model)
         assert a.history == b.history
 
 
-def test_resume_refuses_another_problem(script: Script, traffic: Path, tmp_path: Path) -> None:
+def test_resume_refuses_changed_options(script: Script, traffic: Path, tmp_path: Path) -> None:
     last = traffic / "checkpoints" / "last.pt"
     for change in ("model=n4", "seed=5"):
-        done = script("train", f"resume={last}", change, f"hydra.run.dir={tmp_path}", status=2)
+        done = script("train", f"resume={last}", change, folder=tmp_path, status=2)
         assert "cannot change when a run is resumed" in done.stderr
     assert os.path.exists(last)
 
 
 @pytest.mark.thorough
-def test_resuming_and_evaluating_can_be_swept(
-    script: Script, traffic: Path, tmp_path: Path
-) -> None:
+def test_resume_and_evaluate_accept_sweeps(script: Script, traffic: Path, tmp_path: Path) -> None:
     best, last = (traffic / "checkpoints" / name for name in ("best.pt", "last.pt"))
     for name, overrides in (
         ("train", [f"resume={last}", "trainer.max_epochs=7,8"]),
@@ -175,21 +162,21 @@ def test_resuming_and_evaluating_can_be_swept(
 
 
 @pytest.mark.thorough
-def test_evaluation_tells_what_was_trained_on(
+def test_evaluation_counts_training_sequences(
     script: Script, traffic: Path, tmp_path: Path
 ) -> None:
     best = traffic / "checkpoints" / "best.pt"
-    split = load_checkpoint(best).split
-    for part, trained in (("heldout", 0), ("train", len(split["train"])), ("all", None)):
+    training = len(load_checkpoint(best).split["train"])
+    for part, trained_on in (("heldout", 0), ("train", training), ("all", training)):
         run = tmp_path / part
-        script("evaluate", f"checkpoint={best}", f"part={part}", f"hydra.run.dir={run}")
-        metrics = json.loads((run / "metrics.json").read_text())
-        assert metrics["trained_on"] == (len(split["train"]) if trained is None else trained)
+        script("evaluate", f"checkpoint={best}", f"part={part}", folder=run)
+        metrics = read_json(run / "metrics.json")
+        assert metrics["trained_on"] == trained_on
         assert metrics["sequences"] >= metrics["trained_on"]
 
 
-#: An effect of the user's own, whose code nobody reads.
-OWN = """
+#: A user's effect that cannot be compiled.
+USER_EFFECT = """
 import torch
 from nnode.model.effects import CATALOGUE, Effect, Strength
 from nnode.model.term import Interval
@@ -208,8 +195,8 @@ class Draught(Effect):
 
 
 @pytest.mark.thorough
-def test_a_run_without_compiled_code_says_so(script: Script, raw: Path, tmp_path: Path) -> None:
-    (tmp_path / "draught.py").write_text(OWN)
+def test_uncompiled_run_is_reported(script: Script, raw: Path, tmp_path: Path) -> None:
+    (tmp_path / "draught.py").write_text(USER_EFFECT)
     done = script(
         "train",
         "data=demo_crowd",
@@ -218,9 +205,9 @@ def test_a_run_without_compiled_code_says_so(script: Script, raw: Path, tmp_path
         "model.effects=[draught]",
         "trainer.max_epochs=0",
         f"data.source={raw}",
-        f"hydra.run.dir={tmp_path}",
+        folder=tmp_path,
         NNODE_EFFECTS=str(tmp_path / "draught.py"),
     )
-    solver = json.loads((tmp_path / "result.json").read_text())["solver"]
+    solver = read_json(tmp_path / "result.json")["solver"]
     assert solver == {"name": "fused", "uncompiled": "it does not cover draught"}
     assert (done.stdout + done.stderr).count("in PyTorch and not in compiled code") == 1

@@ -1,4 +1,4 @@
-"""The Calibrator among scikit-learn's tools, and scikit-learn's own checks of estimators."""
+"""The Calibrator with scikit-learn's tools, and scikit-learn's checks of estimators."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tests.app.following import table
 
 pytest.importorskip("sklearn")
 from sklearn.base import clone
-from sklearn.exceptions import NotFittedError as TheirNotFittedError
+from sklearn.exceptions import NotFittedError as SklearnNotFittedError
 from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
 from sklearn.utils import InputTags, Tags, TargetTags
 from sklearn.utils.estimator_checks import check_estimator
 from sklearn.utils.validation import check_is_fitted
 
-#: Asked of numbers in a matrix, of which trajectories cannot be made.
+#: The check fits a numeric matrix.
 MATRIX = "fits a matrix of numbers, and a Calibrator takes trajectories"
-#: The same property of trajectories is tested in test_estimator.py.
+#: The same property is tested with trajectories.
 OURS = f"{MATRIX}; tested with trajectories in test_estimator.py"
 
-#: Checks that do not apply, and why. All others must pass.
+#: Checks that do not apply, with reasons. All others must pass.
 NOT_APPLICABLE = {
     "check_fit_score_takes_y": OURS,
     "check_estimators_overwrite_params": OURS,
@@ -63,8 +63,8 @@ def sequences() -> nnode.Sequences:
     return nnode.sequences(table(platoons=6, seconds=8.0))
 
 
-class _OfMatrices(nnode.Calibrator):
-    """Says that it takes matrices, as otherwise nearly no check is run."""
+class _MatrixCalibrator(nnode.Calibrator):
+    """Declares matrix input; otherwise scikit-learn skips nearly all checks."""
 
     def __sklearn_tags__(self) -> Any:
         return Tags(
@@ -73,8 +73,8 @@ class _OfMatrices(nnode.Calibrator):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_scikit_learn_s_checks_pass_where_they_apply() -> None:
-    result = check_estimator(_OfMatrices(), on_fail=None, on_skip=None)
+def test_applicable_scikit_learn_checks_pass() -> None:
+    result = check_estimator(_MatrixCalibrator(), on_fail=None, on_skip=None)
     failed = {row["check_name"] for row in result if row["status"] == "failed"}
     passed = {row["check_name"] for row in result if row["status"] == "passed"}
     assert failed == set(NOT_APPLICABLE), [r["exception"] for r in result if r["exception"]]
@@ -90,47 +90,47 @@ def test_scikit_learn_s_checks_pass_where_they_apply() -> None:
     } <= passed
 
 
-def test_a_clone_has_the_parameters_and_no_fit(sequences: nnode.Sequences) -> None:
+def test_clone_is_unfitted(sequences: nnode.Sequences) -> None:
     fitted = nnode.Calibrator("lin", effects=({"name": "inertia"},), epochs=1).fit(sequences)
     copied = clone(fitted)
     assert copied.get_params() == fitted.get_params()
     check_is_fitted(fitted)
-    for kind in (NotFittedError, TheirNotFittedError):
+    for kind in (NotFittedError, SklearnNotFittedError):
         with pytest.raises(kind):
             copied.predict(sequences)
-    with pytest.raises(TheirNotFittedError):
+    with pytest.raises(SklearnNotFittedError):
         check_is_fitted(copied)
 
 
-def test_a_module_is_cloned_with_its_values() -> None:
-    own = nnode.Calibrator(Traffic([make_law("lin", v0=21.0, L=4.0)], leader="measured"))
-    copied = clone(own)
-    assert copied.model is not own.model
+def test_clone_copies_a_model_s_values() -> None:
+    calibrator = nnode.Calibrator(Traffic([make_law("lin", v0=21.0, L=4.0)], leader="measured"))
+    copied = clone(calibrator)
+    assert copied.model is not calibrator.model
     assert float(copied.model.physical()["lin.v0"][0]) == pytest.approx(21.0)
 
 
-def test_cross_validation_by_clusters_is_the_same_by_hand(sequences: nnode.Sequences) -> None:
-    one = nnode.Calibrator("idm", epochs=3, drivers="none")
+def test_cross_validation_by_clusters(sequences: nnode.Sequences) -> None:
+    calibrator = nnode.Calibrator("idm", epochs=3, drivers="none")
     folds = GroupKFold(2)
-    scores = cross_val_score(one, sequences, groups=sequences.groups, cv=folds)
+    scores = cross_val_score(calibrator, sequences, groups=sequences.groups, cv=folds)
     assert (scores < 0).all()
-    by_hand = []
+    expected = []
     for train, test in folds.split(sequences, groups=sequences.groups):
         assert not set(sequences.groups[train]) & set(sequences.groups[test])
-        by_hand.append(clone(one).fit(sequences[train]).score(sequences[test]))
-    assert scores == pytest.approx(np.array(by_hand), rel=1e-12)
+        expected.append(clone(calibrator).fit(sequences[train]).score(sequences[test]))
+    assert scores == pytest.approx(np.array(expected), rel=1e-12)
 
 
-def test_sequences_that_share_a_vehicle_are_one_group() -> None:
-    shared = table(platoons=4, seconds=3.0)
-    shared.loc[(shared.sequence == 1) & (shared.agent == 10), "agent"] = 0
-    kept = nnode.sequences(shared, agents="global")
-    assert len(kept) == 4
-    assert kept.groups[0] == kept.groups[1]
-    assert len(set(kept.groups)) == 3
+def test_sequences_with_a_common_vehicle_are_one_group() -> None:
+    data = table(platoons=4, seconds=3.0)
+    data.loc[(data.sequence == 1) & (data.agent == 10), "agent"] = 0
+    sequences = nnode.sequences(data, agents="global")
+    assert len(sequences) == 4
+    assert sequences.groups[0] == sequences.groups[1]
+    assert len(set(sequences.groups)) == 3
 
 
-def test_a_search_over_models_finds_the_law_that_was_driven(sequences: nnode.Sequences) -> None:
+def test_grid_search_selects_the_true_law(sequences: nnode.Sequences) -> None:
     search = GridSearchCV(
         nnode.Calibrator(leader="measured", epochs=15, drivers="none"),
         {"model": ["lin", "idm"]},

@@ -1,4 +1,4 @@
-"""The study script: options, one folder per study, interruption, continuation."""
+"""``nnode study``: options, folders, interruption, continuation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from studies.options import CrowdStudyOptions, TrafficStudyOptions
 from tests.app.conftest import composed
 from tests.app.forked import Forks
 
-#: The script with another study in the place of the traffic's.
+#: The command with a small study in place of the traffic study.
 CODE = """
 import sys
 from studies import command as study
@@ -30,14 +30,14 @@ if __name__ == "__main__":
 @pytest.mark.parametrize(
     ("name", "kind"), [("traffic", TrafficStudyOptions), ("crowd", CrowdStudyOptions)]
 )
-def test_every_study_composes_in_a_folder_without_time(name: str, kind: type) -> None:
+def test_study_composes_with_its_folder(name: str, kind: type) -> None:
     config = composed("study", f"study={name}", "study.quick=true", "study.workers=3")
     assert config.hydra.run.dir == f"runs/study/{name}"
     assert isinstance(OmegaConf.to_object(config.study), kind)
     assert name in study.STUDIES
 
 
-def test_what_no_study_can_work_with_is_refused(tmp_path: Path) -> None:
+def test_invalid_options_are_refused(tmp_path: Path) -> None:
     for change, message in (
         ({"workers": 0}, "study.workers=0 must be at least 1"),
         ({"name": "rail"}, "study.name=rail is unknown, expected one of traffic, crowd"),
@@ -47,11 +47,11 @@ def test_what_no_study_can_work_with_is_refused(tmp_path: Path) -> None:
             study.study(OmegaConf.create({"study": options}), tmp_path)
 
 
-def test_interrupted_and_asked_for_again(forks: Forks, tmp_path: Path) -> None:
+def test_interrupted_study_continues(forks: Forks, tmp_path: Path) -> None:
     command = ["study=traffic", "study.workers=1", f"hydra.run.dir={tmp_path}"]
     process = forks.start(CODE, *command)
-    sign = tmp_path / "sign-a"
-    while process.poll() is None and not sign.exists():
+    started = tmp_path / "sign-a"
+    while process.poll() is None and not started.exists():
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
@@ -60,11 +60,11 @@ def test_interrupted_and_asked_for_again(forks: Forks, tmp_path: Path) -> None:
     assert "Traceback" not in errors
     (tmp_path / "awake").write_text("")
     process = forks.start(CODE, *command)
-    shown, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     assert (tmp_path / "calls").read_text().split() == ["1", "2"]
     for line in (f"page: {tmp_path / 'study.html'}", f"as Markdown: {tmp_path / 'study.md'}"):
-        assert line in shown.splitlines()
+        assert line in output.splitlines()
     assert list(pd.read_csv(tmp_path / "squares.csv")["y"]) == [1.0, 4.0]
     page = (tmp_path / "study.md").read_text()
     assert page.startswith("# Squares\n\nOf *two* numbers.\n")
@@ -72,7 +72,7 @@ def test_interrupted_and_asked_for_again(forks: Forks, tmp_path: Path) -> None:
     assert "torch" in page
 
 
-def test_quick_results_have_a_folder_of_their_own(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_quick_results_have_a_separate_folder(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setitem(study.STUDIES, "traffic", "tests.studies.tiny")
     (tmp_path / "quick").mkdir()
     (tmp_path / "quick" / "awake").write_text("")

@@ -8,18 +8,20 @@ from threadpoolctl import threadpool_info
 from nnode.app.training import set_threads, threads_given_back
 
 
-def of_linear_algebra() -> set[int]:
-    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+def thread_counts() -> tuple[int, set[int]]:
+    """Numbers of threads of torch and of BLAS."""
+    pools = threadpool_info()
+    blas = {pool["num_threads"] for pool in pools if pool["user_api"] == "blas"}
+    return torch.get_num_threads(), blas
 
 
-def test_traffic_takes_one_thread_and_gives_the_others_back() -> None:
+def test_traffic_uses_one_thread_temporarily() -> None:
     with threads_given_back():
         set_threads(2, "crowd")
-        before = torch.get_num_threads(), of_linear_algebra()
-        assert before == (2, {2})
+        assert thread_counts() == (2, {2})
         with threads_given_back():
             set_threads(None, "crowd")
-            assert (torch.get_num_threads(), of_linear_algebra()) == before
+            assert thread_counts() == (2, {2})
             set_threads(None, "traffic")
-            assert (torch.get_num_threads(), of_linear_algebra()) == (1, {1})
-        assert (torch.get_num_threads(), of_linear_algebra()) == before
+            assert thread_counts() == (1, {1})
+        assert thread_counts() == (2, {2})

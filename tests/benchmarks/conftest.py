@@ -1,3 +1,3 @@
-"""Fixtures that benchmarks share with the scripts' tests."""
+"""Fixtures shared with the tests of scripts."""
 
 from tests.app.conftest import forks, script  # noqa: F401

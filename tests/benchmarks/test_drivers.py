@@ -1,4 +1,4 @@
-"""Cases with drivers who differ, with a quick substitute for the diagnosis."""
+"""The benchmark of heterogeneous drivers, with a substitute for the diagnosis."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from nnode.model.build import build_model
 
 def run(monkeypatch: pytest.MonkeyPatch, path: Path, *options: str) -> pd.DataFrame:
     """The table of a run with these options."""
-    given = ["drivers", "--seed", "5", "--processes", "1", "--table", str(path), *options]
-    monkeypatch.setattr(sys, "argv", given)
+    argv = ["drivers", "--seed", "5", "--processes", "1", "--table", str(path), *options]
+    monkeypatch.setattr(sys, "argv", argv)
     drivers.main()
     return pd.read_csv(path)
 
@@ -31,7 +31,7 @@ def test_rows_are_scored_and_kept(
 ) -> None:
     calls = []
 
-    def zone(table: pd.DataFrame, *given: Any, **options: Any) -> SimpleNamespace:
+    def zone(table: pd.DataFrame, *arguments: Any, **options: Any) -> SimpleNamespace:
         calls.append(table)
         alpha = {"alpha": {"value": 0.88, "low": 0.85, "high": 0.91}}
         effect = {"name": "speed_zone", "alternatives": [], "coefficients": alpha}
@@ -58,9 +58,9 @@ def test_rows_are_scored_and_kept(
 
 
 @pytest.mark.thorough
-def test_laws_are_compared_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_comparison_of_laws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     laws = {name: build_model(model_options(name, "measured")) for name in ("lin", "log")}
-    monkeypatch.setattr(drivers, "candidates", lambda *given: laws)
+    monkeypatch.setattr(drivers, "compared_laws", lambda *arguments: laws)
     size = ["--laws", "lin", "--cases", "1", "--platoons", "8", "--vehicles", "4"]
     (row,) = run(monkeypatch, tmp_path / "table.csv", "--compare", *size).to_dict("records")
     assert row["true law first"]

@@ -1,4 +1,4 @@
-// What is looked for in a page, as functions that return a list of faults.
+// Checks of a page, as functions that return a list of faults.
 ({
   visible(e) {
     return e.checkVisibility({ visibilityProperty: true }) && e.getClientRects().length > 0;
@@ -16,7 +16,7 @@
     const [r, g, b] = rgb.map((c) => (c / 255 <= 0.04045 ? c / 3294.6 : ((c / 255 + 0.055) / 1.055) ** 2.4));
     return 0.2126 * r + 0.7152 * g + 0.0722 * b;
   },
-  ground(e) {
+  background(e) {
     for (; e; e = e.parentElement) {
       const [r, g, b, a = 1] = this.channels(getComputedStyle(e).backgroundColor);
       if (a === 1) return [r, g, b];
@@ -26,34 +26,34 @@
   },
   contrast(e) {
     const ink = this.luminance(this.channels(getComputedStyle(e).color).slice(0, 3));
-    const ground = this.luminance(this.ground(e));
-    return (Math.max(ink, ground) + 0.05) / (Math.min(ink, ground) + 0.05);
+    const background = this.luminance(this.background(e));
+    return (Math.max(ink, background) + 0.05) / (Math.min(ink, background) + 0.05);
   },
 
   texts() {
-    const found = new Set();
+    const elements = new Set();
     const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
     while (walker.nextNode()) {
       const e = walker.currentNode.parentElement;
-      if (walker.currentNode.data.trim() && this.visible(e) && !["STYLE", "SCRIPT", "NOSCRIPT", "OPTION"].includes(e.tagName)) found.add(e);
+      if (walker.currentNode.data.trim() && this.visible(e) && !["STYLE", "SCRIPT", "NOSCRIPT", "OPTION"].includes(e.tagName)) elements.add(e);
     }
-    return [...found];
+    return [...elements];
   },
-  pale(least) {
-    return this.texts().filter((e) => this.contrast(e) < least)
+  lowContrast(minimum) {
+    return this.texts().filter((e) => this.contrast(e) < minimum)
       .map((e) => `${this.name(e)}: contrast ${this.contrast(e).toFixed(2)}`);
   },
-  small(least) {
-    return this.texts().filter((e) => parseFloat(getComputedStyle(e).fontSize) < least)
+  smallText(minimum) {
+    return this.texts().filter((e) => parseFloat(getComputedStyle(e).fontSize) < minimum)
       .map((e) => `${this.name(e)}: ${getComputedStyle(e).fontSize}`);
   },
 
-  wide(room) {
+  overflow(width) {
     const inBox = (e) => e.closest(".scroll, pre, .skip");
     return [...document.querySelectorAll("body *")]
-      .filter((e) => this.visible(e) && !inBox(e) && e.getBoundingClientRect().right > room + 1)
-      .map((e) => `${this.name(e)} ends at ${Math.round(e.getBoundingClientRect().right)} of ${room} px`)
-      .concat(document.documentElement.scrollWidth > room ? [`the page is ${document.documentElement.scrollWidth} px wide`] : []);
+      .filter((e) => this.visible(e) && !inBox(e) && e.getBoundingClientRect().right > width + 1)
+      .map((e) => `${this.name(e)} ends at ${Math.round(e.getBoundingClientRect().right)} of ${width} px`)
+      .concat(document.documentElement.scrollWidth > width ? [`the page is ${document.documentElement.scrollWidth} px wide`] : []);
   },
 
   headings() {
@@ -64,7 +64,7 @@
     });
     return faults;
   },
-  silent() {
+  unlabelled() {
     const faults = [...document.images].filter((e) => e.alt.trim().length < 15).map((e) => `alt of ${this.name(e)}`);
     for (const table of document.querySelectorAll("table")) {
       if (![...table.querySelectorAll("thead th")].length) faults.push("a table without a head");
@@ -82,17 +82,17 @@
   interactive() {
     return [...document.querySelectorAll('a[href], button, summary, input, select, [tabindex="0"]')].filter((e) => this.visible(e));
   },
-  // what has the focus: its place among the interactive elements, and whether that is seen
+  // the focused element: its index among interactive elements, and whether the focus is visible
   focus() {
     const e = document.activeElement;
     const style = getComputedStyle(e);
     const ring = style.outlineStyle !== "none" && parseFloat(style.outlineWidth) > 0;
     const box = e.getBoundingClientRect();
     const inside = box.bottom > 0 && box.top < innerHeight && box.right > 0 && box.left < innerWidth;
-    return { place: this.interactive().indexOf(e), name: this.name(e), seen: ring && inside };
+    return { index: this.interactive().indexOf(e), name: this.name(e), visible: ring && inside };
   },
-  // plain links may lead elsewhere; nothing else may
-  elsewhere() {
+  // parts of the page that are not in its file; links are allowed
+  external() {
     const loaded = [...document.querySelectorAll("[src], link[href], object, iframe")];
     return loaded.filter((e) => !(e.src || "").startsWith("data:")).map((e) => e.outerHTML.slice(0, 100));
   },

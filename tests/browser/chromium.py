@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import shutil
 from importlib.util import find_spec
-from types import TracebackType
 from typing import Any, Self
 
-#: The browser, by the names that distributions give it.
+#: The browser's executable.
 PROGRAM = next(
-    (
-        found
-        for name in ("chromium", "chromium-browser", "google-chrome", "chrome")
-        if (found := shutil.which(name))
-    ),
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))),
     None,
 )
-#: Why there is no browser here; empty where there is one.
+#: The reason why no browser is available, or an empty string.
 MISSING = (
     "needs a Chromium: apt-get install chromium"
     if PROGRAM is None
@@ -29,18 +24,18 @@ _OPTIONS = [
     "--no-sandbox",
     "--disable-gpu",
     "--disable-dev-shm-usage",
-    # this machine alone: every other name is unknown
+    # no host except this machine is resolved
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
 ]
 
 
 class Browser:
-    """One page in a browser of its own; use as a context manager.
+    """A browser with one page; use it as a context manager.
 
     Attributes:
-        page: Playwright's.
+        page: Playwright's page.
         complaints: errors and warnings of the console, uncaught exceptions, failed requests.
-        requests: addresses that were asked for, those inside the page left out.
+        requests: addresses of requests, except data URLs.
     """
 
     page: Any
@@ -57,28 +52,24 @@ class Browser:
         self._new_page()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._chromium.close()
         self._playwright.stop()
 
     def _new_page(self, **options: Any) -> None:
         self.page = self._chromium.new_page(**options)
-        self.page.on("console", self._hear)
+        self.page.on("console", self._log_message)
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.on("request", self._note)
+        self.page.on("request", self._log_request)
 
     def open(
         self, address: str, width: int = 1200, height: int = 900, *, motion: bool = True
     ) -> None:
-        """Load a page in a new window of a size, px; what was seen before is forgotten.
+        """Load a page in a new window and clear the logs.
 
         Args:
-            motion: False: the reader asked for less of it.
+            width, height: of the window, px.
+            motion: False if the user prefers reduced motion.
         """
         self.page.close()
         self.complaints.clear()
@@ -91,17 +82,17 @@ class Browser:
         self.page.goto(address)
 
     def evaluate(self, expression: str) -> Any:
-        """The value of a JavaScript expression; a promise is waited for."""
+        """The value of a JavaScript expression, after a promise is resolved."""
         return self.page.evaluate(expression)
 
     def press(self, key: str) -> None:
         """Press and release a key."""
         self.page.keyboard.press(key)
 
-    def _hear(self, message: Any) -> None:
+    def _log_message(self, message: Any) -> None:
         if message.type in ("error", "warning", "assert"):
             self.complaints.append(message.text)
 
-    def _note(self, request: Any) -> None:
+    def _log_request(self, request: Any) -> None:
         if not request.url.startswith("data:"):
             self.requests.append(request.url)

@@ -1,4 +1,4 @@
-"""Reports in a real browser: offline, by keyboard, on a phone, and for eyes that see less."""
+"""Reports in a browser: offline, by keyboard, on a phone, and with sufficient contrast."""
 
 from __future__ import annotations
 
@@ -26,21 +26,20 @@ WIDTHS = {"desk": 1200, "phone": 360}
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with Browser() as found:
-        yield found
+    with Browser() as browser:
+        yield browser
 
 
 @pytest.fixture(scope="module")
 def pages(traffic: Case, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:  # noqa: F811
-    """Pages by name: a diagnosis of made-up data, and the studies that are published."""
+    """Pages by name: a diagnosis and a check of simulated data, and the published studies."""
     folder = tmp_path_factory.mktemp("report")
-    inputs, found = with_faults(traffic), deepcopy(traffic.found)
-    found.diagnosis.data_faults = inputs.data_faults
-    draw(inputs, found, traffic.options, CONFIG, ["nnode evaluate X"], folder)()
+    inputs, outcome = with_faults(traffic), deepcopy(traffic.found)
+    outcome.diagnosis.data_faults = inputs.data_faults
+    draw(inputs, outcome, traffic.options, CONFIG, ["nnode evaluate X"], folder)()
     check_file(saved(cars(), folder)).write(folder)
     studies = {name: STUDIES / name / "study.html" for name in ("traffic", "crowd")}
-    own = {name: folder / f"{name}.html" for name in ("report", "check")}
-    return {**own, **studies}
+    return {"report": folder / "report.html", "check": folder / "check.html", **studies}
 
 
 def opened(browser: Browser, page: Path, width: int) -> None:
@@ -56,33 +55,35 @@ PAGES = list(itertools.product(("report", "check", "traffic", "crowd"), WIDTHS))
 
 
 @pytest.mark.parametrize(("name", "width"), PAGES)
-def test_a_page_is_sound(browser: Browser, pages: dict[str, Path], name: str, width: str) -> None:
+def test_page_is_accessible_and_self_contained(
+    browser: Browser, pages: dict[str, Path], name: str, width: str
+) -> None:
     opened(browser, pages[name], WIDTHS[width])
     assert browser.complaints == []
     assert browser.requests == [pages[name].as_uri()]
     for check in (
-        "elsewhere()",  # parts of the page that are not in its file
+        "external()",
         "headings()",
-        "silent()",  # pictures, tables and links without words
-        "pale(4.5)",  # contrast of WCAG 2.2, level AA
-        "small(12)",  # px
-        f"wide({WIDTHS[width]})",
+        "unlabelled()",
+        "lowContrast(4.5)",  # WCAG 2.2, level AA
+        "smallText(12)",  # px
+        f"overflow({WIDTHS[width]})",
     ):
         assert faults(browser, check) == [], check
 
 
 @pytest.mark.parametrize(("name", "width"), PAGES)
-def test_all_that_can_be_used_is_reached_by_tab(
+def test_tab_reaches_all_controls(
     browser: Browser, pages: dict[str, Path], name: str, width: str
 ) -> None:
     opened(browser, pages[name], WIDTHS[width])
     number = browser.evaluate("checks.interactive().length")
     assert number > 5
-    for place in range(number):
+    for index in range(number):
         browser.press("Tab")
         focus = browser.evaluate("checks.focus()")
-        assert focus["place"] == place, focus["name"]
-        assert focus["seen"], f"{focus['name']} shows no focus"
+        assert focus["index"] == index, focus["name"]
+        assert focus["visible"], f"{focus['name']} shows no focus"
 
 
 def test_keys_skip_the_contents_and_scroll_tables(browser: Browser, pages: dict[str, Path]) -> None:
@@ -92,14 +93,14 @@ def test_keys_skip_the_contents_and_scroll_tables(browser: Browser, pages: dict[
     browser.press("Enter")
     browser.press("Tab")
     assert browser.evaluate("!!document.activeElement.closest('main')")
-    moves = (
+    scrollable = (
         "[...document.querySelectorAll('.scroll')].find((e) => e.scrollWidth > e.clientWidth + 40)"
     )
-    browser.evaluate(f"window.box = {moves}; box.focus(); 1")
+    browser.evaluate(f"window.box = {scrollable}; box.focus(); 1")
     for _ in range(3):
         browser.press("ArrowRight")
-    slid = "new Promise((done) => setTimeout(() => done(box.scrollLeft), 400))"
-    assert browser.evaluate(slid) > 0
+    position = "new Promise((done) => setTimeout(() => done(box.scrollLeft), 400))"
+    assert browser.evaluate(position) > 0
 
 
 def test_links_and_print_open_folded_parts(browser: Browser, pages: dict[str, Path]) -> None:
@@ -110,7 +111,12 @@ def test_links_and_print_open_folded_parts(browser: Browser, pages: dict[str, Pa
     browser.evaluate(f"{link}.click(); 1")
     inside = "document.querySelector('#table-clusters').checkVisibility()"
     assert browser.evaluate(inside)
-    for check in ("silent()", "pale(4.5)", "small(12)", f"wide({WIDTHS['phone']})"):
+    for check in (
+        "unlabelled()",
+        "lowContrast(4.5)",
+        "smallText(12)",
+        f"overflow({WIDTHS['phone']})",
+    ):
         assert faults(browser, check) == [], check
     opened(browser, pages["report"], WIDTHS["desk"])
     browser.evaluate("dispatchEvent(new Event('beforeprint')); 1")
@@ -125,21 +131,20 @@ BAD = """<!DOCTYPE html><html><head><title>t</title></head><body>
 """
 
 
-def test_a_bad_page_is_found_out(browser: Browser, tmp_path: Path) -> None:
+def test_checks_detect_the_faults_of_a_page(browser: Browser, tmp_path: Path) -> None:
     page = tmp_path / "bad.html"
     page.write_text(BAD)
     opened(browser, page, WIDTHS["phone"])
-    assert any("oh" in text for text in browser.complaints)
-    assert any("nothing is not defined" in text for text in browser.complaints)
-    assert any("ERR_NAME_NOT_RESOLVED" in text for text in browser.complaints)
+    for complaint in ("oh", "nothing is not defined", "ERR_NAME_NOT_RESOLVED"):
+        assert any(complaint in text for text in browser.complaints)
     assert browser.requests == [page.as_uri(), "https://nowhere.example/x.png"]
-    assert len(faults(browser, "elsewhere()")) == 1
+    assert len(faults(browser, "external()")) == 1
     assert faults(browser, "headings()") == ["h3 follows h1"]
-    assert len(faults(browser, "silent()")) == 6  # alt, head, scope, name, main, language
-    assert faults(browser, "pale(4.5)") == ['p "pale": contrast 2.85']
-    assert faults(browser, "small(12)") == ['p "small": 8px']
-    assert 'div "wide" ends at 908 of 360 px' in faults(browser, "wide(360)")
+    assert len(faults(browser, "unlabelled()")) == 6  # alt, head, scope, name, main, language
+    assert faults(browser, "lowContrast(4.5)") == ['p "pale": contrast 2.85']
+    assert faults(browser, "smallText(12)") == ['p "small": 8px']
+    assert 'div "wide" ends at 908 of 360 px' in faults(browser, "overflow(360)")
     browser.press("Tab")
-    assert browser.evaluate("checks.focus().place") == 1  # out of order
+    assert browser.evaluate("checks.focus().index") == 1  # out of order
     browser.press("Tab")
-    assert not browser.evaluate("checks.focus().seen")
+    assert not browser.evaluate("checks.focus().visible")

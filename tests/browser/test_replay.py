@@ -1,4 +1,4 @@
-"""The player in a real browser: it plays, is scrubbed by keys, and shows what was asked for."""
+"""The player in a browser: playing, controls, and positions on the screen."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 
 SPEED, LATE, ZONE = 20.0, 3.0, (40.0, 60.0)
 ORANGE = (213, 94, 0)
+REPLAY = "document.querySelector('figure').replay"
 WALLS = np.array([[-6.0, 0.0, 6.0, 0.0], [6.0, 4.0, -6.0, 4.0]])
 
-# columns (px of the style sheet) of the pixels of a colour between two rows
+#: Columns (CSS px) of pixels of a colour between two rows.
 PIXELS = """([r, g, b], top, bottom) => {
-  const canvas = document.querySelector("canvas"), dense = canvas.width / canvas.clientWidth;
-  const pen = canvas.getContext("2d"), columns = new Set();
-  const high = Math.max(1, Math.round((bottom - top) * dense));
-  const { data, width } = pen.getImageData(0, Math.round(top * dense), canvas.width, high);
+  const canvas = document.querySelector("canvas"), scale = canvas.width / canvas.clientWidth;
+  const context = canvas.getContext("2d"), columns = new Set();
+  const height = Math.max(1, Math.round((bottom - top) * scale));
+  const { data, width } = context.getImageData(0, Math.round(top * scale), canvas.width, height);
   for (let i = 0; i < data.length; i += 4)
     if (data[i] === r && data[i + 1] === g && data[i + 2] === b)
-      columns.add((i / 4) % width / dense);
+      columns.add((i / 4) % width / scale);
   return [...columns].sort((a, b) => a - b);
 }"""
 
 
 def car(name: str, seconds: float) -> Scene:
-    """One car, which a model has LATE metres behind."""
+    """One car; its simulation is `LATE` metres behind."""
     s = lane(SPEED * 0.1 * np.arange(round(10 * seconds) + 1)[:, None], 0.1, start=50.0, name=name)
     return Scene(s, {"late": s.x - LATE})
 
@@ -50,8 +51,8 @@ def corridor() -> Scene:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with Browser() as found:
-        yield found
+    with Browser() as browser:
+        yield browser
 
 
 @pytest.fixture(scope="module")
@@ -71,64 +72,65 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def state(browser: Browser) -> dict[str, str]:
-    """What the canvas says it shows."""
+    """The state in the canvas' data attributes."""
     return dict(browser.evaluate("({...document.querySelector('canvas').dataset})"))
 
 
 def columns(browser: Browser, colour: tuple[int, ...], top: float, bottom: float) -> np.ndarray:
-    found = browser.evaluate(f"({PIXELS})({list(colour)}, {top}, {bottom})")
-    return np.array(found)
+    return np.array(browser.evaluate(f"({PIXELS})({list(colour)}, {top}, {bottom})"))
 
 
-def seen(browser: Browser) -> tuple[float, float]:
-    """Fronts of the simulated and of the measured car, m, read from the pixels."""
-    wide = browser.evaluate("document.querySelector('canvas').clientWidth")
-    view = browser.evaluate("document.querySelector('figure').replay.scene.view.half")
-    middle = browser.evaluate("document.querySelector('figure').replay.seen")
-
-    def place(px: float) -> float:
-        return middle - view + px / wide * 2 * view
-
-    # the second strip begins at 78 px; the middle of its cars lies 21 px below
-    model = columns(browser, ORANGE, 98, 100)
-    real = columns(browser, (102, 102, 102), 38, 40)
-    return place(model[-1] + 1), place(real[-1] + 1)
+def replay(browser: Browser, expression: str) -> Any:
+    """A member of the player, or the result of a method."""
+    return browser.evaluate(f"{REPLAY}.{expression}")
 
 
-def test_the_pixels_are_where_the_cars_are(browser: Browser, pages: dict[str, str]) -> None:
+def metres(browser: Browser, px: np.ndarray) -> np.ndarray:
+    """Positions (m) of columns."""
+    width = browser.evaluate("document.querySelector('canvas').clientWidth")
+    half = replay(browser, "scene.view.half")
+    return replay(browser, "seen") - half + px / width * 2 * half
+
+
+def fronts(browser: Browser) -> np.ndarray:
+    """Fronts of the simulated and of the measured car (m), read from the pixels."""
+    # the second strip begins at 78 px; the centre of its cars lies 21 px below
+    simulated = columns(browser, ORANGE, 98, 100)
+    measured = columns(browser, (102, 102, 102), 38, 40)
+    return metres(browser, np.array([simulated[-1] + 1, measured[-1] + 1]))
+
+
+def test_cars_are_drawn_at_their_positions(browser: Browser, pages: dict[str, str]) -> None:
     browser.open(pages["lane"], 800)
     for time in (0.0, 1.25, 4.0):
-        browser.evaluate(f"document.querySelector('figure').replay.show({time})")
+        replay(browser, f"show({time})")
         assert float(state(browser)["time"]) == time
-        simulated, measured = seen(browser)
-        pixel = (
-            2 * browser.evaluate("document.querySelector('figure').replay.scene.view.half") / 768
-        )
+        simulated, measured = fronts(browser)
+        pixel = 2 * replay(browser, "scene.view.half") / 768
         assert measured == pytest.approx(SPEED * time, abs=1.5 * pixel)
         assert simulated == pytest.approx(SPEED * time - LATE, abs=1.5 * pixel)
     assert "late: distance 3.00 m" in browser.evaluate(
-        "(() => { const r = document.querySelector('figure').replay, said = [];"
-        " const old = r.pen.fillText.bind(r.pen);"
-        " r.pen.fillText = (text, ...at) => { said.push(text); old(text, ...at); };"
-        " r.show(2); return said.join('; '); })()"
+        f"(() => {{ const r = {REPLAY}, texts = [], original = r.pen.fillText.bind(r.pen);"
+        " r.pen.fillText = (text, ...at) => { texts.push(text); original(text, ...at); };"
+        " r.show(2); return texts.join('; '); })()"
     )
 
 
-def test_the_named_place_is_shaded_where_it_is(browser: Browser, pages: dict[str, str]) -> None:
+def test_zone_is_shaded_at_its_position(browser: Browser, pages: dict[str, str]) -> None:
     browser.open(pages["lane"], 800)
     shade = (243, 198, 107)
-    browser.evaluate("document.querySelector('figure').replay.show(0)")
+    replay(browser, "show(0)")
     assert not len(columns(browser, shade, 20, 25))
-    browser.evaluate("document.querySelector('figure').replay.show(2.5)")  # the car is at 50 m
-    found = columns(browser, shade, 70 + 9, 70 + 12)
-    wide = browser.evaluate("document.querySelector('canvas').clientWidth")
-    half = browser.evaluate("document.querySelector('figure').replay.scene.view.half")
-    ends = 50 - half + np.array([found[0], found[-1] + 1]) / wide * 2 * half
+    replay(browser, "show(2.5)")  # the car is at 50 m
+    shaded = columns(browser, shade, 70 + 9, 70 + 12)
+    width = browser.evaluate("document.querySelector('canvas').clientWidth")
+    half = replay(browser, "scene.view.half")
+    ends = 50 - half + np.array([shaded[0], shaded[-1] + 1]) / width * 2 * half
     expected = np.clip(ZONE, 50 - half, 50 + half)
-    assert ends == pytest.approx(expected, abs=3 * half / wide)
+    assert ends == pytest.approx(expected, abs=3 * half / width)
 
 
-def test_it_plays_in_its_own_time_and_stops_at_the_end(
+def test_player_runs_in_real_time_and_stops_at_the_end(
     browser: Browser, pages: dict[str, str]
 ) -> None:
     browser.open(pages["lane"], 800)
@@ -136,23 +138,23 @@ def test_it_plays_in_its_own_time_and_stops_at_the_end(
     browser.page.get_by_role("button", name="Play").click()
     begin = browser.evaluate("performance.now()")
     browser.page.wait_for_function("Number(document.querySelector('canvas').dataset.time) > 1")
-    passed = (browser.evaluate("performance.now()") - begin) / 1000
+    elapsed = (browser.evaluate("performance.now()") - begin) / 1000
     assert state(browser)["playing"] == "true"
-    assert float(state(browser)["time"]) == pytest.approx(passed, abs=0.5)
+    assert float(state(browser)["time"]) == pytest.approx(elapsed, abs=0.5)
     browser.page.get_by_role("button", name="Pause").click()
-    held = state(browser)
+    paused = state(browser)
     browser.page.wait_for_timeout(200)
-    assert state(browser) == held | {"playing": "false"}
+    assert state(browser) == paused | {"playing": "false"}
     browser.page.get_by_label("Speed").select_option("10")
     browser.page.get_by_role("button", name="Play").click()
     browser.page.wait_for_function("document.querySelector('button').textContent === 'Play'")
     assert float(state(browser)["time"]) == 4.0
-    browser.press(" ")  # the button has the focus: once more from the start
+    browser.press(" ")  # the focused button restarts the player
     browser.page.wait_for_function("Number(document.querySelector('canvas').dataset.time) < 4")
     assert browser.complaints == []
 
 
-def test_keys_scrub_change_the_speed_and_choose(browser: Browser, pages: dict[str, str]) -> None:
+def test_keys_control_time_speed_and_sequence(browser: Browser, pages: dict[str, str]) -> None:
     browser.open(pages["lane"], 380)
     browser.evaluate("document.querySelector('.stage').focus()")
     for keys, time in (
@@ -185,7 +187,7 @@ def test_keys_scrub_change_the_speed_and_choose(browser: Browser, pages: dict[st
     assert browser.evaluate("document.querySelector('button').textContent") == "Play"
 
 
-def test_the_slider_and_the_list_choose(browser: Browser, pages: dict[str, str]) -> None:
+def test_slider_and_list(browser: Browser, pages: dict[str, str]) -> None:
     browser.open(pages["lane"], 800)
     browser.page.get_by_label("Sequence").select_option(label="second")
     assert state(browser)["scene"] == "second"
@@ -194,18 +196,16 @@ def test_the_slider_and_the_list_choose(browser: Browser, pages: dict[str, str])
     assert browser.evaluate("document.querySelector('output').textContent") == "1.5 of 2.0 s"
 
 
-def test_who_asked_for_less_motion_sees_still_moments(
-    browser: Browser, pages: dict[str, str]
-) -> None:
+def test_reduced_motion_shows_still_images(browser: Browser, pages: dict[str, str]) -> None:
     browser.open(pages["lane"], 800, motion=False)
     browser.evaluate(
-        "window.times = new Set(); const r = document.querySelector('figure').replay,"
-        " old = r.show.bind(r); r.show = (t) => { old(t); times.add(r.time); }; r.play(true)"
+        f"window.times = new Set(); const r = {REPLAY}, original = r.show.bind(r);"
+        " r.show = (t) => { original(t); times.add(r.time); }; r.play(true)"
     )
     browser.page.wait_for_function("Number(document.querySelector('canvas').dataset.time) > 1.5")
     times = sorted(browser.evaluate("[...times]"))
     assert np.diff(times).min() > 0.45
-    browser.evaluate("document.querySelector('figure').replay.play(false)")
+    replay(browser, "play(false)")
     browser.evaluate("document.querySelector('.stage').focus()")
     browser.press("Home")
     browser.press("ArrowRight")
@@ -214,7 +214,7 @@ def test_who_asked_for_less_motion_sees_still_moments(
 
 @pytest.mark.parametrize("width", [380, 800, 1400])
 @pytest.mark.parametrize("name", ["lane", "corridor"])
-def test_it_fits_every_width(
+def test_player_fits_every_width(
     browser: Browser, pages: dict[str, str], name: str, width: int
 ) -> None:
     browser.open(pages[name], width)
@@ -224,11 +224,11 @@ def test_it_fits_every_width(
     assert box["x"] >= 0
     assert box["x"] + box["width"] <= width
     assert 120 < box["height"] < 900
-    inks = browser.evaluate(
-        "(() => { const c = document.querySelector('canvas'), seen = new Set(),"
+    colours = browser.evaluate(
+        "(() => { const c = document.querySelector('canvas'), colours = new Set(),"
         " d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
-        " for (let i = 0; i < d.length; i += 4) seen.add(`${d[i]},${d[i + 1]},${d[i + 2]}`);"
-        " return [...seen]; })()"
+        " for (let i = 0; i < d.length; i += 4) colours.add(`${d[i]},${d[i + 1]},${d[i + 2]}`);"
+        " return [...colours]; })()"
     )
-    assert {"102,102,102", "213,94,0"} <= set(inks)
-    assert ("0,114,178" in inks) == (name == "corridor")
+    assert {"102,102,102", "213,94,0"} <= set(colours)
+    assert ("0,114,178" in colours) == (name == "corridor")

@@ -1,4 +1,4 @@
-"""TensorBoard in a real browser, on the curves of a training."""
+"""TensorBoard in a browser with the curves of a training."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COSTS = [4.0, 2.0, 1.0]
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """TensorBoard on a run's folder."""
+    """The address of TensorBoard for a run's folder."""
     folder = tmp_path_factory.mktemp("run")
     book = Logbook(folder / "tensorboard", {"model": {"name": "lin"}})
     for step, cost in enumerate(COSTS):
@@ -30,17 +30,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     book.close()
     process = subprocess.Popen(
         [
-            sys.executable,
-            "-m",
-            "tensorboard.main",
-            "--logdir",
-            str(folder),
-            "--host",
-            "127.0.0.1",
-            "--port",
-            "0",
-            "--load_fast",
-            "false",
+            *(sys.executable, "-m", "tensorboard.main", "--logdir", str(folder)),
+            *("--host", "127.0.0.1", "--port", "0", "--load_fast", "false"),
         ],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -49,43 +40,42 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     )
     try:
         assert process.stdout is not None
-        found = next(m[0] for line in process.stdout if (m := re.search(r"http://\S+:\d+/", line)))
-        yield found
+        yield next(m[0] for line in process.stdout if (m := re.search(r"http://\S+:\d+/", line)))
     finally:
         process.kill()
         process.wait()
 
 
-def asked(address: str, path: str) -> object:
-    """What TensorBoard's interface answers, as soon as it has read the events."""
+def response(address: str, path: str) -> Any:
+    """TensorBoard's response after it has read the events."""
     end = time.monotonic() + 20
     while True:
         with urlopen(f"{address}{path}", timeout=10) as answer:
-            found: object = json.load(answer)
-        if found or time.monotonic() > end:
-            return found
+            content = json.load(answer)
+        if content or time.monotonic() > end:
+            return content
         time.sleep(0.2)
 
 
 def test_curves_are_served(address: str) -> None:
-    tags: Any = asked(address, "data/plugin/scalars/tags")
+    tags = response(address, "data/plugin/scalars/tags")
     assert {"cost/train", "parameters/v0"} <= set(tags["tensorboard"])
-    rows: Any = asked(address, "data/plugin/scalars/scalars?run=tensorboard&tag=cost/train")
+    rows = response(address, "data/plugin/scalars/scalars?run=tensorboard&tag=cost/train")
     assert [row[1:] for row in rows] == [[step, cost] for step, cost in enumerate(COSTS)]
 
 
-#: What TensorBoard itself, or the browser without a graphics card, complains of.
-KNOWN = r"Multiple instances of Three\.js|fallback to software WebGL"
+#: Warnings of TensorBoard and of a browser without a graphics card.
+IGNORED = r"Multiple instances of Three\.js|fallback to software WebGL"
 
 
 @pytest.mark.skipif(bool(MISSING), reason=MISSING)
-def test_the_page_shows_them_offline_without_errors(address: str) -> None:
-    asked(address, "data/plugin/scalars/tags")
+def test_page_shows_curves_offline_without_errors(address: str) -> None:
+    response(address, "data/plugin/scalars/tags")
     with Browser() as browser:
         browser.open(address)
         end = time.monotonic() + 20
         while "cost" not in browser.evaluate("document.body.innerText"):
             assert time.monotonic() < end, browser.evaluate("document.body.innerText")
             time.sleep(0.2)
-        assert [one for one in browser.requests if not one.startswith(address)] == []
-        assert [one for one in browser.complaints if not re.search(KNOWN, one)] == []
+        assert [url for url in browser.requests if not url.startswith(address)] == []
+        assert [text for text in browser.complaints if not re.search(IGNORED, text)] == []

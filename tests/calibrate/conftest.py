@@ -1,4 +1,4 @@
-"""A small calibration problem: a few platoons obeying a linear law."""
+"""A small calibration problem: platoons by a linear law."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NoisyAdadelta against a scalar loop, torch's ADADELTA, and the statistics of its noise."""
+"""NoisyAdadelta against a scalar loop and torch's ADADELTA, and the statistics of its noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def parameter(*values: float) -> nn.Parameter:
 
 
 def scalar_adadelta(u: float, gradients: list[float], rho: float, eps: float) -> list[float]:
-    """Section 4.2 for one weight, E[g²] with the present gradient, without noise."""
+    """Section 4.2 for one weight, with the current gradient in E[g²], without noise."""
     mean_g2 = mean_d2 = 0.0
     path = []
     for g in gradients:
@@ -41,36 +41,39 @@ def descend(optimizer: torch.optim.Optimizer, p: nn.Parameter, gradients: np.nda
     return torch.stack(path)
 
 
+def path_of(gradients: np.ndarray, *start: float, **options: Any) -> Tensor:
+    """The path without noise."""
+    p = parameter(*start)
+    return descend(NoisyAdadelta([p], eta1=0.0, **options), p, gradients)
+
+
 GRADIENTS = np.random.default_rng(0).normal(3.0, 20.0, (60, 3))
+START = [1.0, -2.0, 30.0]
 
 
 @pytest.mark.parametrize(("rho", "eps"), [(0.95, 1e-6), (0.5, 1e-2)])
-def test_noiseless_steps_are_the_scalar_loop(rho: float, eps: float) -> None:
-    p = parameter(1.0, -2.0, 30.0)
-    path = descend(NoisyAdadelta([p], rho=rho, eps=eps, eta1=0.0), p, GRADIENTS)
-    for i, start in enumerate([1.0, -2.0, 30.0]):
+def test_noiseless_steps_equal_a_scalar_loop(rho: float, eps: float) -> None:
+    path = path_of(GRADIENTS, *START, rho=rho, eps=eps)
+    for i, start in enumerate(START):
         expected = scalar_adadelta(start, list(GRADIENTS[:, i]), rho, eps)
         np.testing.assert_allclose(path[:, i], expected, rtol=1e-13)
 
 
 def test_lr_scales_the_step() -> None:
-    p, q = parameter(0.0), parameter(0.0)
-    one = descend(NoisyAdadelta([p], eta1=0.0), p, GRADIENTS[:1, :1])
-    half = descend(NoisyAdadelta([q], lr=0.5, eta1=0.0), q, GRADIENTS[:1, :1])
-    torch.testing.assert_close(half, 0.5 * one)
+    full, half = (path_of(GRADIENTS[:1, :1], 0.0, lr=lr) for lr in (1.0, 0.5))
+    torch.testing.assert_close(half, 0.5 * full)
 
 
-def test_with_a_vanishing_eps_it_is_torch_s_adadelta() -> None:
-    # torch has sqrt(E[g²] + eps) where the paper has sqrt(E[g²]) + eps: with eps = 1e-30 and
-    # E[g²] >> 1e-15 both are sqrt(E[g²]) to the last digit
-    p, q = parameter(1.0, -2.0, 30.0), parameter(1.0, -2.0, 30.0)
-    ours = descend(NoisyAdadelta([p], rho=0.9, eps=1e-30, eta1=0.0), p, GRADIENTS)
-    theirs = descend(torch.optim.Adadelta([q], lr=1.0, rho=0.9, eps=1e-30), q, GRADIENTS)
-    torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=0)
+def test_steps_equal_torch_adadelta_for_vanishing_eps() -> None:
+    # torch uses sqrt(E[g²] + eps), the paper sqrt(E[g²]) + eps; with eps = 1e-30 and
+    # E[g²] >> 1e-15 both equal sqrt(E[g²]) to the last digit
+    path, p = path_of(GRADIENTS, *START, rho=0.9, eps=1e-30), parameter(*START)
+    expected = descend(torch.optim.Adadelta([p], lr=1.0, rho=0.9, eps=1e-30), p, GRADIENTS)
+    torch.testing.assert_close(path, expected, rtol=1e-12, atol=0)
 
 
 def noise_of_step(n: int, k: int, **options: Any) -> np.ndarray:
-    """The n noise values added to a zero gradient in step k."""
+    """The n noise values that are added to a zero gradient in step k."""
     p = nn.Parameter(torch.zeros(n, dtype=torch.float64))
     optimizer = NoisyAdadelta([p], **options)
     for _ in range(k + 1):
@@ -85,7 +88,7 @@ def noise_of_step(n: int, k: int, **options: Any) -> np.ndarray:
 
 @pytest.mark.parametrize("k", [0, 1, 7])
 @pytest.mark.parametrize(("eta1", "eta2"), [(1.0, 0.55), (4.0, 1.5), (0.3, 0.0)])
-def test_noise_is_normal_with_falling_variance(k: int, eta1: float, eta2: float) -> None:
+def test_noise_is_normal_with_decaying_variance(k: int, eta1: float, eta2: float) -> None:
     n = 20_000
     noise = noise_of_step(n, k, eta1=eta1, eta2=eta2, seed=2)
     variance = eta1 / (1 + k) ** eta2
@@ -106,20 +109,17 @@ def test_weights_get_independent_noise() -> None:
     assert abs(np.corrcoef(first, second)[0, 1]) < 5 / math.sqrt(10_000)
 
 
-def test_a_seed_fixes_the_noise_in_every_precision() -> None:
-    same, again, other = (noise_of_step(50, 1, seed=s) for s in (3, 3, 4))
-    np.testing.assert_array_equal(same, again)
-    assert not np.allclose(same, other)
-    p = nn.Parameter(torch.zeros(50))
-    q = nn.Parameter(torch.zeros(50, dtype=torch.float64))
-    zero = np.zeros((1, 50))
-    single = descend(NoisyAdadelta([p], seed=3), p, zero)
-    double = descend(NoisyAdadelta([q], seed=3), q, zero)
+def test_noise_depends_on_the_seed_and_not_on_the_precision() -> None:
+    first, repeated, other = (noise_of_step(50, 1, seed=s) for s in (3, 3, 4))
+    np.testing.assert_array_equal(first, repeated)
+    assert not np.allclose(first, other)
+    p, q = (nn.Parameter(torch.zeros(50, dtype=dtype)) for dtype in (torch.float32, torch.float64))
+    single, double = (descend(NoisyAdadelta([x], seed=3), x, np.zeros((1, 50))) for x in (p, q))
     torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=0)
 
 
 def stored(state: dict[str, Any]) -> dict[str, Any]:
-    """The state after a round trip through a file that may hold nothing but data."""
+    """The state after a round trip through a file without code."""
     file = io.BytesIO()
     torch.save(state, file)
     file.seek(0)
@@ -127,8 +127,8 @@ def stored(state: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_resumed_run_continues_bit_for_bit(dtype: torch.dtype) -> None:
-    p = nn.Parameter(torch.tensor([1.0, -2.0, 30.0], dtype=dtype))
+def test_resume_is_bit_identical(dtype: torch.dtype) -> None:
+    p = nn.Parameter(torch.tensor(START, dtype=dtype))
     optimizer = NoisyAdadelta([p], seed=5)
     descend(optimizer, p, GRADIENTS[:20])
     q = nn.Parameter(p.detach().clone())
@@ -138,7 +138,7 @@ def test_a_resumed_run_continues_bit_for_bit(dtype: torch.dtype) -> None:
     assert resumed.noise == optimizer.noise
 
 
-def test_it_descends_into_the_minimum_of_a_quadratic() -> None:
+def test_descent_into_the_minimum_of_a_quadratic() -> None:
     target = torch.tensor([3.0, -1.0], dtype=torch.float64)
     stiffness = torch.tensor([1.0, 50.0], dtype=torch.float64)
     p = parameter(0.0, 0.0)
@@ -159,7 +159,7 @@ def test_it_descends_into_the_minimum_of_a_quadratic() -> None:
     assert np.mean(costs[-100:]) < 0.03 * costs[0]
 
 
-def test_a_parameter_without_gradient_stays() -> None:
+def test_parameter_without_gradient_is_unchanged() -> None:
     p, q = parameter(1.0), parameter(2.0)
     optimizer = NoisyAdadelta([p, q])
     p.grad = torch.ones_like(p)
@@ -169,18 +169,17 @@ def test_a_parameter_without_gradient_stays() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad",
+    ("name", "value"),
     [
-        {"lr": 0.0},
-        {"lr": float("nan")},
-        {"rho": 1.0},
-        {"rho": 0.0},
-        {"eps": 0.0},
-        {"eta1": -1.0},
-        {"eta2": -0.1},
+        ("lr", 0.0),
+        ("lr", math.nan),
+        ("rho", 1.0),
+        ("rho", 0.0),
+        ("eps", 0.0),
+        ("eta1", -1.0),
+        ("eta2", -0.1),
     ],
-    ids=str,
 )
-def test_values_outside_their_range_are_refused(bad: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        NoisyAdadelta([parameter(1.0)], **bad)
+def test_options_out_of_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        NoisyAdadelta([parameter(1.0)], **{name: value})

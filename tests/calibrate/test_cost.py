@@ -1,4 +1,4 @@
-"""The trajectory cost by hand, and on a real recording against a plain loop."""
+"""The trajectory cost by hand and, on real recordings, against a plain loop."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from tests.builders import lane
 
 
 def two_sequences() -> Batch:
-    """K = 3 samples of two vehicles, and K = 2 of one."""
+    """Three samples of two vehicles, and two samples of one vehicle."""
     long = lane([[0.0, 10.0], [5.0, 16.0], [9.0, 21.0]], 0.5, name="long")
     return collate([long, lane([[1.0], [4.0]], 0.5, start=7.0, name="short")])
 
 
 def shifted(batch: Batch) -> Trajectory:
-    """A simulation whose errors are 0, (1, -2), (3, 4) in the first and 0, 5 in the second."""
+    """A simulation with errors 0, (1, -2), (3, 4) in the first sequence and 0, 5 in the second."""
     x = batch.x.clone()
     x[1, 0, :, 0] += torch.tensor([1.0, -2.0])
     x[2, 0, :, 0] += torch.tensor([3.0, 4.0])
     x[1, 1, 0, 0] += 5.0
-    # the padding may hold anything
+    # values of the padding must not matter
     x[2, 1, 0, 0] = float("nan")
     x[:, 1, 1, 0] = float("inf")
     return Trajectory(x, None)
@@ -39,7 +39,7 @@ def shifted(batch: Batch) -> Trajectory:
 @pytest.mark.parametrize(
     ("convention", "scale"), [(Convention.integral, 0.5), (Convention.sum, 1.0)]
 )
-def test_costs_and_their_gradients_by_hand(convention: Convention, scale: float) -> None:
+def test_costs_and_gradients_by_hand(convention: Convention, scale: float) -> None:
     batch = two_sequences()
     x = shifted(batch).x.requires_grad_()
     squares = [[[0, 0], [0, 0]], [[1, 4], [25, 0]], [[9, 16], [0, 0]]]
@@ -48,16 +48,14 @@ def test_costs_and_their_gradients_by_hand(convention: Convention, scale: float)
     np.testing.assert_allclose(costs.detach(), [15 * scale, 12.5 * scale], rtol=1e-14)
     costs.sum().backward()
     assert x.grad is not None
-    # d/dx of 1/2 dt e² is dt e, and the padding has no gradient
+    # the derivative of 1/2 dt e² is dt e; the padding has no gradient
     errors = [[[0, 0], [0, 0]], [[1, -2], [5, 0]], [[3, 4], [0, 0]]]
     np.testing.assert_array_equal(x.grad[..., 0], scale * np.array(errors))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("convention", list(Convention))
-def test_a_simulation_that_blows_up_has_no_finite_cost(
-    convention: Convention, value: float
-) -> None:
+def test_diverged_simulation_has_no_finite_cost(convention: Convention, value: float) -> None:
     batch = two_sequences()
     x, v = batch.x.clone(), batch.v.clone()
     x[2, 0, 0, 0] = v[2, 0, 0, 0] = value
@@ -69,7 +67,7 @@ def test_a_simulation_that_blows_up_has_no_finite_cost(
 @pytest.mark.real
 @pytest.mark.parametrize("recording", ["1-1_1", "2-1_1"])
 def test_cost_of_a_recording(real_data: Path, recording: str) -> None:
-    """Every sequence, faults kept, behind a leader at v0."""
+    """All sequences, including faulty ones, behind a leader at v0."""
     v0, length, dt = 22.0, 4.0, 0.02
     cells = loadmat(real_data / "esimas" / f"sequence_data{recording}.mat")["sequences"].ravel()
     items, costs = [], []

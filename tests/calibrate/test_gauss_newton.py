@@ -1,4 +1,4 @@
-"""Gauss and Newton's method on exact tangents, and costs of car following."""
+"""The Gauss-Newton method with exact derivatives, and costs of car following."""
 
 from __future__ import annotations
 
@@ -27,21 +27,23 @@ def model(**values: float) -> System:
     return set_(following.model("idm"), **values)
 
 
+def problem(batch: Batch, kind: Convention, **values: float) -> ResidualProblem:
+    return ResidualProblem(model(**values), batch, FusedSolver(), kind)
+
+
 @pytest.fixture(scope="module")
 def pairs() -> Batch:
-    """Six pairs behind leaders that brake and stop, as the law with TRUE drives; 5 cm of noise."""
+    """Six IDM pairs with :data:`TRUE` parameters behind stop-and-go leaders; 5 cm of noise."""
     rng = np.random.default_rng(20261122)
-    found = []
+    sequences = []
     for i in range(6):
         time = 0.1 * np.arange(200 + 20 * i)
         speed = np.clip(12 + 10 * np.sin(0.35 * time + i), 0, None)
         lead = np.cumsum(speed) * 0.1
-        x, v = (
-            np.stack(columns, 1)
-            for columns in ((lead - 20 - 2 * i, lead), (np.full_like(speed, 10.0), speed))
-        )
-        found.append(lane(x, 0.1, v=v, name=f"r/{i}", length=np.array([4.0, 5.0])))
-    batch = collate(found)
+        x = np.stack([lead - 20 - 2 * i, lead], 1)
+        v = np.stack([np.full_like(speed, 10.0), speed], 1)
+        sequences.append(lane(x, 0.1, v=v, name=f"r/{i}", length=np.array([4.0, 5.0])))
+    batch = collate(sequences)
     with torch.no_grad():
         run = FusedSolver()(model(**TRUE), batch)
     noise = 0.05 * torch.from_numpy(rng.standard_normal(run.x.shape))
@@ -53,81 +55,79 @@ def pairs() -> Batch:
 
 @pytest.fixture(scope="module")
 def differentiable(pairs: Batch) -> tuple[System, Trajectory]:
-    """A model, and its motion with the graph of its derivatives."""
+    """A model and its simulation with the graph for automatic differentiation."""
     system = model(T=1.1)
     return system, RungeKutta()(system, pairs)
 
 
 @pytest.mark.parametrize("kind", list(Convention))
-def test_costs_and_slopes_are_those_of_autograd(
+def test_costs_and_gradients_as_autograd(
     kind: Convention, pairs: Batch, differentiable: tuple[System, Trajectory]
 ) -> None:
     system, run = differentiable
     cost = ResidualProblem(system, pairs, FusedSolver(), kind)
-    curved = cost(cost.start)
-    wanted = sequence_costs(run, pairs, kind)
-    np.testing.assert_allclose(curved.cost, wanted.detach().numpy(), rtol=1e-11)
-    np.testing.assert_allclose(cost.costs(cost.start), curved.cost, rtol=1e-11)
-    slopes = torch.autograd.grad(wanted.sum(), list(system.parameters()), retain_graph=True)
-    np.testing.assert_allclose(curved.gradient.sum(0), [float(s) for s in slopes], rtol=1e-9)
+    quadratic = cost(cost.start)
+    expected = sequence_costs(run, pairs, kind)
+    np.testing.assert_allclose(quadratic.cost, expected.detach().numpy(), rtol=1e-11)
+    np.testing.assert_allclose(cost.costs(cost.start), quadratic.cost, rtol=1e-11)
+    slopes = torch.autograd.grad(expected.sum(), list(system.parameters()), retain_graph=True)
+    np.testing.assert_allclose(quadratic.gradient.sum(0), [float(s) for s in slopes], rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", [Convention.integral, Convention.gap])
-def test_costs_of_platoons_are_those_that_come_with_slopes(kind: Convention) -> None:
+def test_costs_of_platoons(kind: Convention) -> None:
     time = 0.1 * np.arange(30)
     lead = 12 * time + np.sin(time)
     batch = collate([lane(np.stack([lead - 45, lead - 20, lead], 1), 0.1)])
-    cost = ResidualProblem(model(), batch, FusedSolver(), kind)
-    wanted = sequence_costs(RungeKutta()(model(), batch), batch, kind)
-    np.testing.assert_allclose(cost(cost.start).cost, wanted.detach().numpy(), rtol=1e-11)
-    np.testing.assert_allclose(cost.costs(cost.start), wanted.detach().numpy(), rtol=1e-11)
+    cost = problem(batch, kind)
+    expected = sequence_costs(RungeKutta()(model(), batch), batch, kind).detach().numpy()
+    np.testing.assert_allclose(cost(cost.start).cost, expected, rtol=1e-11)
+    np.testing.assert_allclose(cost.costs(cost.start), expected, rtol=1e-11)
 
 
 @pytest.mark.thorough
-def test_costs_are_what_their_names_say(pairs: Batch) -> None:
+def test_definitions_of_costs(pairs: Batch) -> None:
     run = TorchdiffeqSolver(None, "discrete")(model(T=1.1), pairs)
-    found = {kind: sequence_costs(run, pairs, kind).detach().numpy() for kind in FOLLOWING}
+    costs = {kind: sequence_costs(run, pairs, kind).detach().numpy() for kind in FOLLOWING}
     for b in range(len(pairs)):
         k = int(pairs.valid[:, b, 0].sum())
         gap = (run.x[1:k, b, 1, 0] - run.x[1:k, b, 0, 0] - 5).detach().numpy()
-        seen = (pairs.x[1:k, b, 1, 0] - pairs.x[1:k, b, 0, 0] - 5).numpy()
-        rmse = np.sqrt(np.mean((gap - seen) ** 2))
-        assert found[Convention.spacing][b] == pytest.approx(rmse, rel=1e-12)
-        relative = np.mean(((gap - seen) / seen) ** 2)
-        assert found[Convention.relative_gap][b] == pytest.approx(relative, rel=1e-12)
-        logarithm = np.mean((np.log(gap) - np.log(seen)) ** 2)
-        assert found[Convention.log_gap][b] == pytest.approx(logarithm, rel=1e-12)
+        measured = (pairs.x[1:k, b, 1, 0] - pairs.x[1:k, b, 0, 0] - 5).numpy()
+        rmse = np.sqrt(np.mean((gap - measured) ** 2))
+        assert costs[Convention.spacing][b] == pytest.approx(rmse, rel=1e-12)
+        relative = np.mean(((gap - measured) / measured) ** 2)
+        assert costs[Convention.relative_gap][b] == pytest.approx(relative, rel=1e-12)
+        logarithm = np.mean((np.log(gap) - np.log(measured)) ** 2)
+        assert costs[Convention.log_gap][b] == pytest.approx(logarithm, rel=1e-12)
 
 
-def test_pooled_parameters_are_found_and_lie_in_their_intervals(pairs: Batch) -> None:
-    cost = ResidualProblem(
-        model(v0=30, T=1.0, s0=2, a=1.5, b=1.5), pairs, FusedSolver(), Convention.gap
-    )
+def test_pooled_fit_and_intervals(pairs: Batch) -> None:
+    cost = problem(pairs, Convention.gap, v0=30, T=1.0, s0=2, a=1.5, b=1.5)
     fit = pooled(cost)
     assert np.abs(cost(fit.row).gradient.mean(0) * (1 + np.abs(fit.row))).max() < 1e-6
-    found = intervals(cost, fit.row, np.arange(6))
-    assert found["clusters"] == 6
-    inside = [
-        own["low"] < TRUE[name.split(".")[1]] < own["high"]
-        for name, own in found["parameters"].items()
+    report = intervals(cost, fit.row, np.arange(6))
+    assert report["clusters"] == 6
+    covered = [
+        interval["low"] < TRUE[name.split(".")[1]] < interval["high"]
+        for name, interval in report["parameters"].items()
     ]
-    assert sum(inside) >= 4  # five intervals of 95 %
+    assert sum(covered) >= 4  # of five intervals of 95 %
     # weights choose sequences
-    one = pooled(cost, weights=np.eye(6)[2])
+    single = pooled(cost, weights=np.eye(6)[2])
     _, costs = separate(cost, [fit.row])
-    assert one.cost == pytest.approx(costs[2], rel=1e-6)
+    assert single.cost == pytest.approx(costs[2], rel=1e-6)
     assert (costs <= cost.costs(fit.row) + 1e-12).all()
 
 
-def test_parameters_at_a_bound_are_flagged(pairs: Batch) -> None:
-    cost = ResidualProblem(model(**{**TRUE, "b": 0.05}), pairs, FusedSolver(), Convention.gap)
-    own = intervals(cost, cost.start, np.arange(6))["parameters"]["idm.b"]
-    assert own["at_bound"] == "low"
-    assert own["low"] is None
-    assert not own["identified"]
+def test_parameter_at_a_bound_is_flagged(pairs: Batch) -> None:
+    cost = problem(pairs, Convention.gap, **{**TRUE, "b": 0.05})
+    interval = intervals(cost, cost.start, np.arange(6))["parameters"]["idm.b"]
+    assert interval["at_bound"] == "low"
+    assert interval["low"] is None
+    assert not interval["identified"]
 
 
-def test_the_optimiser_goes_on_as_if_it_had_not_stopped(pairs: Batch) -> None:
+def test_resume_is_bit_identical(pairs: Batch) -> None:
     def run(steps: int, state: dict[str, object] | None, system: System) -> GaussNewton:
         optimizer = GaussNewton(system)
         if state is not None:
@@ -137,15 +137,15 @@ def test_the_optimiser_goes_on_as_if_it_had_not_stopped(pairs: Batch) -> None:
             optimizer.step()
         return optimizer
 
-    whole, halves = model(T=1.0), model(T=1.0)
-    run(6, None, whole)
-    run(3, run(3, None, halves).state_dict(), halves)
-    for a, b in zip(whole.parameters(), halves.parameters(), strict=True):
+    uninterrupted, resumed = model(T=1.0), model(T=1.0)
+    run(6, None, uninterrupted)
+    run(3, run(3, None, resumed).state_dict(), resumed)
+    for a, b in zip(uninterrupted.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
 class Coded(Term):
-    """A term that is code without a formula."""
+    """A term without a formula."""
 
     name = "coded"
 
@@ -153,7 +153,7 @@ class Coded(Term):
         return torch.zeros_like(state.x)
 
 
-def test_what_has_no_tangents_is_refused(pairs: Batch) -> None:
+def test_models_without_derivatives_are_refused(pairs: Batch) -> None:
     lin = {"term": "lin", "name": "lin", "leader": "measured", "v0": 20.0, "L": 5.0, "L_min": 2.0}
     coded = Traffic([*build_model(lin).terms, Coded()], leader="measured")
     with pytest.raises(ConfigError, match="gauss_newton needs a model of a lane"):

@@ -1,4 +1,4 @@
-"""Standard errors by clusters against clubSandwich's, and what no data tell."""
+"""Cluster-robust standard errors against clubSandwich, and unidentified parameters."""
 
 from __future__ import annotations
 
@@ -22,46 +22,49 @@ def of_regression(x: np.ndarray, y: np.ndarray, cluster: np.ndarray) -> ClusterI
 
 
 @pytest.mark.parametrize("case", STORED)
-def test_covariances_and_degrees_of_freedom_are_club_sandwich_s(case: str) -> None:
+def test_covariances_and_degrees_of_freedom_as_club_sandwich(case: str) -> None:
     stored = STORED[case]
     data = {name: np.array(values) for name, values in stored["data"].items()}
     columns = [data[name] for name in ("x1", "x2") if name in data]
     x = np.stack([np.ones(len(data["y"])), *columns], 1)
-    found = of_regression(x, data["y"], data["cluster"])
-    np.testing.assert_allclose(found.covariance(), stored["covariance"], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.degrees(), stored["df"], rtol=1e-9)
+    result = of_regression(x, data["y"], data["cluster"])
+    np.testing.assert_allclose(result.covariance(), stored["covariance"], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(result.degrees(), stored["df"], rtol=1e-9)
 
 
-def test_changes_by_a_cluster_are_those_of_leaving_it_out() -> None:
+def test_cluster_influence_is_leave_one_out() -> None:
     rng = np.random.default_rng(3)
     x, y, cluster = rng.normal(size=(60, 3)), rng.normal(size=60), np.repeat(np.arange(6), 10)
-    whole = np.linalg.lstsq(x, y, rcond=None)[0]
-    moved = of_regression(x, y, cluster).moved(1.0)
+    estimate = np.linalg.lstsq(x, y, rcond=None)[0]
+    influence = of_regression(x, y, cluster).moved(1.0)
     for g in range(6):
         kept = cluster != g
-        wanted = np.linalg.lstsq(x[kept], y[kept], rcond=None)[0] - whole
-        np.testing.assert_allclose(moved[g], wanted, rtol=1e-9)
+        expected = np.linalg.lstsq(x[kept], y[kept], rcond=None)[0] - estimate
+        np.testing.assert_allclose(influence[g], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("which", "lost"), [("combination", [True, True, False]), ("one cluster", [False, True, False])]
+    ("case", "unidentified"),
+    [("collinear", [True, True, False]), ("one cluster", [False, True, False])],
 )
-def test_what_the_data_do_not_tell_has_no_variance(which: str, lost: list[bool]) -> None:
+def test_unidentified_parameters_have_infinite_intervals(
+    case: str, unidentified: list[bool]
+) -> None:
     rng = np.random.default_rng(5)
     x, y, cluster = rng.normal(size=(50, 3)), rng.normal(size=50), np.repeat(np.arange(5), 10)
-    if which == "combination":
+    if case == "collinear":
         x[:, 1] = x[:, 0]
     else:
         x[cluster != 2, 1] = 0.0
-    found = of_regression(x, y, cluster)
-    assert np.isinf(found.half_widths()).tolist() == lost
-    assert found.flat.tolist() == [on and which == "combination" for on in lost]
+    result = of_regression(x, y, cluster)
+    assert np.isinf(result.half_widths()).tolist() == unidentified
+    assert result.flat.tolist() == (unidentified if case == "collinear" else [False] * 3)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("clusters", [4, 8, 20])
-def test_intervals_cover_the_truth_although_clusters_are_few(clusters: int) -> None:
-    """Errors that clusters share."""
+def test_coverage_with_few_clusters(clusters: int) -> None:
+    """Regressors and errors are correlated within clusters."""
     rng, inside = np.random.default_rng(clusters), []
     for _ in range(1500):
         cluster = np.repeat(np.arange(clusters), rng.integers(3, 12, clusters))

@@ -1,4 +1,4 @@
-"""Damped least squares against problems with known solutions."""
+"""Damped least squares for problems with known solutions."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ def solved(
     high: Any = np.inf,
     **options: Any,
 ) -> Minimum:
-    """The minima of problems side by side, each a function of ``(P,)`` parameters to residuals
-    and their derivatives."""
+    """The minima of several problems.
+
+    Args:
+        problems: functions of ``(P,)`` parameters that return residuals and their derivatives.
+    """
 
     def quadratic(rows: np.ndarray) -> Quadratic:
         parts = [problem(row) for problem, row in zip(problems, rows, strict=True)]
@@ -33,11 +36,13 @@ def solved(
         )
 
     def costs(trials: np.ndarray) -> np.ndarray:
-        found = [
-            [r @ r for r in (problem(row)[0] for problem, row in zip(problems, rows, strict=True))]
-            for rows in trials
-        ]
-        return np.nan_to_num(np.array(found), nan=np.inf)
+        residuals = np.array(
+            [
+                [problem(row)[0] for problem, row in zip(problems, rows, strict=True)]
+                for rows in trials
+            ]
+        )
+        return np.nan_to_num((residuals**2).sum(-1), nan=np.inf)
 
     box = (np.full(start.shape[1], end) for end in (low, high))
     return least_squares(quadratic, costs, start, *box, **options)
@@ -59,19 +64,19 @@ def linear(matrix: np.ndarray, target: np.ndarray) -> Residuals:
 
 
 def exponential(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Blows up above 3.5."""
+    """NaN above 3.5."""
     value = np.exp(row) if row[0] <= 3.5 else np.array([np.nan])
     return value - 20.0, value[:, None]
 
 
 @pytest.mark.parametrize("dampings", [(), (1e-6, 1e-2, 1.0, 30.0)])
-def test_rosenbrock_s_valley_is_followed_to_its_end(dampings: tuple[float, ...]) -> None:
-    found = solved([rosenbrock(2.0)], np.array([[-1.2, 1.0]]), dampings=dampings)
-    assert found.row[0] == pytest.approx([1.0, 1.0], abs=1e-6)
-    assert found.before == pytest.approx([5.6144])
+def test_rosenbrock_minimum(dampings: tuple[float, ...]) -> None:
+    minimum = solved([rosenbrock(2.0)], np.array([[-1.2, 1.0]]), dampings=dampings)
+    assert minimum.row[0] == pytest.approx([1.0, 1.0], abs=1e-6)
+    assert minimum.before == pytest.approx([5.6144])
 
 
-def test_problems_side_by_side_end_where_each_ends_alone() -> None:
+def test_joint_problems_have_their_separate_minima() -> None:
     problems = [rosenbrock(scale) for scale in (1.0, 10.0, 30.0)]
     starts = np.array([[-1.2, 1.0], [3.0, -2.0], [0.0, 5.0]])
     together = solved(problems, starts)
@@ -82,41 +87,42 @@ def test_problems_side_by_side_end_where_each_ends_alone() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_bounds_of_a_linear_problem_are_obeyed_as_scipy_obeys_them(seed: int) -> None:
+def test_bounded_linear_problem_as_scipy(seed: int) -> None:
     rng = np.random.default_rng(seed)
     matrix, target = rng.normal(size=(30, 6)), rng.normal(size=30)
-    known = lsq_linear(matrix, target, (-0.05, 0.08), tol=1e-14)
-    found = solved([linear(matrix, target)], np.full((1, 6), 0.01), -0.05, 0.08)
-    assert (known.active_mask != 0).any()
-    assert found.cost[0] == pytest.approx(2 * known.cost, rel=1e-8)
-    assert found.row[0] == pytest.approx(known.x, abs=1e-5)
+    expected = lsq_linear(matrix, target, (-0.05, 0.08), tol=1e-14)
+    minimum = solved([linear(matrix, target)], np.full((1, 6), 0.01), -0.05, 0.08)
+    assert (expected.active_mask != 0).any()
+    assert minimum.cost[0] == pytest.approx(2 * expected.cost, rel=1e-8)
+    assert minimum.row[0] == pytest.approx(expected.x, abs=1e-5)
 
 
-def test_a_penalty_is_that_of_further_rows() -> None:
+def test_penalty_equals_additional_rows() -> None:
     rng = np.random.default_rng(7)
     matrix, target = rng.normal(size=(30, 4)), rng.normal(size=30)
     centre, weight = rng.normal(size=4), rng.uniform(1, 9, 4)
-    found = solved([linear(matrix, target)], np.zeros((1, 4)), penalty=(centre, weight))
+    minimum = solved([linear(matrix, target)], np.zeros((1, 4)), penalty=(centre, weight))
     rows = np.concatenate([matrix, np.diag(np.sqrt(weight))])
-    known = np.linalg.lstsq(rows, np.concatenate([target, np.sqrt(weight) * centre]), rcond=None)
-    assert found.row[0] == pytest.approx(known[0], abs=1e-9)
-    assert found.cost[0] == pytest.approx(float(known[1][0]), rel=1e-12)
+    targets = np.concatenate([target, np.sqrt(weight) * centre])
+    row, cost, *_ = np.linalg.lstsq(rows, targets, rcond=None)
+    assert minimum.row[0] == pytest.approx(row, abs=1e-9)
+    assert minimum.cost[0] == pytest.approx(float(cost[0]), rel=1e-12)
 
 
-def test_points_that_cannot_be_simulated_are_stepped_around() -> None:
-    found = solved([exponential], np.zeros((1, 1)))
-    assert found.row[0, 0] == pytest.approx(np.log(20.0), rel=1e-9)
+def test_points_without_finite_cost_are_avoided() -> None:
+    minimum = solved([exponential], np.zeros((1, 1)))
+    assert minimum.row[0, 0] == pytest.approx(np.log(20.0), rel=1e-9)
 
 
-def test_a_search_without_hope_ends_early() -> None:
+def test_hopeless_search_stops_early() -> None:
     start, options = np.array([[-1.2, 1.0]]), {"dampings": (30.0,)}
-    whole = solved([rosenbrock(10.0)], start, **options)
+    full = solved([rosenbrock(10.0)], start, **options)
     early = solved([rosenbrock(10.0)], start, hopeless=1e-3, **options)
-    assert early.steps < whole.steps
+    assert early.steps < full.steps
     assert early.cost[0] > 1e-3
 
 
-def test_a_profile_is_the_cost_with_the_others_at_their_best() -> None:
+def test_profile_minimises_over_the_other_parameters() -> None:
     rng = np.random.default_rng(3)
     matrix, target = rng.normal(size=(20, 5)), rng.normal(size=20)
     residual, matrix = linear(matrix, target)(np.zeros(5))

@@ -1,4 +1,4 @@
-"""Optimisers by name: what is built from the options, and whether it calibrates."""
+"""Optimisers that are built from options, and short calibrations with them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from nnode.model import Traffic, make_law
 from nnode.simulation import FusedSolver
 from tests.builders import linear
 
-#: v0 (m/s) and L (m) that the data are made with.
+#: True v0 (m/s) and L (m).
 TRUTH = (24.0, 6.0)
 SOLVER = FusedSolver(0.1)
 
 
-def made_with_lin() -> Batch:
-    """Platoons of TRUTH."""
+def platoons() -> Batch:
+    """Platoons with the parameters :data:`TRUTH`."""
     gaps = ([9.0, 14.0], [20.0, 8.0], [30.0, 11.0])
     return collate(linear((np.cumsum([0.0, *g]) for g in gaps), *TRUTH, 8, 0.1))
 
@@ -43,7 +43,7 @@ def made_with_lin() -> Batch:
     ids=lambda o: getattr(o, "name", ""),
 )
 def test_each_optimiser_calibrates(options: OptimizerOptions, steps: int, share: float) -> None:
-    batch, model = made_with_lin(), Traffic([make_law("lin")])
+    batch, model = platoons(), Traffic([make_law("lin")])
     optimizer = build_optimizer(model, options, seed=1)
 
     def closure() -> Tensor:
@@ -59,8 +59,8 @@ def test_each_optimiser_calibrates(options: OptimizerOptions, steps: int, share:
         model.project_()
     assert float(closure()) < share * first
     if share < 1e-5:
-        found = [model.terms[0].v0.item(), model.terms[0].L.item()]
-        np.testing.assert_allclose(found, TRUTH, rtol=1e-4)
+        estimate = [model.terms[0].v0.item(), model.terms[0].L.item()]
+        np.testing.assert_allclose(estimate, TRUTH, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -96,19 +96,18 @@ def test_options_reach_the_optimiser(
     assert expected.items() <= optimizer.param_groups[0].items()
 
 
-def test_the_seed_reaches_the_optimiser() -> None:
-    states = [
-        build_optimizer(Traffic([make_law("lin")]), AdadeltaOptions(), seed=s).state_dict()[
-            "generator"
-        ]
-        for s in (4, 4, 5)
-    ]
-    assert torch.equal(states[0], states[1])
-    assert not torch.equal(states[0], states[2])
+def test_seed_reaches_the_optimiser() -> None:
+    model = Traffic([make_law("lin")])
+    first, repeated, other = (
+        build_optimizer(model, AdadeltaOptions(), seed=seed).state_dict()["generator"]
+        for seed in (4, 4, 5)
+    )
+    assert torch.equal(first, repeated)
+    assert not torch.equal(first, other)
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         (
             OptimizerOptions(name="adadlta"),
@@ -119,6 +118,6 @@ def test_the_seed_reaches_the_optimiser() -> None:
     ],
     ids=lambda v: v if isinstance(v, str) else "",
 )
-def test_errors_name_the_option(options: OptimizerOptions, words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
+def test_errors_name_the_option(options: OptimizerOptions, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         build_optimizer(Traffic([make_law("lin")]), options)

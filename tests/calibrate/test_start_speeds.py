@@ -1,4 +1,4 @@
-"""First speeds as a nuisance: fitted where they are wrong, and derivatives of what is left."""
+"""Initial speeds as nuisance parameters, and derivatives of the profiled cost."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from studies.following.tasks import EVERY
 from tests.app.following import pairs
 from tests.builders import lane
 from tests.model.following import idm
-from tests.studies.following.test_fit import HELLY, driven
+from tests.studies.following.test_fit import HELLY, helly_pairs
 
 
-def known(name: str = "helly") -> System:
+def helly_model(name: str = "helly") -> System:
+    """A candidate of the study with the parameters of :func:`helly_pairs`."""
     system = EVERY[name].system()
     with torch.no_grad():
-        for own, value in HELLY.items():
-            getattr(system.terms[0], own).fill_(value)
+        for parameter, value in HELLY.items():
+            getattr(system.terms[0], parameter).fill_(value)
     return system
 
 
@@ -39,7 +40,7 @@ def fitted_starts(system: System, batch: Batch, convention: Convention) -> Resid
 
 
 def wrong_starts(sequences: list[Sequence]) -> Batch:
-    """True paths, whose first speeds are off by 1 m/s to and fro."""
+    """Exact paths with errors of the first speeds, alternately 1 m/s and -1 m/s."""
     batch = collate(sequences)
     batch.v[0, ::2, 0] += 1.0
     batch.v[0, 1::2, 0] -= 1.0
@@ -47,65 +48,60 @@ def wrong_starts(sequences: list[Sequence]) -> Batch:
 
 
 @pytest.mark.thorough
-def test_wrong_first_speeds_are_found_beside_the_parameters() -> None:
-    sequences = driven()
+def test_initial_speeds_and_parameters_are_fitted_jointly() -> None:
+    sequences = helly_pairs()
     batch = wrong_starts(sequences)
-    given = ResidualProblem(known(), batch, FusedSolver(), Convention.spacing)
-    fitted = fitted_starts(known(), batch, Convention.spacing)
+    given = ResidualProblem(helly_model(), batch, FusedSolver(), Convention.spacing)
+    fitted = fitted_starts(helly_model(), batch, Convention.spacing)
     row = np.array(list(HELLY.values()))
     assert pooled(given, row * 1.2).cost > 0.1
-    found = pooled(fitted, row * 1.2)
-    assert found.cost < 1e-3
-    np.testing.assert_allclose(found.row, row, rtol=1e-3)
-    starts = fitted.start_speeds(found.row)
+    fit = pooled(fitted, row * 1.2)
+    assert fit.cost < 1e-3
+    np.testing.assert_allclose(fit.row, row, rtol=1e-3)
+    starts = fitted.start_speeds(fit.row)
     for s in sequences:
         np.testing.assert_allclose(starts[s.name], s.velocity()[0, :, 0], atol=1e-3)
-    assert float(batch.v[0, 0, 0]) == pytest.approx(10.0)  # what was given is not changed
+    assert float(batch.v[0, 0, 0]) == pytest.approx(10.0)  # the given speeds are not modified
 
 
 @pytest.mark.parametrize("name", ["helly", "helly + memory"])
 @pytest.mark.parametrize("kind", [Convention.integral, Convention.spacing, Convention.log_gap])
-def test_the_gradient_is_that_of_the_least_cost(name: str, kind: Convention) -> None:
-    cost = ResidualProblem(
-        known(name), wrong_starts(driven()), FusedSolver(), kind, StartSpeeds.fitted
-    )
+def test_gradient_of_the_profiled_cost_as_finite_differences(name: str, kind: Convention) -> None:
+    cost = fitted_starts(helly_model(name), wrong_starts(helly_pairs()), kind)
     row = cost.start * 1.1
-    curved = cost(row)
+    gradient = cost(row).gradient
     for i, value in enumerate(row):
         h = 1e-5 * value
         up, down = (cost.costs(row + s * h * np.eye(len(row))[i]) for s in (1, -1))
-        wanted = (up - down) / (2 * h)
-        np.testing.assert_allclose(curved.gradient[:, i], wanted, rtol=2e-3, atol=1e-5)
+        np.testing.assert_allclose(gradient[:, i], (up - down) / (2 * h), rtol=2e-3, atol=1e-5)
 
 
-def test_every_follower_of_a_platoon_has_its_own() -> None:
+def test_each_follower_of_a_platoon_has_an_initial_speed() -> None:
     time = 0.1 * np.arange(80)
     lead = 12 * time + np.sin(time)
     x = np.stack([lead - 45, lead - 20, lead], 1)
-    one = lane(x, 0.1, v=(12 + np.cos(time))[:, None], name="a")
+    batch = collate([lane(x, 0.1, v=(12 + np.cos(time))[:, None], name="a")])
     with torch.no_grad():
-        run = FusedSolver()(known(), collate([one]))
-    batch = collate([one])
-    batch.x = run.x
+        batch.x = FusedSolver()(helly_model(), batch).x
     batch.v[0, 0, :2, 0] += torch.tensor([0.7, -0.4])
-    cost = fitted_starts(known(), batch, Convention.gap)
+    cost = fitted_starts(helly_model(), batch, Convention.gap)
     row = cost.start
-    assert ResidualProblem(known(), batch, FusedSolver(), Convention.gap).costs(row)[0] > 1e-2
+    assert ResidualProblem(helly_model(), batch, FusedSolver(), Convention.gap).costs(row)[0] > 1e-2
     np.testing.assert_allclose(cost.start_speeds(row)["a"], [13.0, 13.0, 13.0], atol=1e-4)
     assert cost.costs(row)[0] < 1e-8
 
 
 @pytest.mark.thorough
-def test_it_is_said_and_refused_where_there_is_no_speed() -> None:
+def test_fitted_start_speeds_are_reported_and_need_second_order() -> None:
     table = pairs(number=4, seconds=12.0)
     table.loc[table.time == 0, "v_follower"] += 0.8
-    own = {"method": "ballistic", "cost": "gap"}  # that the pairs are made with
-    found = nnode.Calibrator("idm", start_speeds="fitted", **own).fit(table)
-    assert found.result_.start_speeds["kind"] == "fitted"
-    assert found.result_.start_speeds["change"] == pytest.approx(0.8, rel=1e-3)
-    assert found.cost_ < 1e-6
-    assert "first speeds of training sequences are fitted" in found.result_.summary()
-    given = nnode.Calibrator("idm", **own).fit(table).result_
+    options = {"method": "ballistic", "cost": "gap"}  # the method of the synthetic pairs
+    fitted = nnode.Calibrator("idm", start_speeds="fitted", **options).fit(table).result_
+    assert fitted.start_speeds["kind"] == "fitted"
+    assert fitted.start_speeds["change"] == pytest.approx(0.8, rel=1e-3)
+    assert fitted.cost < 1e-6
+    assert "first speeds of training sequences are fitted" in fitted.summary()
+    given = nnode.Calibrator("idm", **options).fit(table).result_
     assert given.start_speeds == {"kind": "measured"}
     assert given.cost > 1e-3
     with pytest.raises(ConfigError, match="needs optimizer=gauss_newton"):
@@ -114,7 +110,7 @@ def test_it_is_said_and_refused_where_there_is_no_speed() -> None:
         nnode.Calibrator("lin", optimizer="gauss_newton", start_speeds="fitted").fit(table)
 
 
-def test_parabolas_tell_first_speeds() -> None:
+def test_initial_speeds_from_fitted_parabolas() -> None:
     rng = np.random.default_rng(3)
     t = 0.1 * np.arange(60)
     x = np.stack([3 + 8 * t - 0.5 * t**2, 30 + 10 * t], 1)
@@ -122,25 +118,25 @@ def test_parabolas_tell_first_speeds() -> None:
     np.testing.assert_allclose(exact.velocity()[0, :, 0], [8.0, 10.0], rtol=1e-9)
     np.testing.assert_allclose(exact.velocity()[1:-1, :, 0], np.diff(x, axis=0)[1:] / 0.1)
     assert (exact.x[..., 0] == x).all()
-    away = []
+    errors = []
     for _ in range(300):
         noisy = lane(x + 0.3 * rng.normal(size=x.shape), 0.1, start=5.0)
-        away.append(start_smoothed(noisy).velocity()[0, :, 0] - [8.0, 10.0])
-    # 0.3 m at every 0.1 s over 2 s: 0.43 m/s, where a difference of two samples has 4.2 m/s
-    assert np.std(away) == pytest.approx(0.43, rel=0.15)
+        errors.append(start_smoothed(noisy).velocity()[0, :, 0] - [8.0, 10.0])
+    # 0.3 m at every 0.1 s over 2 s gives 0.43 m/s; a difference of two samples has 4.2 m/s
+    assert np.std(errors) == pytest.approx(0.43, rel=0.15)
     short = lane(x[:3], 0.1, start=5.0)
     assert start_smoothed(short) is short
-    found = nnode.sequences(pairs(number=2, seconds=5.0), data="pairs", start_speeds="smoothed")
-    assert found.manifest["options"]["start_speeds"] == "smoothed"
+    smoothed = nnode.sequences(pairs(number=2, seconds=5.0), data="pairs", start_speeds="smoothed")
+    assert smoothed.manifest["options"]["start_speeds"] == "smoothed"
 
 
-def test_no_fit_of_first_speeds_is_worse_than_the_data_s_own() -> None:
-    """From far parameters first speeds go far, where steps without damping got stuck."""
-    sequences = driven()
+def test_fitted_initial_speeds_are_never_worse_than_given_ones() -> None:
+    """Distant parameters lead to distant first speeds, where undamped steps got stuck."""
+    sequences = helly_pairs()
     row = np.array(list(HELLY.values()))
     batch = collate(sequences)
-    given = ResidualProblem(known(), batch, FusedSolver(), Convention.integral)
-    fitted = fitted_starts(known(), batch, Convention.integral)
+    given = ResidualProblem(helly_model(), batch, FusedSolver(), Convention.integral)
+    fitted = fitted_starts(helly_model(), batch, Convention.integral)
     fitted(row * 3.0)
     fitted(row * 0.2)
     assert (fitted.costs(row) <= given.costs(row) + 1e-9).all()
@@ -149,10 +145,12 @@ def test_no_fit_of_first_speeds_is_worse_than_the_data_s_own() -> None:
 IDM = SimpleNamespace(v0=30.0, T=1.4, s0=2.0, a=1.2, b=1.5)
 
 
-def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
-    """Platoons of four by idm with the parameters :data:`IDM`, Heun's method at 0.02 s, behind
-    leaders of many speeds, with noise that is new at every 0.1 s."""
-    rng, h, found = np.random.default_rng(seed), 0.02, []
+def noisy(sigma: float) -> list[Sequence]:
+    """Platoons of four with the parameters :data:`IDM` behind leaders of varying speeds.
+
+    Heun's method with steps of 0.02 s; white noise at every 0.1 s.
+    """
+    rng, h, sequences = np.random.default_rng(1), 0.02, []
     for number in range(8):
         t = h * np.arange(2001)
         # m/s, 6 to 34, accelerations up to 1.5 m/s²
@@ -160,9 +158,9 @@ def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
         lead = 20 + sum(size * np.sin(w * t + p) for size, w, p in parts)
         place = np.concatenate([[0.0], np.cumsum((lead[1:] + lead[:-1]) / 2 * h)])
 
-        def rate(x: np.ndarray, v: np.ndarray, ahead: float, pace: float) -> np.ndarray:
-            before, speed = np.append(x[1:], ahead), np.append(v[1:], pace)
-            return np.asarray(idm(before - x - 4.5, v, speed, IDM))
+        def rate(x: np.ndarray, v: np.ndarray, lead_x: float, lead_v: float) -> np.ndarray:
+            x_ahead, v_ahead = np.append(x[1:], lead_x), np.append(v[1:], lead_v)
+            return np.asarray(idm(x_ahead - x - 4.5, v, v_ahead, IDM))
 
         v = np.full(3, lead[0]) + rng.normal(size=3)
         x = -np.cumsum(4.5 + (2 + 1.4 * v[::-1]) * rng.uniform(0.8, 1.6, 3))[::-1]
@@ -172,17 +170,20 @@ def noisy(sigma: float, seed: int = 1) -> list[Sequence]:
                 path[k // 5] = [*x, place[k]]
             if k < 2000:
                 a = rate(x, v, place[k], lead[k])
-                then = rate(x + h * v, v + h * a, place[k + 1], lead[k + 1])
-                x, v = x + h * v + h**2 / 2 * a, v + h / 2 * (a + then)
+                a_next = rate(x + h * v, v + h * a, place[k + 1], lead[k + 1])
+                x, v = x + h * v + h**2 / 2 * a, v + h / 2 * (a + a_next)
         path += sigma * rng.normal(size=path.shape)
-        found.append(lane(path, 0.1, name=f"r{number}/0", length=4.5))
-    return found
+        sequences.append(lane(path, 0.1, name=f"r{number}/0", length=4.5))
+    return sequences
 
 
 @pytest.mark.thorough
-def test_costs_do_not_rise_from_one_step_of_the_training_loop_to_the_next() -> None:
-    """The loop attaches a new copy of the batch before each step. The law of Krauss is a map whose
-    cost has several minima over the first speeds, so the search has to go on from the last ones."""
+def test_costs_decrease_in_each_step_of_the_training_loop() -> None:
+    """The loop attaches a new copy of the batch before each step.
+
+    The cost of Krauss' law has several minima over the first speeds, so each search has to start
+    at the speeds of the previous one.
+    """
     batch = collate([replace(s, time=s.time[:81], x=s.x[:81]) for s in noisy(0.05)[:4]])
     system, costs = EVERY["krauss"].system(), []
     optimizer = GaussNewton(system)
@@ -194,21 +195,19 @@ def test_costs_do_not_rise_from_one_step_of_the_training_loop_to_the_next() -> N
 
 
 @pytest.mark.thorough
-def test_noise_of_0_3_m_does_not_bias_what_is_fitted_by_default() -> None:
-    table = noisy(0.3)
-    wanted = vars(IDM)
+def test_default_fits_are_unbiased_by_noise_of_0_3_m() -> None:
+    sequences = noisy(0.3)
+    options = {"leader": "measured", "method": "rk4"}
     for drivers, kind in ((None, "fitted to each driver"), ("none", "fitted")):
-        own = nnode.Calibrator("idm", leader="measured", method="rk4", drivers=drivers).fit(table)
-        estimate = own.parameters_["estimate"]
-        for name, value in wanted.items():
+        fitted = nnode.Calibrator("idm", drivers=drivers, **options).fit(sequences)
+        estimate = fitted.parameters_["estimate"]
+        for name, value in vars(IDM).items():
             assert estimate[f"idm.{name}"] == pytest.approx(value, rel=0.1), (name, kind)
-        assert own.result_.noise.position == pytest.approx(0.3, rel=0.1)
-        assert own.result_.start_speeds["kind"] == kind
-        assert "speeds are those of smoothed paths" in own.result_.summary()
-    given = [replace(s, v=np.maximum(s.velocity(), 0.0)) for s in table]
-    raw = nnode.Calibrator(
-        "idm", leader="measured", method="rk4", start_speeds="given", drivers="none"
-    ).fit(given)
-    away = raw.parameters_["estimate"] / np.array(list(wanted.values())) - 1
-    assert away.abs().max() > 0.1
+        assert fitted.result_.noise.position == pytest.approx(0.3, rel=0.1)
+        assert fitted.result_.start_speeds["kind"] == kind
+        assert "speeds are those of smoothed paths" in fitted.result_.summary()
+    given = [replace(s, v=np.maximum(s.velocity(), 0.0)) for s in sequences]
+    raw = nnode.Calibrator("idm", start_speeds="given", drivers="none", **options).fit(given)
+    bias = raw.parameters_["estimate"] / np.array(list(vars(IDM).values())) - 1
+    assert bias.abs().max() > 0.1
     assert "estimates are biased" in raw.result_.summary()

@@ -1,4 +1,4 @@
-"""What the processes of ``test_distributed.py`` do: ``torchrun together.py STORE FOLDER``."""
+"""The processes of ``test_distributed.py``: ``torchrun together.py STORE FOLDER``."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ N4 = {
 }
 LIN = {"term": "lin", "name": "lin", "leader": "constant", "v0": 30.0, "L": 5.0, "L_min": 2.0}
 
-#: name: model, optimiser, sequences per mini-batch, epochs. Of five sequences, mini-batches of
-#: two leave an uneven rest, and of one nothing for the second process.
+#: Model, optimiser, sequences per mini-batch and epochs of each case. With five sequences, the last
+#: mini-batch of two is incomplete; mini-batches of one leave the second process without data.
 CASES: dict[str, tuple[dict[str, Any], OptimizerOptions, int, int]] = {
     "adadelta": (N4, AdadeltaOptions(), 2, 3),
     "single": (N4, AdadeltaOptions(eta1=0.1), 1, 2),
@@ -60,10 +60,7 @@ def trainer_of(
     solver: Solver | None = None,
     **settings: Any,
 ) -> Trainer:
-    """A trainer in a folder, with this process's share of the data; all randomness from its seed.
-
-    Five sequences are trained, two are held out.
-    """
+    """A trainer with this process's share of five training and two held-out sequences."""
     world, model = World(), build_model(options, seed)
 
     def loader(indices: range, size: int) -> Any:
@@ -100,7 +97,7 @@ def make_trainer(case: str, store: Store, folder: Path) -> Trainer:
 
 
 def numbers(trainer: Trainer) -> dict[str, Any]:
-    """Where a training has ended."""
+    """Parameters and history at the end of a calibration."""
     flat = torch.cat([p.detach().flatten() for p in trainer.model.parameters()])
     return {
         "parameters": flat.tolist(),
@@ -112,7 +109,7 @@ def numbers(trainer: Trainer) -> dict[str, Any]:
 
 
 def failing(store: Store, folder: Path) -> str:
-    """The message in this process when the simulation fails in the last process only."""
+    """The error message in this process if the simulation fails in the last process only."""
     trainer = make_trainer("adadelta", store, folder)
     solve = trainer.solver
 
@@ -130,16 +127,16 @@ def failing(store: Store, folder: Path) -> str:
 
 
 def interrupted(store: Store, folder: Path) -> list[int]:
-    """Step and signal at the end, when only the last process is asked to stop in step 4."""
+    """Step and signal at the end if only the last process gets a signal in step 4."""
     trainer = make_trainer("adadelta", store, folder)
     descend = trainer._descend
 
-    def ask(batch: Any) -> None:
+    def signalled(batch: Any) -> None:
         descend(batch)
         if trainer.step == 3 and World().rank == World().size - 1:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    trainer._descend = ask  # type: ignore[method-assign]
+    trainer._descend = signalled
     try:
         trainer.fit()
     except Interrupted as stop:
@@ -151,12 +148,12 @@ if __name__ == "__main__":
     torch.set_num_threads(1)
     join()
     prepared, out = Store(Path(sys.argv[1])), Path(sys.argv[2])
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name in CASES:
         fitted = make_trainer(name, prepared, out / name)
         fitted.fit()
-        found[name] = numbers(fitted)
-    found["failing"] = failing(prepared, out / "failing")
-    found["interrupted"] = interrupted(prepared, out / "interrupted")
-    (out / f"process_{World().rank}.json").write_text(json.dumps(found))
+        results[name] = numbers(fitted)
+    results["failing"] = failing(prepared, out / "failing")
+    results["interrupted"] = interrupted(prepared, out / "interrupted")
+    (out / f"process_{World().rank}.json").write_text(json.dumps(results))
     World().leave()

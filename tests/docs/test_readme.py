@@ -1,4 +1,4 @@
-"""What the README says can be typed."""
+"""Commands, links and examples of the README and the documentation."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ PAGES = [
     *sorted((ROOT / "docs" / "tutorials").glob("*")),
 ]
 
-#: Choices that a page lets its reader make first.
-MADE = {"model=lin_with_speed_zone", "data=i80"}
+#: Options that exist only after earlier steps of a page.
+LOCAL = {"model=lin_with_speed_zone", "data=i80"}
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
-def test_every_command_has_options_that_exist(page: Path) -> None:
+def test_options_of_commands_exist(page: Path) -> None:
     for language, text in blocks(page):
         for command in examples(text) if language == "sh" else []:
-            if "…" not in command and not MADE & set(command):
+            if "…" not in command and not LOCAL & set(command):
                 composed(*command)
 
 
-def test_every_link_leads_somewhere() -> None:
+def test_links_exist() -> None:
     links = re.findall(r"\]\(([^)#]+)", README.read_text())
     assert len(links) > 10
     for link in links:
@@ -43,41 +43,41 @@ def test_every_link_leads_somewhere() -> None:
 
 
 @pytest.mark.thorough
-def test_your_own_data_in_python(tmp_path: Path) -> None:
+def test_python_example_with_own_data(tmp_path: Path) -> None:
     text = "".join(t for lang, t in blocks(README) if lang == "python" and "mine.csv" in t)
     drives = as_table(platoons(number=6, seconds=8.0)).drop(columns="recording")
     names = {"sequence": "platoon", "time": "t", "agent": "car", "x": "pos"}
     drives.rename(columns=names).to_csv(tmp_path / "mine.csv", index=False)
-    said = in_a_folder(text, tmp_path)
-    assert re.search(r" Log-likelihood +-?\d", said, re.M)
-    assert re.search(r"^v0 +\d+(\.\d+)? .* m/s$", said, re.M)
+    output = run_code(text, tmp_path)
+    assert re.search(r" Log-likelihood +-?\d", output, re.M)
+    assert re.search(r"^v0 +\d+(\.\d+)? .* m/s$", output, re.M)
     for name in ("law.png", "map.png"):
         assert (tmp_path / name).stat().st_size > 10_000
     assert (tmp_path / "runs" / "mine" / "report.html").is_file()
 
 
 @pytest.mark.thorough
-def test_the_lines_with_scikit_learn(tmp_path: Path) -> None:
+def test_scikit_learn_example(tmp_path: Path) -> None:
     pytest.importorskip("sklearn")
     (text,) = (t for lang, t in blocks(README) if lang == "python" and "cross_val_score" in t)
     table(platoons=8, seconds=10.0).to_csv(tmp_path / "platoons.csv", index=False)
     script = f"{text}\nassert len(simulated) == 8 * 101 * 3\nprint(list(idm.parameters_))"
-    said = in_a_folder(script, tmp_path)
-    assert re.search(r"^idm.T +1\.\d+ +1\.\d+ +1\.\d+ +s *$", said, re.M)
-    assert "['estimate', 'lower', 'upper', 'unit'" in said
-    scores = re.findall(r"-\d+\.\d+", said.partition("\n[")[2].partition("]")[0])
+    output = run_code(script, tmp_path)
+    assert re.search(r"^idm.T +1\.\d+ +1\.\d+ +1\.\d+ +s *$", output, re.M)
+    assert "['estimate', 'lower', 'upper', 'unit'" in output
+    scores = re.findall(r"-\d+\.\d+", output.partition("\n[")[2].partition("]")[0])
     assert len(scores) == 4
     chain = re.search(r"`(nnode\.Calibrator\(.*?\.score\(table\))`", README.read_text())
     assert chain is not None
     code = (
         f"import nnode\nimport pandas as pd\ntable = pd.read_csv('platoons.csv')\nprint({chain[1]})"
     )
-    assert -1 < float(in_a_folder(code, tmp_path)) < 0
+    assert -1 < float(run_code(code, tmp_path)) < 0
 
 
-def in_a_folder(code: str, folder: Path) -> str:
-    """What code prints."""
-    done = subprocess.run(
+def run_code(code: str, folder: Path) -> str:
+    """The output of code that runs in a folder."""
+    result = subprocess.run(
         [sys.executable, "-c", code],
         cwd=folder,
         capture_output=True,
@@ -85,5 +85,5 @@ def in_a_folder(code: str, folder: Path) -> str:
         check=False,
         env={"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": ""},
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert result.returncode == 0, result.stderr
+    return result.stdout

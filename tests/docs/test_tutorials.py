@@ -1,4 +1,4 @@
-"""Every block of code of the tutorials runs, in its order, in a folder of its own."""
+"""The code of each tutorial runs in a separate folder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TUTORIALS = ROOT / "docs" / "tutorials"
 #: Tutorials that calibrate the real recordings.
 REAL = {"esimas", "juelich", "own_term", "cluster"}
 
-#: Runs blocks one after the other; those in Python share their names.
+#: Runs blocks in their order; Python blocks share a namespace.
 DRIVER = """
 import subprocess, sys
 from pathlib import Path
@@ -33,9 +33,8 @@ for path in sys.argv[1:]:
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:
-    """Language and text of the blocks that a reader would run."""
-    found = re.findall(r"^```(python|sh)\n(.*?)^```", page.read_text(), re.M | re.S)
-    return [(str(language), str(text)) for language, text in found]
+    """Language and text of each code block."""
+    return re.findall(r"^```(python|sh)\n(.*?)^```", page.read_text(), re.M | re.S)
 
 
 def names() -> list[str]:
@@ -44,7 +43,7 @@ def names() -> list[str]:
 
 @pytest.mark.tutorial
 @pytest.mark.parametrize("name", names())
-def test_a_tutorial_does_what_it_says(name: str, tmp_path: Path) -> None:
+def test_tutorial_runs(name: str, tmp_path: Path) -> None:
     if name in REAL and not os.environ.get("NNODE_DATA"):
         pytest.skip("real recordings absent: set NNODE_DATA to a folder with esimas/ and juelich/")
     for folder in ("conf", "scripts"):
@@ -74,7 +73,7 @@ def test_a_tutorial_does_what_it_says(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.tutorial
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+def test_site_builds_without_warnings(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs")
     pytest.importorskip("material")
     done = subprocess.run(
@@ -86,11 +85,11 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr[-3000:]
     page = (tmp_path / "site" / "index.html").read_text()
-    # it must work without a network
+    # the site works offline
     assert not re.findall(r'(?:src|href)="(?:https?:)?//[^"]+\.(?:js|css|woff2?)', page)
 
 
-def test_every_tutorial_stands_in_the_table_of_contents() -> None:
+def test_tutorials_are_in_the_table_of_contents() -> None:
     contents = (ROOT / "mkdocs.yml").read_text()
     missing = [name for name in names() if f"tutorials/{name}.md" not in contents]
     assert not missing

@@ -1,4 +1,4 @@
-"""Platoons in lanes of their own, simulated by SUMO."""
+"""Platoons on separate roads, simulated by SUMO."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ import numpy as np
 
 from benchmarks.programs.sumo import call, network
 
-#: Of SUMO's passenger car: its own length and gap at rest, m, the time that drivers keep, s, and
-#: their comfortable braking, m/s².
+#: SUMO's passenger car: length and gap at rest (m), time gap (s), comfortable deceleration (m/s²).
 LENGTH, MIN_GAP, TAU, DECEL = 5.0, 2.5, 1.0, 4.5
-#: Speeds between which leaders choose anew every PERIOD s, m/s.
+#: Bounds of leaders' random speeds (m/s), and the time between changes (s).
 SLOW, FAST, PERIOD = 10.0, 18.0, 5.0
-#: Length of a road, m, and SUMO's step, s.
+#: Length of a road (m) and SUMO's step (s).
 ROAD, STEP = 3000.0, 0.2
 
 
@@ -33,20 +32,19 @@ def platoons(
     seed: int = 0,
     steer: Callable[[ModuleType], None] | None = None,
 ) -> Path:
-    """SUMO's floating car data of platoons under its own car-following model, Krauss' with noise.
+    """SUMO's floating car data of platoons with its default law, that of Krauss with noise.
 
-    Every platoon has a road of its own. Its leader drives as fast as a variable speed sign says;
-    the others, who may drive at twice the limit, are only bound by whom they follow.
+    Leaders follow variable speed signs. Followers may drive at twice the speed limit.
 
     Args:
-        home: SUMO's folder.
-        folder: receives its files.
-        spread: the platoons start within so many metres.
-        steer: is called before every step with SUMO's interface for Python.
+        home: the folder of SUMO.
+        folder: receives the files.
+        spread: range of the platoons' starting positions, m.
+        steer: is called before every step with SUMO's Python interface.
     """
     rng = np.random.default_rng(seed)
     road = _roads(home, folder, number)
-    signs, cars_of = [], []
+    signs, vehicles = [], []
     for k in range(number):
         speeds = rng.uniform(SLOW, FAST, int(seconds / PERIOD) + 1)
         steps = "".join(
@@ -55,7 +53,7 @@ def platoons(
         signs.append(f'<variableSpeedSign id="s{k}" lanes="e{k}_0">{steps}</variableSpeedSign>')
         x = 50.0 + 40.0 * cars + rng.uniform(0, spread)
         for i in range(cars):
-            cars_of.append(
+            vehicles.append(
                 f'<vehicle id="p{k}-{i}" type="{"own" if i else "lead"}" route="r{k}" depart="0" '
                 f'departPos="{x:.2f}" departSpeed="{speeds[0]:.2f}"/>'
             )
@@ -67,24 +65,13 @@ def platoons(
         f'tau="{TAU}" decel="{DECEL}"/>'
     )
     (folder / "a.add.xml").write_text(f"<additional>{types}{''.join(signs)}</additional>")
-    (folder / "a.rou.xml").write_text(f"<routes>{routes}{''.join(cars_of)}</routes>")
+    (folder / "a.rou.xml").write_text(f"<routes>{routes}{''.join(vehicles)}</routes>")
     command = [
         home / "bin" / "sumo",
-        "-n",
-        road,
-        "-a",
-        folder / "a.add.xml",
-        "-r",
-        folder / "a.rou.xml",
-        "--step-length",
-        STEP,
-        "--seed",
-        seed,
-        "--fcd-output",
-        folder / "fcd.xml.gz",
-        "--fcd-output.attributes",
-        "id,type,pos,lane",
-        "--no-step-log",
+        *("-n", road, "-a", folder / "a.add.xml", "-r", folder / "a.rou.xml"),
+        *("--step-length", STEP, "--seed", seed, "--no-step-log"),
+        *("--fcd-output", folder / "fcd.xml.gz"),
+        *("--fcd-output.attributes", "id,type,pos,lane"),
     ]
     if steer is None:
         call(*command, "--end", seconds + STEP)
@@ -96,7 +83,7 @@ def platoons(
 def configured(
     folder: Path, *, step: float = 0.1, end: float | None = None, ballistic: bool = False
 ) -> Path:
-    """SUMO's configuration of ``a.net.xml`` and ``a.rou.xml`` in a folder."""
+    """SUMO's configuration for ``a.net.xml`` and ``a.rou.xml`` in a folder."""
     limit = "" if end is None else f'<end value="{end}"/>'
     path = folder / "a.sumocfg"
     path.write_text(
@@ -109,19 +96,15 @@ def configured(
 
 
 def measured(path: Path, error: float, seed: int = 0) -> Path:
-    """The same positions, each with a normal error of ``error`` m, as a camera would have them."""
+    """The trajectories with normal errors of ``error`` m in positions."""
     rng = np.random.default_rng(seed)
-    with gzip.open(path, "rt") as file:
-        text = file.read()
+    text = re.sub(
+        r' pos="([^"]+)"',
+        lambda m: f' pos="{float(m[1]) + error * rng.standard_normal():.3f}"',
+        gzip.decompress(path.read_bytes()).decode(),
+    )
     result = path.with_name("measured.xml.gz")
-    with gzip.open(result, "wt") as file:
-        file.write(
-            re.sub(
-                r' pos="([^"]+)"',
-                lambda m: f' pos="{float(m[1]) + error * rng.standard_normal():.3f}"',
-                text,
-            )
-        )
+    result.write_bytes(gzip.compress(text.encode()))
     return result
 
 

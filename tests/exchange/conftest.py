@@ -1,4 +1,4 @@
-"""The neighbouring programs; what needs one that is not installed is skipped."""
+"""SUMO and JuPedSim; tests that need a program that is not installed are skipped."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from types import ModuleType
 
 import pytest
 
+from tests.app.conftest import forks, script  # noqa: F401
+
 
 @pytest.fixture(scope="session")
 def jupedsim() -> ModuleType:
@@ -18,14 +20,14 @@ def jupedsim() -> ModuleType:
 
 @pytest.fixture(scope="session")
 def sumo() -> Path:
-    """SUMO's folder."""
+    """The folder of SUMO."""
     return Path(pytest.importorskip("sumo").SUMO_HOME)
 
 
 @pytest.fixture(scope="session")
 def program(sumo: Path) -> str:
-    """How SUMO is run: ``libsumo`` where it is installed, else ``traci``, which comes with it."""
+    """The interface to SUMO: ``libsumo`` if it is installed, otherwise ``traci``."""
     tools = str(sumo / "tools")
     if tools not in sys.path:
-        sys.path.append(tools)  # libsumo imports what stands there
+        sys.path.append(tools)  # libsumo imports modules from this folder
     return "libsumo" if importlib.util.find_spec("libsumo") else "traci"

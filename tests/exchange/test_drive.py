@@ -1,7 +1,7 @@
-"""Laws drive SUMO's vehicles: on one scene SUMO and the compiled simulation go the same ways.
+"""Laws drive SUMO's vehicles: SUMO's paths equal those of the compiled simulation.
 
-SUMO writes nine decimals: first states and a leader are off by 5e-10 m at most, and a law that
-forgets keeps it so. What is more has its reason in the test that allows it.
+SUMO writes nine decimals. The rounding error of initial states and leaders is at most 5e-10 m, and
+stable laws do not amplify it. Larger tolerances are explained in their tests.
 """
 
 from __future__ import annotations
@@ -29,20 +29,18 @@ from nnode.model import System, build_model
 from nnode.simulation import FusedSolver
 from tests.exchange.by_sumo import configured
 
-#: m: rounding of what SUMO writes, on both sides.
+#: Rounding error of SUMO's output (m), on both sides.
 ROUNDED = 1e-9
-#: What is asked of every law, m.
-CENTIMETRE = 0.01
 LIN = {"v0": 15.0, "L": 9.0}
 
 
-def model(what: str | Mapping[str, Any], *effects: dict[str, Any], **values: float) -> System:
-    """A model with effects, its law's parameters as given."""
-    options = {**model_options(what, "measured"), "effects": list(effects)}
+def model(name: str | Mapping[str, Any], *effects: dict[str, Any], **values: float) -> System:
+    """A model with effects and values of the law's parameters."""
+    options = {**model_options(name, "measured"), "effects": list(effects)}
     result = build_model(options).double()
     with torch.no_grad():
-        for name, value in values.items():
-            getattr(result.terms[0], name).fill_(value)
+        for parameter, value in values.items():
+            getattr(result.terms[0], parameter).fill_(value)
     return result
 
 
@@ -60,7 +58,7 @@ def scenario(
 
 
 def led(profile: np.ndarray) -> Any:
-    """Lets the leader drive as fast as a profile says."""
+    """A function that sets the leader's speed from a profile."""
 
     def steer(sumo: RunningSumo) -> None:
         if "c0" in sumo.vehicles:
@@ -81,7 +79,7 @@ def driven(
     profile: np.ndarray = by_sumo.PROFILE,
     **options: Any,
 ) -> tuple[Drive, Sequence]:
-    """What came of it, and what SUMO wrote, with the lengths that it does not write."""
+    """The drive and SUMO's trajectories; vehicle lengths are added to the latter."""
     path = scenario(sumo, folder, ballistic=ballistic, speed=float(profile[0, 1]))
     result = drive(
         system, path, ["own"], folder / "out", program=program, steer=led(profile), **options
@@ -90,8 +88,8 @@ def driven(
     return result, replace(observed, length=np.full(observed.n_agents, by_sumo.LENGTH))
 
 
-def apart(system: System, observed: Sequence, method: str) -> float:
-    """The largest distance of a vehicle in SUMO from where the compiled simulation has it, m."""
+def largest_distance(system: System, observed: Sequence, method: str) -> float:
+    """The largest distance (m) between vehicles in SUMO and in the compiled simulation."""
     batch = collate([observed])
     assert batch.n_samples == round(by_sumo.SECONDS / by_sumo.STEP) + 1
     with torch.no_grad():
@@ -99,28 +97,27 @@ def apart(system: System, observed: Sequence, method: str) -> float:
     return float((path.x - batch.x).abs().max())
 
 
-def test_idm_in_euler_s_steps(sumo: Path, program: str, tmp_path: Path) -> None:
+def test_idm_with_euler_steps(sumo: Path, program: str, tmp_path: Path) -> None:
     system = model("idm")
     result, observed = driven(system, sumo, program, tmp_path)
-    assert apart(system, observed, "semi_implicit") < ROUNDED
+    assert largest_distance(system, observed, "semi_implicit") < ROUNDED
     assert observed.v is not None
-    assert observed.v.min() == 0  # they stop, and nobody drives backwards
+    assert observed.v.min() == 0  # vehicles stop and do not reverse
     assert (result.driven, result.steps, result.collisions, result.teleports) == (7, 601, 0, 0)
     assert result.stranded == 0
     assert result.mean_speed == pytest.approx(observed.v[:, :-1].mean(), rel=0.01)
 
 
-def test_idm_in_ballistic_steps(sumo: Path, program: str, tmp_path: Path) -> None:
-    # a step that ends at rest is v²/(2|a|) long here, v dt/2 in SUMO, which only knows a speed of
-    # 0: at most a dt²/8 less, 2 mm with idm's b of 1.7 m/s²; each of seven stops behind another
+def test_idm_with_ballistic_steps(sumo: Path, program: str, tmp_path: Path) -> None:
+    # A step that ends at rest has the length v²/(2|a|) here and v dt/2 in SUMO. The difference is
+    # at most b dt²/8 = 2 mm for b = 1.7 m/s², and it adds up over seven vehicles.
     system = model("idm")
     _, observed = driven(system, sumo, program, tmp_path, ballistic=True)
-    assert ROUNDED < apart(system, observed, "ballistic") < 7 * 1.7 * 0.1**2 / 8 < 1.5 * CENTIMETRE
-    assert apart(system, observed, "ballistic") < CENTIMETRE
+    assert ROUNDED < largest_distance(system, observed, "ballistic") < 0.01
 
 
 @pytest.mark.thorough
-def test_both_ways_to_run_sumo_are_the_same(sumo: Path, tmp_path: Path) -> None:
+def test_libsumo_and_traci_agree(sumo: Path, tmp_path: Path) -> None:
     pytest.importorskip("libsumo")
     observed = [
         driven(model("idm"), sumo, program, tmp_path / program)[1]
@@ -152,7 +149,7 @@ SECOND_ORDER = {
 
 
 def network(name: str, *layers: tuple[list[list[float]], list[float]]) -> System:
-    """A model with a network of these weights and biases."""
+    """A network model with given weights and biases."""
     system = model(name)
     with torch.no_grad():
         for layer, (weight, bias) in zip(system.terms[0].network.layers, layers, strict=True):
@@ -177,14 +174,14 @@ def case(
     make: Callable[[], System],
     method: str,
     *marks: Any,
-    off: float = ROUNDED,
-    **how: Any,
+    tolerance: float = ROUNDED,
+    **scene: Any,
 ) -> Any:
-    return pytest.param(make, method, how, off, id=name, marks=marks)
+    return pytest.param(make, method, scene, tolerance, id=name, marks=marks)
 
 
 @pytest.mark.parametrize(
-    ("make", "method", "how", "off"),
+    ("make", "method", "scene", "tolerance"),
     [
         *(
             case(
@@ -202,7 +199,7 @@ def case(
                 f"idm {name}",
                 partial(model, "idm", {name: values}),
                 "semi_implicit",
-                off=2 * ROUNDED,
+                tolerance=2 * ROUNDED,
             )
             for name, values in SECOND_ORDER.items()
         ),
@@ -210,7 +207,7 @@ def case(
             case(name, partial(model, name), "semi_implicit", pytest.mark.thorough, far=200.0)
             for name in ("krauss", "gipps", "newell")
         ),
-        # it brakes by v/dt at most, so that no step ends at rest
+        # this law brakes by at most v/dt, so that no step ends at rest
         case(
             "own",
             partial(model, {"term": "formula", "name": "own", "law": LAWS["sumo_idm"]}),
@@ -221,22 +218,22 @@ def case(
         case("n4", SPEEDS, "euler", profile=SLOWLY, far=100.0),
     ],
 )
-def test_paths_are_those_of_the_compiled_simulation(
+def test_sumo_agrees_with_the_compiled_simulation(
     sumo: Path,
     program: str,
     tmp_path: Path,
     make: Callable[[], System],
     method: str,
-    how: dict[str, Any],
-    off: float,
+    scene: dict[str, Any],
+    tolerance: float,
 ) -> None:
     system = make()
-    _, observed = driven(system, sumo, program, tmp_path, ballistic=method == "ballistic", **how)
-    assert apart(system, observed, method) < off
+    _, observed = driven(system, sumo, program, tmp_path, ballistic=method == "ballistic", **scene)
+    assert largest_distance(system, observed, method) < tolerance
 
 
 def two_edges(home: Path, folder: Path, *, length: int, lanes: int, speed: int) -> None:
-    """A road of two edges of a length, m: two lanes, then so many."""
+    """A road of two edges: the first has two lanes, the second ``lanes``."""
     nodes = (
         f'<node id="a" x="0" y="0"/><node id="b" x="{length}" y="0"/>'
         f'<node id="c" x="{2 * length}" y="0"/>'
@@ -248,9 +245,18 @@ def two_edges(home: Path, folder: Path, *, length: int, lanes: int, speed: int) 
     by_sumo.network(home, folder, nodes, edges)
 
 
+def with_and_without_lane_changes(system: System, program: str, path: Path) -> list[Drive]:
+    return [
+        drive(
+            system, path, ["own"], path.parent / str(allowed), program=program, lane_changes=allowed
+        )
+        for allowed in (True, False)
+    ]
+
+
 @pytest.mark.thorough
-def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path: Path) -> None:
-    """Two lanes over two edges, a slow vehicle that is overtaken, a flow that leaves at the end."""
+def test_vehicles_enter_leave_and_overtake(sumo: Path, program: str, tmp_path: Path) -> None:
+    """A flow of vehicles behind a slow vehicle on a road with two lanes."""
     two_edges(sumo, tmp_path, length=400, lanes=2, speed=30)
     (tmp_path / "a.rou.xml").write_text(
         '<routes><vType id="own" speedDev="0"/><vType id="slow" maxSpeed="6" sigma="0"/>'
@@ -258,27 +264,21 @@ def test_vehicles_come_go_and_change_leaders(sumo: Path, program: str, tmp_path:
         '<flow id="q" type="own" route="r" begin="1" end="40" period="4" departLane="0" '
         'departSpeed="8"/></routes>'
     )
-    path = configured(tmp_path)
-    stays, changes = (
-        drive(
-            model("idm", {"pure_delay": {"T": 0.3}}),
-            path,
-            ["own"],
-            tmp_path / str(free),
-            program=program,
-            lane_changes=free,
-        )
-        for free in (False, True)
+    system = model("idm", {"pure_delay": {"T": 0.3}})
+    overtaking, following = results = with_and_without_lane_changes(
+        system, program, configured(tmp_path)
     )
-    for result in (stays, changes):
+    for result in results:
         assert (result.driven, result.collisions, result.teleports) == (10, 0, 0)
-    assert stays.mean_speed is not None
-    assert changes.mean_speed is not None
-    # who may not change lanes goes on behind 6 m/s
-    assert stays.mean_speed < 8 < 10 < changes.mean_speed
+    assert following.mean_speed is not None
+    assert overtaking.mean_speed is not None
+    # without lane changes, vehicles follow the slow one at 6 m/s
+    assert following.mean_speed < 8 < 10 < overtaking.mean_speed
 
 
-def test_who_stands_where_a_lane_does_not_lead_on(sumo: Path, program: str, tmp_path: Path) -> None:
+def test_vehicles_at_the_end_of_a_lane_are_stranded(
+    sumo: Path, program: str, tmp_path: Path
+) -> None:
     two_edges(sumo, tmp_path, length=200, lanes=1, speed=20)
     (tmp_path / "a.rou.xml").write_text(
         '<routes><vType id="own"/><route id="r" edges="e f"/>'
@@ -288,57 +288,45 @@ def test_who_stands_where_a_lane_does_not_lead_on(sumo: Path, program: str, tmp_
         + "</routes>"
     )
     path = configured(tmp_path, end=60.0)
-    stays, changes = (
-        drive(model("idm"), path, ["own"], tmp_path / str(free), program=program, lane_changes=free)
-        for free in (False, True)
-    )
-    assert (stays.driven, stays.stranded, stays.steps) == (2, 1, 600)
-    assert changes.driven == 2
-    assert changes.steps < 400  # all have arrived
+    changing, staying = with_and_without_lane_changes(model("idm"), program, path)
+    assert (staying.driven, staying.stranded, staying.steps) == (2, 1, 600)
+    assert changing.driven == 2
+    assert changing.steps < 400  # all vehicles have arrived
 
 
-def test_a_scenario_with_other_steps_is_refused(sumo: Path, program: str, tmp_path: Path) -> None:
+def test_scenario_with_other_steps_is_refused(sumo: Path, program: str, tmp_path: Path) -> None:
     path = scenario(sumo, tmp_path, step=0.5)
-    expected = Steps(0.1, "ballistic")
+    steps = Steps(0.1, "ballistic")
+    start = partial(drive, model("idm"), path, ["own"], tmp_path, program=program, expected=steps)
     with pytest.raises(
         ConfigError, match=r"semi_implicit steps of 0\.5 s.*ballistic steps of 0\.1"
     ):
-        drive(model("idm"), path, ["own"], tmp_path, program=program, expected=expected)
-    result = drive(
-        model("idm"),
-        path,
-        ["own"],
-        tmp_path,
-        program=program,
-        expected=expected,
-        forced_steps=expected,
-        end=5.0,
-    )
+        start()
+    result = start(forced_steps=steps, end=5.0)
     assert (result.step, result.method, result.steps) == (0.1, "ballistic", 50)
 
 
-def test_speeds_and_ballistic_steps_do_not_go_together(
-    sumo: Path, program: str, tmp_path: Path
-) -> None:
+def test_first_order_law_refuses_ballistic_steps(sumo: Path, program: str, tmp_path: Path) -> None:
     path = scenario(sumo, tmp_path, ballistic=True)
     with pytest.raises(ConfigError, match=r"step-method\.ballistic.*Euler's steps"):
         drive(model("lin"), path, ["own"], tmp_path, program=program)
 
 
-def test_what_a_scenario_does_not_have(sumo: Path, program: str, tmp_path: Path) -> None:
+def test_invalid_scenarios_are_refused(sumo: Path, program: str, tmp_path: Path) -> None:
     path = scenario(sumo, tmp_path)
-    with pytest.raises(ConfigError, match=r"vehicles=car is no vehicle type.*lead, own"):
-        drive(model("idm"), path, ["car"], tmp_path, program=program)
-    with pytest.raises(ConfigError, match=r"none\.sumocfg is not there"):
-        drive(model("idm"), tmp_path / "none.sumocfg", ["own"], tmp_path, program=program)
-    with pytest.raises(ConfigError, match=r"a\.net\.xml cannot be loaded by SUMO"):
-        drive(model("idm"), tmp_path / "a.net.xml", ["own"], tmp_path, program=program)
+    for file, vehicles, message in (
+        (path, "car", r"vehicles=car is no vehicle type.*lead, own"),
+        (tmp_path / "none.sumocfg", "own", r"none\.sumocfg is not there"),
+        (tmp_path / "a.net.xml", "own", r"a\.net\.xml cannot be loaded by SUMO"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            drive(model("idm"), file, [vehicles], tmp_path, program=program)
     routes = tmp_path / "a.rou.xml"
     routes.write_text(routes.read_text().replace('id="own"', 'id="own" actionStepLength="1"'))
     with pytest.raises(ConfigError, match="actionStepLength is 1 s"):
         drive(model("idm"), path, ["own"], tmp_path, program=program)
 
 
-def test_an_unknown_program(sumo: Path, tmp_path: Path) -> None:
+def test_unknown_program_is_refused(sumo: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"program=matsim is unknown, .* libsumo, traci"):
         drive(model("idm"), scenario(sumo, tmp_path), ["own"], tmp_path, program="matsim")

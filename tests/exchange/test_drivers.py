@@ -1,4 +1,4 @@
-"""Drivers without a program that moves them: memories, empty roads, and what is refused."""
+"""Drivers without SUMO: speeds, memory, empty roads, and refused models."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nnode.app.python.inputs import model_options
@@ -23,113 +24,108 @@ def model(name: str, *effects: dict[str, Any], leader: str = "measured") -> Syst
 
 
 def observed(
-    v: list[float], gap: list[float], lead: list[int] | None = None, **more: Any
+    v: ArrayLike, gap: ArrayLike, lead: list[int] | None = None, **more: Any
 ) -> DriverInputs:
-    """Vehicles whose leaders, where they are others, drive as fast as they do."""
-    own, far = np.array(v, float), np.full(len(v), np.inf)
-    who = np.full(len(v), -1) if lead is None else np.array(lead)
+    """Vehicles; leaders outside of the list have the speed of their followers."""
+    speed, nobody = np.array(v, float), np.full(len(v), np.inf)
+    leader = np.full(len(v), -1) if lead is None else np.array(lead)
     values = {
-        "v": own,
+        "v": speed,
         "gap": np.array(gap, float),
-        "v_1": np.where(who >= 0, own[who], own),
+        "v_1": np.where(leader >= 0, speed[leader], speed),
         "length_1": np.full(len(v), 5.0),
-        "lead": who,
-        "gap_1": far,
-        "v_2": own,
-        "x": 0 * own,
+        "lead": leader,
+        "gap_1": nobody,
+        "v_2": speed,
+        "x": 0 * speed,
     }
     return DriverInputs(**{**values, **{k: np.array(value, float) for k, value in more.items()}})
 
 
 def idm(v: float, net: float, dv: float) -> float:
-    """Its formula with the values of ``FIELD``, by hand; Treiber, Hennecke & Helbing 2000."""
+    """The IDM of Treiber, Hennecke & Helbing 2000 with the package's default parameters."""
     v0, T, s0, a, b = 30.0, 1.2, 2.0, 1.3, 1.7
-    wish = s0 + max(v * T + v * dv / (2 * np.sqrt(a * b)), 0.0)
-    return a * (1 - (v / v0) ** 4 - (wish / net) ** 2)
+    desired_gap = s0 + max(v * T + v * dv / (2 * np.sqrt(a * b)), 0.0)
+    return a * (1 - (v / v0) ** 4 - (desired_gap / net) ** 2)
 
 
-def test_one_step_of_idm_is_its_formula() -> None:
-    drivers = Drivers(model("idm"), DT, "semi_implicit")
-    drivers.enter([()] * 3)
-    said = drivers.speeds(
-        0.0, observed([12.0, 14.0, 3.0], [25.0, np.inf, 6.0], v_1=[11.0, 0.0, 0.0])
-    )
-    alone = 14 + DT * 1.3 * (1 - (14 / 30) ** 4)
-    np.testing.assert_allclose(said[0], 12 + DT * idm(12.0, 20.0, 1.0), rtol=1e-12)
-    np.testing.assert_allclose(said[1], alone, rtol=1e-9)  # an empty road is 1e9 m long
-    assert 0 <= said[2] < 3.0
+def drivers_of(system: System, number: int, method: str = "euler", **options: Any) -> Drivers:
+    """Drivers who have entered."""
+    drivers = Drivers(system, DT, method, **options)
+    drivers.enter([()] * number)
+    return drivers
 
 
-def test_gaps_from_front_to_front_where_no_lengths_were_known() -> None:
-    drivers = Drivers(model("idm"), DT, "semi_implicit", lengths=False)
-    drivers.enter([()])
-    said = drivers.speeds(0.0, observed([12.0], [25.0]))
-    np.testing.assert_allclose(said, 12 + DT * idm(12.0, 25.0, 0.0), rtol=1e-12)
+def test_one_step_of_idm() -> None:
+    drivers = drivers_of(model("idm"), 3, "semi_implicit")
+    vehicles = observed([12.0, 14.0, 3.0], [25.0, np.inf, 6.0], v_1=[11.0, 0.0, 0.0])
+    speeds = drivers.speeds(0.0, vehicles)
+    free = 14 + DT * 1.3 * (1 - (14 / 30) ** 4)
+    np.testing.assert_allclose(speeds[0], 12 + DT * idm(12.0, 20.0, 1.0), rtol=1e-12)
+    np.testing.assert_allclose(speeds[1], free, rtol=1e-9)  # an empty road is 1e9 m long
+    assert 0 <= speeds[2] < 3.0
 
 
-def test_nobody_drives_backwards() -> None:
-    first, second = Drivers(model("lin"), DT, "euler"), Drivers(model("idm"), DT, "ballistic")
-    for drivers in (first, second):
-        drivers.enter([()])
+def test_gaps_without_lengths_are_front_to_front() -> None:
+    drivers = drivers_of(model("idm"), 1, "semi_implicit", lengths=False)
+    speeds = drivers.speeds(0.0, observed([12.0], [25.0]))
+    np.testing.assert_allclose(speeds, 12 + DT * idm(12.0, 25.0, 0.0), rtol=1e-12)
+
+
+def test_speeds_are_not_negative() -> None:
+    for name, method in (("lin", "euler"), ("idm", "ballistic")):
+        drivers = drivers_of(model(name), 1, method)
         assert drivers.speeds(0.0, observed([0.5], [0.2])) == [0.0]
 
 
-def test_memories_belong_to_drivers() -> None:
-    """With others that come and go, and another leader, somebody's inertia is his own."""
-    effect = {"inertia": {"tau_v": 2.0}}
-    alone, among = (Drivers(model("idm", effect), DT, "semi_implicit") for _ in range(2))
-    alone.enter([()])
-    among.enter([(), ()])
+def test_memory_belongs_to_a_driver() -> None:
+    """Other drivers who come and go do not change a driver's inertia."""
+    inertia = {"inertia": {"tau_v": 2.0}}
+    alone = drivers_of(model("idm", inertia), 1, "semi_implicit")
+    among_others = drivers_of(model("idm", inertia), 2, "semi_implicit")
     v = 10.0
     for k in range(30):
         gap = 30.0 if k < 15 else 12.0  # another vehicle cuts in
         if k == 10:
-            among.keep(np.array([False, True]))
+            among_others.keep(np.array([False, True]))
         if k == 20:
-            among.enter([(), ()])
-        one = alone.speeds(k * DT, observed([v], [gap]))
-        here = 1 if k < 10 else 0
-        others = [8.0] * (len(among) - 1)
-        speeds, gaps = (
-            ([8.0, v], [50.0, gap]) if here else ([v, *others], [gap, *[40.0] * len(others)])
-        )
-        many = among.speeds(k * DT, observed(speeds, gaps))
-        assert many[here] == one[0]
-        v = float(one[0])
-    # and it is one: after 1 s the acceleration is still between those of both gaps
-    assert len(among) == 3
+            among_others.enter([(), ()])
+        index, n = int(k < 10), len(among_others)
+        speeds, gaps = np.full(n, 8.0), np.full(n, 50.0 if k < 10 else 40.0)
+        speeds[index], gaps[index] = v, gap
+        expected = alone.speeds(k * DT, observed([v], [gap]))[0]
+        assert among_others.speeds(k * DT, observed(speeds, gaps))[index] == expected
+        v = float(expected)
+    assert len(among_others) == 3
 
 
-def test_a_delay_begins_where_a_driver_is_taken_over() -> None:
-    drivers = Drivers(model("idm", {"pure_delay": {"T": 0.3}}), DT, "semi_implicit")
-    drivers.enter([()])
-    now = [
+def test_delay_starts_when_a_driver_enters() -> None:
+    drivers = drivers_of(model("idm", {"pure_delay": {"T": 0.3}}), 1, "semi_implicit")
+    speeds = [
         float(drivers.speeds(k * DT, observed([12.0], [gap]))[0])
         for k, gap in enumerate([25.0, 60.0, 60.0, 60.0, 60.0])
     ]
     before, after = (12 + DT * idm(12.0, gap - 5, 0.0) for gap in (25.0, 60.0))
-    np.testing.assert_allclose(now, [before] * 4 + [after], rtol=1e-12)
+    np.testing.assert_allclose(speeds, [before] * 4 + [after], rtol=1e-12)
 
 
-def test_who_looks_at_the_speed_ahead_is_computed_after_it() -> None:
-    """relative_speed: the speed ahead is what the whole model says in the same step."""
+def test_leaders_are_computed_before_followers() -> None:
+    """The effect relative_speed uses the leader's speed in the same step."""
     kappa, v0, L = 0.3, 30.0, 5.0
-    drivers = Drivers(model("lin", {"relative_speed": {"kappa": kappa}}), DT, "euler")
-    drivers.enter([()] * 4)
-    gaps = [20.0, 30.0, 25.0, 40.0]  # 2 follows 0, 0 follows 3, 3 a vehicle of SUMO's, 1 nobody
+    drivers = drivers_of(model("lin", {"relative_speed": {"kappa": kappa}}), 4)
+    gaps = [20.0, 30.0, 25.0, 40.0]  # 2 follows 0, 0 follows 3, 3 a vehicle of SUMO, 1 nobody
     lead = [3, -1, 0, -1]
-    said = drivers.speeds(
-        0.0, observed([9.0] * 4, [20.0, np.inf, 25.0, 40.0], lead, v_1=[9, 9, 9, 7])
-    )
+    vehicles = observed([9.0] * 4, [20.0, np.inf, 25.0, 40.0], lead, v_1=[9, 9, 9, 7])
+    speeds = drivers.speeds(0.0, vehicles)
     law = [v0 - v0 * L / gap for gap in gaps]
     third = law[3] + kappa * (7 - law[3])
     zeroth = law[0] + kappa * (third - law[0])
     second = law[2] + kappa * (zeroth - law[2])
     free = v0 + kappa * (9 - v0)
-    np.testing.assert_allclose(said, [zeroth, free, second, third], rtol=1e-6)
+    np.testing.assert_allclose(speeds, [zeroth, free, second, third], rtol=1e-6)
 
 
-def test_an_order_for_everybody_even_in_a_ring() -> None:
+def test_leaders_first_with_a_ring() -> None:
     groups = leaders_first(np.array([1, 2, -1, 2, 5, 6, 4]))
     assert sorted(np.concatenate(groups)) == list(range(7))
     assert [g.tolist() for g in groups[:3]] == [[2], [1, 3], [0]]
@@ -138,47 +134,42 @@ def test_an_order_for_everybody_even_in_a_ring() -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["lin", "idm", "ovm", "fvdm", "gipps", "krauss"])
-def test_laws_with_a_speed_on_an_empty_road(name: str) -> None:
-    drivers = Drivers(model(name), DT, "semi_implicit")
-    drivers.enter([()])
+def test_speed_on_an_empty_road(name: str) -> None:
+    drivers = drivers_of(model(name), 1, "semi_implicit")
     v = 10.0
     for k in range(3000):
         v = float(drivers.speeds(k * DT, observed([v], [np.inf]))[0])
-    assert v == pytest.approx(30.0, rel=2e-3)  # v0; gipps' approaches it slowly
+    assert v == pytest.approx(30.0, rel=2e-3)  # Gipps' law approaches v0 slowly
 
 
 @pytest.mark.parametrize("name", ["log", "helly", "newell", "n4", "a2"])
-def test_laws_without_one_need_a_distance_that_is_far(name: str) -> None:
+def test_laws_without_free_speed_need_a_distance(name: str) -> None:
     with pytest.raises(ConfigError, match=r"has no speed on an empty road.*far=100"):
         Drivers(model(name), DT, "semi_implicit")
     Drivers(model(name), DT, "semi_implicit", far=100.0)
 
 
-def test_so_do_effects_that_remember_gaps() -> None:
+def test_memory_of_gaps_needs_a_distance() -> None:
     with pytest.raises(ConfigError, match=r"lin with reaction_delay has no speed"):
         Drivers(model("lin", {"reaction_delay": {"T": 0.5}}), DT, "euler")
 
 
-def test_what_is_far_away_is_nobody() -> None:
-    drivers = Drivers(model("helly"), DT, "semi_implicit", far=80.0)
-    drivers.enter([()] * 3)
-    said = drivers.speeds(
-        0.0,
-        observed([9.0] * 3, [np.inf, 81.0, 80.0], v_1=[9.0, 2.0, 9.0], length_1=[0.0, 5.0, 0.0]),
-    )
-    assert said[0] == said[1] == said[2]
+def test_distant_leaders_are_ignored() -> None:
+    drivers = drivers_of(model("helly"), 3, "semi_implicit", far=80.0)
+    leaders = {"v_1": [9.0, 2.0, 9.0], "length_1": [0.0, 5.0, 0.0]}
+    speeds = drivers.speeds(0.0, observed([9.0] * 3, [np.inf, 81.0, 80.0], **leaders))
+    assert speeds[0] == speeds[1] == speeds[2]
     for far in (0.0, -1.0, 2e6):
         with pytest.raises(ConfigError, match=r"far=.* must be a distance"):
             Drivers(model("helly"), DT, "semi_implicit", far=far)
 
 
-def test_drivers_who_differ_are_drawn_from_the_fitted_distribution() -> None:
+def test_paces_have_the_fitted_distribution() -> None:
     sigma, n = 0.12, 4000
     effect = {"name": "driver_heterogeneity", "sigma": sigma, "people": {"a": [0.1, -0.1]}}
 
     def speeds(seed: int) -> np.ndarray:
-        drivers = Drivers(model("lin", effect), DT, "euler", seed=seed)
-        drivers.enter([()] * n)
+        drivers = drivers_of(model("lin", effect), n, seed=seed)
         return drivers.speeds(0.0, observed([9.0] * n, [20.0] * n))
 
     pace = speeds(1) / (30.0 * (1 - 5 / 20)) - 1
@@ -188,35 +179,33 @@ def test_drivers_who_differ_are_drawn_from_the_fitted_distribution() -> None:
     assert (speeds(1) != speeds(2)).any()
 
 
-def test_without_a_spread_it_is_that_of_the_drivers_who_were_seen() -> None:
+def test_paces_have_the_spread_of_observed_drivers() -> None:
     effect = {"name": "driver_heterogeneity", "people": {"a": [0.3, -0.3], "b": [0.3, -0.3]}}
-    drivers = Drivers(model("lin", effect), DT, "euler")
-    drivers.enter([()] * 4000)
-    said = drivers.speeds(0.0, observed([9.0] * 4000, [20.0] * 4000)) / 22.5 - 1
-    assert said.std() == pytest.approx(0.3, rel=0.05)
-    assert said.min() >= -0.9  # nobody's pace is turned round
+    drivers = drivers_of(model("lin", effect), 4000)
+    pace = drivers.speeds(0.0, observed([9.0] * 4000, [20.0] * 4000)) / 22.5 - 1
+    assert pace.std() == pytest.approx(0.3, rel=0.05)
+    assert pace.min() >= -0.9  # speeds stay positive
 
 
-def test_a_class_acts_on_its_own() -> None:
+def test_vehicle_class_applies_to_its_members() -> None:
     effect = {"vehicle_class": {"kind": "truck", "phi": 0.5}}
-    drivers = Drivers(model("lin", effect), DT, "euler")
+    drivers = drivers_of(model("lin", effect), 0)
     drivers.enter([{"own", "truck"}, {"own", "passenger"}])
     slow, fast = drivers.speeds(0.0, observed([9.0] * 2, [20.0] * 2))
     assert slow == pytest.approx(fast / 2)
 
 
-def test_numbers_that_are_none() -> None:
+def test_speed_that_is_not_a_number_is_an_error() -> None:
     parameters = {"v0": "30 m/s", "L": "6 m"}
     law = {"parameters": parameters, "rate": {"x": "v0*sqrt((gap - L)/L)"}}
     options = model_options({"term": "formula", "name": "own", "law": law}, "measured")
-    drivers = Drivers(build_model(options).double(), DT, "euler", far=100.0)
-    drivers.enter([()])
+    drivers = drivers_of(build_model(options).double(), 1, far=100.0)
     with np.errstate(invalid="ignore"), pytest.raises(SimulationError, match=r"gap of 5\.5 m"):
         drivers.speeds(3.0, observed([9.0], [5.5]))
 
 
 class Coded(FollowTheLeader):
-    """A law that is Python code."""
+    """A law in Python code."""
 
     name = "coded"
 
@@ -224,12 +213,14 @@ class Coded(FollowTheLeader):
         return torch.tanh(gap)
 
 
-def test_what_cannot_drive_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"one of people.*JuPedSim"):
-        drivable(build_model(model_options("sf", "measured")))
-    with pytest.raises(ConfigError, match="Python code"):
-        drivable(Traffic([Coded(20.0)]))
-    with pytest.raises(ConfigError, match=r"leader_length needs longer.*SUMO cannot tell"):
-        drivable(model("lin", {"leader_length": {"beta": 0.3}}))
+def test_models_that_cannot_drive_are_refused() -> None:
+    length = model("lin", {"leader_length": {"beta": 0.3}})
+    for system, message in (
+        (model("sf"), r"one of people.*JuPedSim"),
+        (Traffic([Coded(20.0)]), "Python code"),
+        (length, r"leader_length needs longer.*SUMO cannot tell"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            drivable(system)
     drivable(model("lin", {"leader_speed": {"weight": 0.5}}, leader="constant"))
     drivable(Traffic([make_law("lin")]))

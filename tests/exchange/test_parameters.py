@@ -1,4 +1,4 @@
-"""Calibrated parameters as those of JuPedSim and SUMO, and what has no counterpart."""
+"""Export of calibrated parameters to JuPedSim and SUMO, and parameters without a counterpart."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from nnode.exchange.sumo import equilibrium_gap, has_type, sumo_type, traffic_of
 from nnode.model import Crowd, System, Traffic, make_law
 from nnode.model.build import add_effects
 from nnode.model.laws import CAR_FOLLOWING_LAWS, PEDESTRIAN_LAWS, law_from
+from tests.builders import lane, people
 
 SCENES = Scenes(people=12.0, points=50.0, spacing=0.25, speed=1.3)
 
@@ -33,7 +34,7 @@ def crowd(**options: object) -> Crowd:
     return Crowd([make_law("relaxation", tau=0.7), force])
 
 
-def test_social_force_by_jupedsim_s_names() -> None:
+def test_social_force_for_jupedsim() -> None:
     result = jupedsim_parameters(crowd(r=0.2, B=0.1, mass=2.0), SCENES)
     content = json.loads(result.text)
     assert content["model"] == {"body_force": 10.0, "friction": 5.0}
@@ -51,7 +52,7 @@ def test_social_force_by_jupedsim_s_names() -> None:
     assert content["no_counterpart"] == result.missing
 
 
-def test_what_jupedsim_cannot_say() -> None:
+def test_parts_without_a_counterpart_are_listed() -> None:
     plain = jupedsim_parameters(crowd(), SCENES).missing
     assert not any("opposing" in line or "effect" in line for line in plain)
     model = crowd(opposing_wall_friction=True)
@@ -62,26 +63,17 @@ def test_what_jupedsim_cannot_say() -> None:
     assert any("side_preference" in line for line in missing)
 
 
-def test_without_walls_nobody_is_pushed_by_them() -> None:
+def test_no_wall_force_without_walls() -> None:
     for model, points in ((crowd(walls=False), 50.0), (crowd(), 0.0)):
         result = jupedsim_parameters(model, Scenes(12.0, points, 0.25, 1.3))
         assert json.loads(result.text)["agent"]["obstacle_scale"] == 0
         assert not any("walls" in line for line in result.missing)
 
 
-@pytest.mark.parametrize(
-    "model",
-    [Crowd([make_law("relaxation"), make_law("network_force")]), Traffic([make_law("lin")])],
-)
-def test_jupedsim_knows_no_other_model(model: System) -> None:
-    with pytest.raises(ConfigError, match=r"to=jupedsim: .* no social force"):
-        jupedsim_parameters(model, SCENES)
-
-
 @given(r=st.floats(0.1, 0.5), B=st.floats(0.05, 1.0))
 @settings(max_examples=30, deadline=None)
-def test_points_per_edge_is_the_sum_over_a_row(r: float, B: float) -> None:
-    spacing = 0.02  # so fine that the sum does not depend on where the row begins
+def test_points_per_edge_is_a_sum_over_wall_points(r: float, B: float) -> None:
+    spacing = 0.02  # fine enough that the sum does not depend on the first point
     y = spacing * np.arange(-4000, 4001)
     d = np.hypot(r, y)
     row = (np.exp((r - d) / B) * r / d).sum()
@@ -89,41 +81,43 @@ def test_points_per_edge_is_the_sum_over_a_row(r: float, B: float) -> None:
 
 
 def test_scenes_are_means_over_sequences() -> None:
-    time = 0.1 * np.arange(3)
     walls = np.array([[0.0, 0, 4, 0], [4, 2, 0, 2]])
 
-    def people(n: int, speed: float, walls: np.ndarray | None) -> Sequence:
+    def walk(n: int, speed: float, walls: np.ndarray | None) -> Sequence:
         x = np.zeros((3, n, 2))
-        x[:, :, 0] = speed * time[:, None]
-        return Sequence(name=str(n), recording="a", time=time, x=x, walls=walls)
+        x[:, :, 0] = speed * 0.1 * np.arange(3)[:, None]
+        return people(x, 0.1, walls=walls)
 
-    scenes = scenes_of([people(2, 1.0, walls), people(6, 1.5, None)], 0.25)
+    scenes = scenes_of([walk(2, 1.0, walls), walk(6, 1.5, None)], 0.25)
     assert (scenes.people, scenes.points) == (4.0, 17.0)
     assert scenes.spacing == pytest.approx(0.25)
     assert scenes.speed == pytest.approx(1.5)
 
 
 def values(model: System, speed: float = 15.0, length: float | None = 4.2) -> dict[str, str]:
+    """Attributes of the exported vehicle type."""
     (kind,) = ElementTree.fromstring(sumo_type(model, "lin", speed, length).text).iter("vType")
     return dict(kind.attrib)
 
 
-def test_a_linear_law_as_a_vehicle_type() -> None:
-    result = values(Traffic([make_law("lin", v0=30.0, L=7.0)]))
+def linear(L: float = 7.0) -> Traffic:
+    return Traffic([make_law("lin", v0=30.0, L=L)])
+
+
+def test_linear_law_as_a_vehicle_type() -> None:
+    result = values(linear())
     assert result["id"] == "lin"
     assert (float(result["length"]), float(result["minGap"])) == (4.2, pytest.approx(2.8))
     assert float(result["maxSpeed"]) == 30
-    # at 15 m/s the law asks for twice the gap at rest
+    # the gap at 15 m/s is twice the gap at rest
     assert float(result["tau"]) == pytest.approx(7 / 15, rel=1e-5)
     assert "actionStepLength" not in result
-
-
-def test_a_law_shorter_than_a_car() -> None:
-    result = values(Traffic([make_law("lin", v0=30.0, L=3.5)]), length=None)
+    # a gap at rest that is shorter than a car
+    result = values(linear(L=3.5), length=None)
     assert (float(result["length"]), float(result["minGap"])) == (3.5, 0)
 
 
-def test_a_logarithmic_law_knows_no_greatest_speed() -> None:
+def test_logarithmic_law_has_no_maximum_speed() -> None:
     model = Traffic([make_law("log", v0=10.0, L=6.0)])
     assert "maxSpeed" not in values(model)
     assert any("v0 = 10" in line for line in sumo_type(model, "log", 15.0, None).missing)
@@ -131,29 +125,28 @@ def test_a_logarithmic_law_knows_no_greatest_speed() -> None:
 
 
 def field(name: str) -> System:
-    """A law of the field, whatever its user calls it."""
-    described = CAR_FOLLOWING_LAWS.get(name) or PEDESTRIAN_LAWS[name]
-    law = law_from("mine", described)
+    """A published law under a user's name."""
+    law = law_from("mine", CAR_FOLLOWING_LAWS.get(name) or PEDESTRIAN_LAWS[name])
     return Traffic([law], leader="measured") if name in CAR_FOLLOWING_LAWS else Crowd([law])
 
 
 @pytest.mark.parametrize(("law", "follow"), [("idm", "IDM"), ("krauss", "KraussOrig1")])
-def test_laws_that_sumo_has(law: str, follow: str) -> None:
+def test_laws_of_sumo(law: str, follow: str) -> None:
     system = field(law)
     assert has_type(system)
     result = values(system, length=4.5)
     expected = {name.rpartition(".")[2]: float(v) for name, (v, _) in system.physical().items()}
     assert (result["id"], result["carFollowModel"]) == ("lin", follow)
     names = {"v0": "maxSpeed", "T": "tau", "a": "accel", "b": "decel", "s0": "minGap"}
-    for own, theirs in names.items():
-        assert float(result[theirs]) == pytest.approx(expected[own], rel=1e-11)
+    for name, sumo_name in names.items():
+        assert float(result[sumo_name]) == pytest.approx(expected[name], rel=1e-11)
     assert float(result["length"]) == 4.5
-    # without lengths the gap at rest contains one
+    # without lengths the gap at rest includes the vehicle
     result = values(system, length=None)
     assert float(result["length"]) + float(result["minGap"]) == pytest.approx(expected["s0"])
 
 
-def test_intervals_stand_in_comments() -> None:
+def test_intervals_are_written_as_comments() -> None:
     expected = {"mine.T": {"value": 1.2, "low": 1.125, "high": 1.25}, "mine.a": {"low": None}}
     text = sumo_type(field("idm"), "x", 15.0, 4.5, expected).text
     assert "<!-- T = 1.2 s, 95 % [1.125, 1.25] -->" in text
@@ -164,19 +157,19 @@ def test_intervals_stand_in_comments() -> None:
     assert "l = 0.3 m, 95 % [0.2, 0.4]" in content["notes"]
 
 
-def test_a_law_with_another_formula_is_none_of_sumo_s() -> None:
+def test_changed_law_is_not_exported_as_idm() -> None:
     rate = CAR_FOLLOWING_LAWS["idm"]["rate"]["v"].replace("(v/v0)**4", "(v/v0)**2")
     system = Traffic(
         [law_from("idm", {**CAR_FOLLOWING_LAWS["idm"], "rate": {"v": rate}})], leader="measured"
     )
     assert not has_type(system)
-    beside = law_from("idm", CAR_FOLLOWING_LAWS["idm"], network=4)
-    assert not has_type(Traffic([beside], leader="measured"))
+    with_network = law_from("idm", CAR_FOLLOWING_LAWS["idm"], network=4)
+    assert not has_type(Traffic([with_network], leader="measured"))
     with pytest.raises(ConfigError, match=r"neither idm nor krauss.*nnode drive"):
         sumo_type(system, "x", 15.0, None)
 
 
-def test_laws_of_people_that_jupedsim_has() -> None:
+def test_pedestrian_laws_of_jupedsim() -> None:
     scenes = Scenes(people=8.0, points=0.0, spacing=0.25, speed=1.1, pace=1.4)
     content = json.loads(jupedsim_parameters(field("cfsm"), scenes).text)
     assert content["classes"]["model"] == "CollisionFreeSpeedModel"
@@ -199,43 +192,44 @@ def test_laws_of_people_that_jupedsim_has() -> None:
             jupedsim_parameters(field(name), scenes)
 
 
-def test_effects_with_a_counterpart() -> None:
-    model = Traffic([make_law("lin", v0=30.0, L=7.0)])
-    chosen = [
+def test_effects_in_a_vehicle_type() -> None:
+    model = linear()
+    effects = [
         {"name": "reaction_delay", "T": 0.8},
         {"name": "free_flow_speed", "v_max": 25.0},
         {"name": "time_gap", "h": 0.2},
         {"name": "relative_speed", "kappa": 0.3},
     ]
-    add_effects(model, chosen)
+    add_effects(model, effects)
     result = values(model)
     assert float(result["actionStepLength"]) == pytest.approx(0.8)
     assert float(result["maxSpeed"]) == 25
     assert float(result["tau"]) == pytest.approx((2 * (7 + 0.2 * 15) - 7) / 15, rel=1e-5)
-    told = [t for t in sumo_type(model, "lin", 15.0, None).missing if t.startswith("effect")]
-    assert len(told) == 1
-    assert "relative_speed" in told[0]
+    missing = sumo_type(model, "lin", 15.0, None).missing
+    (line,) = [line for line in missing if line.startswith("effect")]
+    assert "relative_speed" in line
 
 
 @pytest.mark.parametrize("speed", [0.0, 30.0, 35.0])
-def test_no_gap_at_the_recorded_speed(speed: float) -> None:
-    model = Traffic([make_law("lin", v0=30.0, L=7.0)])
-    assert "tau" not in values(model, speed)
-    assert any(t.startswith("tau") for t in sumo_type(model, "lin", speed, None).missing)
+def test_time_gap_is_missing_without_an_equilibrium(speed: float) -> None:
+    assert "tau" not in values(linear(), speed)
+    missing = sumo_type(linear(), "lin", speed, None).missing
+    assert any(line.startswith("tau") for line in missing)
 
 
-@pytest.mark.parametrize(
-    "model",
-    [crowd(), Traffic([make_law("network_speed", hidden=4)])],
-)
-def test_sumo_knows_no_other_model(model: System) -> None:
-    with pytest.raises(ConfigError, match=r"to=sumo: .* nor a law with a gap at rest.*nnode drive"):
-        sumo_type(model, "x", 15.0, None)
+def test_unsuitable_models_are_refused() -> None:
+    for model in (Crowd([make_law("relaxation"), make_law("network_force")]), linear()):
+        with pytest.raises(ConfigError, match=r"to=jupedsim: .* no social force"):
+            jupedsim_parameters(model, SCENES)
+    message = r"to=sumo: .* nor a law with a gap at rest.*nnode drive"
+    for model in (crowd(), Traffic([make_law("network_speed", hidden=4)])):
+        with pytest.raises(ConfigError, match=message):
+            sumo_type(model, "x", 15.0, None)
 
 
 @given(v0=st.floats(5, 50), L=st.floats(2, 15), share=st.floats(0.01, 0.95), log=st.booleans())
 @settings(max_examples=50, deadline=None)
-def test_at_its_equilibrium_gap_a_law_drives_at_that_speed(
+def test_law_gives_the_speed_at_its_equilibrium_gap(
     v0: float, L: float, share: float, log: bool
 ) -> None:
     law = make_law("log", v0=v0, L=L) if log else make_law("lin", v0=v0, L=L)
@@ -245,31 +239,25 @@ def test_at_its_equilibrium_gap_a_law_drives_at_that_speed(
 
 
 @pytest.mark.parametrize("h", [-0.1, 0.3])
-def test_the_time_gap_s_equilibrium_is_the_model_s(h: float) -> None:
-    model = Traffic([make_law("lin", v0=30.0, L=7.0)])
+def test_equilibrium_gap_with_a_time_gap(h: float) -> None:
+    model = linear()
     add_effects(model, [{"name": "time_gap", "h": h}])
+    model.leader = "measured"
     law = model.find_law("lin")
     assert law is not None
     gap = equilibrium_gap(law, 12.0, h)
-    lead = equilibrium_gap(law, 12.0, h)
-    # the leader's constant speed is that of the equilibrium
-    with torch.no_grad():
-        law.v0.fill_(30.0)
-    x = np.array([0.0, gap, gap + lead])[None, :, None] + 12 * 0.1 * np.arange(3)[:, None, None]
-    batch = collate([Sequence(name="a", recording="a", time=0.1 * np.arange(3), x=x)])
-    model.leader = "measured"
+    x = gap * np.arange(3.0) + 12 * 0.1 * np.arange(3)[:, None]
+    batch = collate([lane(x, 0.1)])
     rate = model(torch.tensor(0.0), batch.x[0], model.scene(batch)).detach()[0, :, 0]
     np.testing.assert_allclose(rate[:2], 12.0)
 
 
-def test_traffic_is_the_median_over_all_sequences() -> None:
-    time = 0.2 * np.arange(4)
+def test_traffic_means_are_medians_over_sequences() -> None:
+    def cars(speed: float, length: list[float] | None) -> Sequence:
+        x = np.array([0.0, 30.0]) + speed * 0.2 * np.arange(4)[:, None]
+        return lane(x, length=None if length is None else np.array(length))
 
-    def cars(speed: float, length: np.ndarray | None) -> Sequence:
-        x = np.array([0.0, 30.0])[None, :, None] + speed * time[:, None, None]
-        return Sequence(name=f"{speed}", recording="a", time=time, x=x, length=length)
-
-    speed, length = traffic_of([cars(10, np.array([4.0, np.nan])), cars(20, np.array([6.0, 9.0]))])
+    speed, length = traffic_of([cars(10, [4.0, np.nan]), cars(20, [6.0, 9.0])])
     assert speed == pytest.approx(15.0)
     assert length == 6.0
     assert traffic_of([cars(10, None)])[1] is None

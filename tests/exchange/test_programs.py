@@ -1,4 +1,4 @@
-"""The neighbouring programs themselves: they write what is read here, and read what is written."""
+"""Files and forces agree with JuPedSim, PedPy and SUMO themselves."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import warnings
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -23,14 +24,15 @@ from nnode.exchange.sumo import equilibrium_gap, sumo_type
 from nnode.exchange.trajectories import write_pedpy
 from nnode.model import Crowd, Traffic, make_law
 from nnode.model.term import State
+from tests.builders import people
 
 ROOM = [(0, 0), (12, 0), (12, 4), (0, 4)]
 PILLAR = [(5.5, 1.8), (6.5, 1.8), (6.5, 2.2), (5.5, 2.2)]
 
 
 @pytest.fixture(scope="module")
-def walked(jupedsim: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four people who walk past a pillar for 5 s, simulated by JuPedSim."""
+def recording(jupedsim: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four people walk past a pillar for 5 s in a simulation by JuPedSim."""
     import shapely
 
     path = tmp_path_factory.mktemp("jupedsim") / "walk.sqlite"
@@ -53,8 +55,8 @@ def walked(jupedsim: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return path
 
 
-def test_a_simulation_by_jupedsim_is_read(walked: Path, tmp_path: Path) -> None:
-    options = WalkwayOptions(path=str(walked), faults=Faults.error)
+def test_jupedsim_trajectories_are_read(recording: Path, tmp_path: Path) -> None:
+    options = WalkwayOptions(path=str(recording), faults=Faults.error)
     store = prepare(options, tmp_path / "out")
     assert (len(store), store.manifest["dt"], store[0].n_agents) == (5, 0.04, 4)
     start = store[0].x[0]
@@ -64,25 +66,25 @@ def test_a_simulation_by_jupedsim_is_read(walked: Path, tmp_path: Path) -> None:
     walls = store[0].walls
     assert walls is not None
     assert {tuple(w[:2]) for w in walls} == {(float(x), float(y)) for x, y in ROOM + PILLAR}
-    centre = np.array([6.0, 1.0])  # beside the pillar: on the left of its nearest edges
+    centre = np.array([6.0, 1.0])  # left of the nearest edges of room and pillar
     for x1, y1, x2, y2 in walls:
         if y1 == y2 and y1 in (0, 1.8):
             assert (x2 - x1) * (centre[1] - y1) > 0
 
 
-def test_pedpy_reads_the_same_database(walked: Path) -> None:
+def test_pedpy_reads_the_same_trajectories(recording: Path) -> None:
     pedpy = pytest.importorskip("pedpy")
-    area = pedpy.load_walkable_area_from_jupedsim_sqlite(trajectory_file=walked)
-    theirs = pedpy.load_trajectory_from_jupedsim_sqlite(trajectory_file=walked)
-    ours = read_walkway(walked, WalkwayOptions(path=str(walked), t_seq=5.0))[0]
-    np.testing.assert_array_equal(walls_of(area.polygon.wkt, "").shape, ours.walls.shape)
-    assert theirs.frame_rate == pytest.approx(1 / ours.dt)
-    for n, agent in enumerate(ours.agents):
-        rows = theirs.data[theirs.data["id"] == int(agent)].sort_values("frame")
-        np.testing.assert_allclose(ours.x[:, n], rows[["x", "y"]].to_numpy()[: ours.n_samples])
+    area = pedpy.load_walkable_area_from_jupedsim_sqlite(trajectory_file=recording)
+    trajectory = pedpy.load_trajectory_from_jupedsim_sqlite(trajectory_file=recording)
+    s = read_walkway(recording, WalkwayOptions(path=str(recording), t_seq=5.0))[0]
+    assert walls_of(area.polygon.wkt, "").shape == s.walls.shape
+    assert trajectory.frame_rate == pytest.approx(1 / s.dt)
+    for n, agent in enumerate(s.agents):
+        rows = trajectory.data[trajectory.data["id"] == int(agent)].sort_values("frame")
+        np.testing.assert_allclose(s.x[:, n], rows[["x", "y"]].to_numpy()[: s.n_samples])
 
 
-def test_pedpy_reads_the_text(tmp_path: Path) -> None:
+def test_pedpy_reads_exported_text(tmp_path: Path) -> None:
     pedpy = pytest.importorskip("pedpy")
     time = 0.04 * np.arange(10, 36)
     x = np.stack([np.stack([1.3 * time, 0 * time + n], -1) for n in range(3)], 1)
@@ -97,7 +99,7 @@ def test_pedpy_reads_the_text(tmp_path: Path) -> None:
 
 
 def accelerations(jupedsim: ModuleType, content: dict, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """What JuPedSim's people feel who want to go nowhere: their change of velocity by time."""
+    """JuPedSim's interaction accelerations: of people with a desired speed of zero."""
     import shapely
 
     dt = 1e-4
@@ -112,75 +114,61 @@ def accelerations(jupedsim: ModuleType, content: dict, x: np.ndarray, v: np.ndar
     ids = [
         simulation.add_agent(
             jupedsim.SocialForceModelAgentParameters(
-                position=tuple(place),
-                velocity=tuple(speed),
+                position=tuple(position),
+                velocity=tuple(velocity),
                 journey_id=journey,
                 stage_id=target,
                 **agent,
             )
         )
-        for place, speed in zip(x, v, strict=True)
+        for position, velocity in zip(x, v, strict=True)
     ]
     simulation.iterate()
     result = np.array([simulation.agent(i).model.velocity for i in ids])
     return (result - v) / dt + v / agent["reaction_time"]
 
 
+def two_samples(x: np.ndarray, displacement: np.ndarray, **more: Any) -> Sequence:
+    return people(np.stack([x, x + displacement]), 1.0, **more)
+
+
 def forces(model: Crowd, x: np.ndarray, v: np.ndarray, walls: np.ndarray | None) -> np.ndarray:
-    """What the model's own interaction gives."""
-    s = Sequence(
-        name="a",
-        recording="a",
-        time=np.arange(2.0),
-        x=np.stack([x, x + v]),
-        walls=walls,
-        v=np.stack([v, v]),
-    )
-    batch = collate([s])
+    """Interaction accelerations of the model."""
+    batch = collate([two_samples(x, v, walls=walls, v=np.stack([v, v]))])
     state = State(torch.tensor(0.0), batch.x[0], batch.v[0], model.scene(batch))
     force = model.find_law("social_force")
     assert force is not None
     return force(state)[0].detach().numpy()
 
 
-def test_people_push_each_other_alike_in_jupedsim(jupedsim: ModuleType) -> None:
-    model = Crowd(
-        [
-            make_law("relaxation", tau=0.5),
-            make_law("social_force", A=20.0, k=30.0, kappa=40.0, B=0.3, mass=1.5),
-        ]
-    )
-    # the middle pair touches, all are near each other and far from walls
+def test_social_force_between_people_agrees_with_jupedsim(jupedsim: ModuleType) -> None:
+    force = make_law("social_force", A=20.0, k=30.0, kappa=40.0, B=0.3, mass=1.5)
+    model = Crowd([make_law("relaxation", tau=0.5), force])
+    # two people touch; all are far from walls
     x = np.array([[5.0, 2.0], [5.4, 2.1], [5.5, 1.4], [4.6, 2.5]])
     v = np.array([[1.0, 0.2], [-0.8, 0.1], [0.3, 0.9], [0.0, -1.0]])
-    s = Sequence(name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x + v]))
-    content = json.loads(jupedsim_parameters(model, scenes_of([s], 0.25)).text)
+    content = json.loads(jupedsim_parameters(model, scenes_of([two_samples(x, v)], 0.25)).text)
     with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # the names are those of today
-        theirs = accelerations(jupedsim, content, x, v)
-    np.testing.assert_allclose(theirs, forces(model, x, v, None), rtol=1e-3, atol=1e-3)
+        warnings.simplefilter("error", DeprecationWarning)
+        simulated = accelerations(jupedsim, content, x, v)
+    np.testing.assert_allclose(simulated, forces(model, x, v, None), rtol=1e-3, atol=1e-3)
 
 
-def test_a_wall_pushes_alike_who_touches_it(jupedsim: ModuleType) -> None:
-    model = Crowd(
-        [
-            make_law("relaxation", tau=0.5),
-            make_law("social_force", A=20.0, k=0.0, kappa=0.0, B=0.2),
-        ],
-        wall_spacing=0.02,
-    )
+def test_social_force_of_a_wall_agrees_with_jupedsim(jupedsim: ModuleType) -> None:
+    force = make_law("social_force", A=20.0, k=0.0, kappa=0.0, B=0.2)
+    model = Crowd([make_law("relaxation", tau=0.5), force], wall_spacing=0.02)
     walls = np.hstack([ROOM, np.roll(ROOM, -1, axis=0)]).astype(float)
     x, v = np.array([[6.0, 0.25]]), np.zeros((1, 2))
-    s = Sequence(name="a", recording="a", time=np.arange(2.0), x=np.stack([x, x]), walls=walls)
-    content = json.loads(jupedsim_parameters(model, scenes_of([s], 0.02)).text)
-    theirs, ours = accelerations(jupedsim, content, x, v), forces(model, x, v, walls)
-    assert theirs[0, 0] == pytest.approx(ours[0, 0], abs=1e-6)
-    assert theirs[0, 1] == pytest.approx(ours[0, 1], rel=0.01)
+    scenes = scenes_of([two_samples(x, v, walls=walls)], 0.02)
+    content = json.loads(jupedsim_parameters(model, scenes).text)
+    simulated, expected = accelerations(jupedsim, content, x, v), forces(model, x, v, walls)
+    assert simulated[0, 0] == pytest.approx(expected[0, 0], abs=1e-6)
+    assert simulated[0, 1] == pytest.approx(expected[0, 1], rel=0.01)
 
 
 @pytest.fixture(scope="module")
 def road(sumo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A straight road of 3 km, as a network for SUMO."""
+    """A SUMO network of a straight road of 3 km."""
     folder = tmp_path_factory.mktemp("sumo")
     nodes = '<node id="a" x="0" y="0"/><node id="b" x="3000" y="0"/>'
     edge = '<edge id="e" from="a" to="b" numLanes="1" speed="50"/>'
@@ -188,7 +176,7 @@ def road(sumo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def platoon(sumo: Path, road: Path, folder: Path, types: Path, seconds: int) -> Path:
-    """Four vehicles of type ``own`` behind one of type ``lead``; returns SUMO's data of them."""
+    """SUMO's trajectories of four vehicles of type ``own`` behind one of type ``lead``."""
     cars = "".join(
         f'<vehicle id="c{i}" type="{"own" if i else "lead"}" route="r" depart="0" '
         f'departPos="{300 - 40 * i}" departSpeed="10"/>'
@@ -197,20 +185,10 @@ def platoon(sumo: Path, road: Path, folder: Path, types: Path, seconds: int) -> 
     (folder / "a.rou.xml").write_text(f'<routes><route id="r" edges="e"/>{cars}</routes>')
     call(
         sumo / "bin" / "sumo",
-        "-n",
-        road,
-        "-a",
-        types,
-        "-r",
-        folder / "a.rou.xml",
-        "--step-length",
-        0.2,
-        "--end",
-        seconds,
-        "--fcd-output",
-        folder / "fcd.xml.gz",
-        "--fcd-output.attributes",
-        "id,type,speed,pos,lane",
+        *("-n", road, "-a", types, "-r", folder / "a.rou.xml"),
+        *("--step-length", 0.2, "--end", seconds),
+        *("--fcd-output", folder / "fcd.xml.gz"),
+        *("--fcd-output.attributes", "id,type,speed,pos,lane"),
     )
     return folder / "fcd.xml.gz"
 
@@ -224,7 +202,7 @@ def types(tmp_path: Path) -> Path:
     return tmp_path / "types.add.xml"
 
 
-def test_a_platoon_by_sumo_is_read(sumo: Path, road: Path, types: Path, tmp_path: Path) -> None:
+def test_sumo_trajectories_are_read(sumo: Path, road: Path, types: Path, tmp_path: Path) -> None:
     path = platoon(sumo, road, tmp_path, types, 31)
     store = prepare(SumoOptions(path=str(path), window=10.0, faults=Faults.error), tmp_path / "out")
     assert len(store) == 3
@@ -235,7 +213,7 @@ def test_a_platoon_by_sumo_is_read(sumo: Path, road: Path, types: Path, tmp_path
     np.testing.assert_allclose(np.diff(store[2].x[:, -1, 0]), 2.4, atol=0.011)
 
 
-def test_sumo_s_drivers_keep_the_law_s_gap(sumo: Path, road: Path, tmp_path: Path) -> None:
+def test_exported_type_keeps_the_equilibrium_gap(sumo: Path, road: Path, tmp_path: Path) -> None:
     model, speed = Traffic([make_law("lin", v0=25.0, L=6.5)]), 12.0
     law = model.find_law("lin")
     assert law is not None

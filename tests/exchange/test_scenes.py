@@ -1,4 +1,4 @@
-"""Scenes of the open-world benchmark, as SUMO drives them."""
+"""Scenes of the discovery benchmark, simulated by SUMO."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.discovery import sumo_scenes as by_sumo
 pytestmark = pytest.mark.slow
 
 
-def test_a_scene_is_recorded(sumo: Path) -> None:
+def test_scene_is_recorded_reproducibly(sumo: Path) -> None:
     table, _ = by_sumo.recorded("idm_trucks", 3)
     assert table["sequence"].nunique() == by_sumo.ROADS
     assert set(table["kind"]) == {"car", "truck"}

@@ -1,9 +1,10 @@
-"""Trajectories that are written and read again, in every format, and simulated ones."""
+"""Writing trajectories in every format and reading them; simulated trajectories."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,17 +26,19 @@ from nnode.exchange.trajectories import (
     write_table,
 )
 from nnode.simulation.base import Trajectory
+from tests.builders import lane, people
+
+ENDINGS = pytest.mark.parametrize("ending", ["parquet", "csv"])
 
 
 def walk(
-    n: int = 3, k: int = 11, dt: float = 0.1, start: int = 20, name: str = "run/002", **more: object
+    n: int = 3, k: int = 11, dt: float = 0.1, start: int = 20, name: str = "run/002", **more: Any
 ) -> Sequence:
-    """People on circles of their own."""
-    time = dt * (start + np.arange(k))
-    turn = time[:, None] + np.arange(n)
-    x = np.stack([np.cos(turn) + 3 * np.arange(n), np.sin(turn)], -1)
-    more = {"agents": tuple(str(7 * i + 3) for i in range(n)), **more}
-    return Sequence(name=name, recording=name.split("/")[0], time=time, x=x, **more)  # type: ignore[arg-type]
+    """People who walk on separate circles."""
+    angle = dt * (start + np.arange(k))[:, None] + np.arange(n)
+    x = np.stack([np.cos(angle) + 3 * np.arange(n), np.sin(angle)], -1)
+    more.setdefault("agents", tuple(str(7 * i + 3) for i in range(n)))
+    return people(x, dt, start=dt * start, name=name, **more)
 
 
 @given(
@@ -47,72 +50,64 @@ def walk(
 @settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-def test_text_is_read_as_it_was(tmp_path: Path, n: int, k: int, rate: float, start: int) -> None:
+def test_text_round_trip(tmp_path: Path, n: int, k: int, rate: float, start: int) -> None:
     s = walk(n, k, 1 / rate, start)
     (path,) = write_pedpy(tmp_path, [s])
     assert path.name == "run_002.txt"
-    (back,) = read_juelich(path, JuelichOptions(t_seq=(k - 1) / rate))
-    assert back.agents == s.agents
-    np.testing.assert_allclose(back.x, s.x, atol=5.1e-7)
-    np.testing.assert_allclose(back.time, s.time, rtol=1e-9)
+    (read,) = read_juelich(path, JuelichOptions(t_seq=(k - 1) / rate))
+    assert read.agents == s.agents
+    np.testing.assert_allclose(read.x, s.x, atol=5.1e-7)
+    np.testing.assert_allclose(read.time, s.time, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
     "agents", [(), ("1", "2", "9" * 40), ("ann", "x/cm", "framerate 7"), ("1", "01", "2")]
 )
-def test_names_that_are_no_numbers_are_counted(tmp_path: Path, agents: tuple[str, ...]) -> None:
+def test_names_that_are_not_numbers_are_numbered(tmp_path: Path, agents: tuple[str, ...]) -> None:
     s = walk(agents=agents)
     (path,) = write_pedpy(tmp_path, [s])
-    (back,) = read_juelich(path, JuelichOptions())
-    assert back.agents == ("1", "2", "3")
-    assert back.dt == pytest.approx(0.1)
-    np.testing.assert_allclose(back.x, s.x, atol=5.1e-7)
+    (read,) = read_juelich(path, JuelichOptions())
+    assert read.agents == ("1", "2", "3")
+    assert read.dt == pytest.approx(0.1)
+    np.testing.assert_allclose(read.x, s.x, atol=5.1e-7)
     for i, name in enumerate(agents, start=1):
         assert f"# {i} is {name.replace('/', ' ')}\n" in path.read_text()
 
 
-def test_no_file_is_written_twice(tmp_path: Path) -> None:
+def test_file_names_are_unique(tmp_path: Path) -> None:
     paths = write_pedpy(tmp_path, [walk(name="run/2"), walk(name="run_2"), walk(name="run:2")])
     assert [p.name for p in paths] == ["run_2.txt", "run_2_.txt", "run_2__.txt"]
 
 
 def test_text_needs_two_coordinates(tmp_path: Path) -> None:
-    lane = Sequence(name="a/0", recording="a", time=np.arange(3.0), x=np.zeros((3, 2, 1)))
     with pytest.raises(DataError, match=r"a/0.*two coordinates.*take another format"):
-        write_pedpy(tmp_path, [lane])
+        write_pedpy(tmp_path, [lane(np.zeros((3, 2)), name="a/0")])
 
 
 @pytest.mark.parametrize(
-    ("name", "domain", "told"),
+    ("name", "domain", "message"),
     [
         ("pedpy", "traffic", r"format=pedpy is not for traffic; .* one of parquet, csv, fcd"),
         ("fcd", "crowd", r"format=fcd is not for crowd; .* one of parquet, csv, pedpy"),
         ("xlsx", "crowd", r"format=xlsx is unknown; for crowd take one of parquet, csv, pedpy"),
     ],
 )
-def test_a_format_that_does_not_fit(name: str, domain: str, told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_unsuitable_format_is_refused(name: str, domain: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         check_format("format", name, domain)
 
 
-def drive(name: str, n: int, k: int, start: int = 0, dt: float = 0.1, **more: object) -> Sequence:
-    """Vehicles 20 m apart at 15 m/s, each a little faster than the one behind."""
+def drive(name: str, n: int, k: int, start: int = 0, dt: float = 0.1, **more: Any) -> Sequence:
+    """Vehicles 20 m apart at about 15 m/s, each slightly faster than its follower."""
     rng = np.random.default_rng(n)
     v = 15 + np.cumsum(rng.uniform(0.1, 0.5, (k, n)), axis=1)
     x = 20.0 * np.arange(n) + dt * np.cumsum(v, axis=0)
-    return Sequence(
-        name=name,
-        recording=name.split("/")[0],
-        time=dt * (start + np.arange(k)),
-        x=x[:, :, None],
-        v=v[:, :, None],
-        **more,  # type: ignore[arg-type]
-    )
+    return lane(x, dt, v=v, start=dt * start, name=name, **more)
 
 
-def test_vehicles_are_read_as_they_were(tmp_path: Path) -> None:
-    """All in one file, at the same times, some with the same identifiers and some with none."""
-    given_ = [
+def test_floating_car_data_round_trip(tmp_path: Path) -> None:
+    """Sequences overlap in time, and identifiers are repeated or absent."""
+    sequences = [
         drive(
             "road/0~1",
             3,
@@ -125,99 +120,91 @@ def test_vehicles_are_read_as_they_were(tmp_path: Path) -> None:
         drive("road/1~1", 2, 25, start=20),
         drive("road:1~1", 4, 10, start=33),
     ]
-    path = write_fcd(tmp_path / "samples.xml.gz", given_)
+    path = write_fcd(tmp_path / "samples.xml.gz", sequences)
     options = SumoOptions(path=str(path), dt=0.1, min_vehicles=2, window=None)
     lanes = ["road_0~1", "road_0~2", "road_1~1", "road_1~1_"]
     result = {s.recording: s for s in read_sumo(path, options)}
-    assert sorted(result) == [f"samples_{lane}" for lane in lanes]
-    for lane, s in zip(lanes, given_, strict=True):
-        back = result[f"samples_{lane}"]
-        assert back.agents == tuple(f"{lane}.{a}" for a in s.agents or map(str, range(s.n_agents)))
-        np.testing.assert_allclose(back.time, s.time, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(back.x, s.x, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(back.v, s.v, rtol=0, atol=1e-9)
-    first, second = (result[f"samples_{lane}"] for lane in lanes[:2])
+    assert sorted(result) == [f"samples_{name}" for name in lanes]
+    for name, s in zip(lanes, sequences, strict=True):
+        read = result[f"samples_{name}"]
+        assert read.agents == tuple(f"{name}.{a}" for a in s.agents or map(str, range(s.n_agents)))
+        np.testing.assert_allclose(read.time, s.time, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(read.x, s.x, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(read.v, s.v, rtol=0, atol=1e-9)
+    first, second = (result[f"samples_{name}"] for name in lanes[:2])
     assert (first.kind, second.kind) == (("car", "truck", "car"), ("", "", ""))
-    np.testing.assert_array_equal(first.length, given_[0].length)
+    np.testing.assert_array_equal(first.length, sequences[0].length)
     assert second.length is None
-    repeated = write_fcd(tmp_path / "again.xml.gz", given_)
-    assert repeated.read_bytes() == path.read_bytes()
+    second_path = write_fcd(tmp_path / "second.xml.gz", sequences)
+    assert second_path.read_bytes() == path.read_bytes()
 
 
-def test_vehicles_without_speeds(tmp_path: Path) -> None:
+def test_floating_car_data_without_speeds(tmp_path: Path) -> None:
     s = replace(drive("road/0", 2, 12), v=None)
     path = write_fcd(tmp_path / "fcd.xml.gz", [s])
     options = SumoOptions(path=str(path), dt=0.1, min_vehicles=2, window=None)
-    (back,) = read_sumo(path, options)
-    assert back.v is None
-    np.testing.assert_allclose(back.x, s.x, rtol=0, atol=1e-9)
+    (read,) = read_sumo(path, options)
+    assert read.v is None
+    np.testing.assert_allclose(read.x, s.x, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("ending", ["parquet", "csv"])
-def test_a_crowd_s_table_is_read_as_it_was(tmp_path: Path, ending: str) -> None:
+@ENDINGS
+def test_table_of_people_round_trip(tmp_path: Path, ending: str) -> None:
     first = walk(group=("g", "", "g"), kind=("child", "", ""), length=np.array([0.3, 0.4, np.nan]))
-    second = walk(start=30, name="run/003", group=("", "", ""), kind=("child", "", ""))
+    # texts that spreadsheets would read as formulas; people are sorted by name
+    second = walk(
+        start=30,
+        name="run/+a",
+        agents=("'@x", "-7", "=1+1"),
+        group=("@", "", ""),
+        kind=("-k", "", "=k"),
+    )
     path = write_table(tmp_path / "deep" / f"walk.{ending}", [first, second], 2)
+    if ending == "csv":
+        cells = pd.read_csv(path, dtype=str)
+        assert {"'=1+1", "''@x", "-7"} < set(cells["agent"])
+        assert not cells["sequence"].str.match(r"[=+\-@]").any()
     result = read_table(path, TableOptions(domain="crowd", path=str(path)))
-    for back, s in zip(result, (first, second), strict=True):
-        assert (back.name, back.recording, back.agents) == (s.name, s.recording, s.agents)
-        np.testing.assert_array_equal(back.x, s.x)
-        np.testing.assert_array_equal(back.destination, s.x[-1])
-        assert (back.group, back.kind) == (s.group, s.kind)
+    for read, s in zip(result, (first, second), strict=True):
+        assert (read.name, read.recording, read.agents) == (s.name, s.recording, s.agents)
+        np.testing.assert_array_equal(read.x, s.x)
+        np.testing.assert_array_equal(read.destination, s.x[-1])
+        assert (read.group, read.kind) == (s.group, s.kind)
     np.testing.assert_array_equal(result[0].length, first.length)
 
 
-@pytest.mark.parametrize("ending", ["parquet", "csv"])
-def test_traffic_s_table_is_read_as_it_was(tmp_path: Path, ending: str) -> None:
-    time = np.arange(5) * 0.2
-    x = np.array([0.0, 30.0])[None, :, None] + 20 * time[:, None, None]
-    s = Sequence(name="road/0", recording="road", time=time, x=x, length=np.array([4.0, np.nan]))
+@ENDINGS
+def test_table_of_vehicles_round_trip(tmp_path: Path, ending: str) -> None:
+    x = np.array([0.0, 30.0]) + 4.0 * np.arange(5)[:, None]
+    s = lane(x, name="road/0", length=np.array([4.0, np.nan]))
     path = write_table(tmp_path / f"road.{ending}", [s], 1)
-    (back,) = read_table(path, TableOptions(domain="traffic", path=str(path)))
-    np.testing.assert_array_equal(back.x, s.x)
-    np.testing.assert_array_equal(back.length, s.length)
+    (read,) = read_table(path, TableOptions(domain="traffic", path=str(path)))
+    np.testing.assert_array_equal(read.x, s.x)
+    np.testing.assert_array_equal(read.length, s.length)
 
 
-@pytest.mark.parametrize("ending", ["parquet", "csv"])
-def test_names_that_look_like_formulas_are_read_as_they_were(tmp_path: Path, ending: str) -> None:
-    s = walk(
-        agents=("=1+1", "'@x", "-7"), name="run/+a", kind=("-k", "", "=k"), group=("@", "", "")
-    )
-    path = write_table(tmp_path / f"walk.{ending}", [s], 2)
-    if ending == "csv":
-        cells = pd.read_csv(path, dtype=str)
-        assert list(cells["agent"][:3]) == ["'=1+1", "''@x", "-7"]
-        assert not cells["sequence"].str.match(r"[=+\-@]").any()
-    (back,) = read_table(path, TableOptions(domain="crowd", path=str(path)))
-    # people are read in the order of their names
-    assert set(zip(back.agents, back.kind, back.group, strict=True)) == set(
-        zip(s.agents, s.kind, s.group, strict=True)
-    )
-    assert back.name == s.name
-
-
-@pytest.mark.parametrize("ending", ["parquet", "csv"])
-def test_nothing_is_left_of_a_table_that_failed(tmp_path: Path, ending: str) -> None:
-    def broken():
+@ENDINGS
+def test_failed_writing_leaves_no_file(tmp_path: Path, ending: str) -> None:
+    def failing():
         yield walk()
         raise DataError("no more")
 
     with pytest.raises(DataError, match="no more"):
-        write_table(tmp_path / f"walk.{ending}", broken(), 2)
+        write_table(tmp_path / f"walk.{ending}", failing(), 2)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
-def test_simulated_sequences_lose_their_padding(size: int) -> None:
+def test_simulated_sequences_have_no_padding(size: int) -> None:
     def straight(batch: Batch) -> Trajectory:
         t = batch.dt * torch.arange(batch.n_samples).double()[:, None, None, None]
         return Trajectory(batch.x[0] + t * batch.v[0], batch.v[:1].expand_as(batch.x))
 
-    given_ = [walk(3, 11), walk(1, 21, name="run/003"), walk(2, 5, name="run/004")]
-    result = list(simulated(straight, given_, size=size))
-    for s, back in zip(given_, result, strict=True):
-        assert (back.name, back.agents) == (s.name, s.agents)
+    sequences = [walk(3, 11), walk(1, 21, name="run/003"), walk(2, 5, name="run/004")]
+    result = list(simulated(straight, sequences, size=size))
+    for s, read in zip(sequences, result, strict=True):
+        assert (read.name, read.agents) == (s.name, s.agents)
         speed = s.velocity()[0]
-        np.testing.assert_allclose(back.x, s.x[0] + (s.time - s.time[0])[:, None, None] * speed)
-        np.testing.assert_allclose(back.v, np.broadcast_to(speed, s.x.shape))
-        np.testing.assert_array_equal(back.destination, s.x[-1])  # measured, not simulated
+        np.testing.assert_allclose(read.x, s.x[0] + (s.time - s.time[0])[:, None, None] * speed)
+        np.testing.assert_allclose(read.v, np.broadcast_to(speed, s.x.shape))
+        np.testing.assert_array_equal(read.destination, s.x[-1])  # measured, not simulated

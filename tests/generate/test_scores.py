@@ -1,4 +1,4 @@
-"""Scores against closed forms, and what bands cover of samples of their own kind."""
+"""Scores agree with closed forms; bands cover samples at their level."""
 
 from __future__ import annotations
 
@@ -13,26 +13,22 @@ from nnode.generate.scores import Scores, band, crps, mean_of, nearest
 
 
 @pytest.mark.parametrize("value", [-1.3, 0.4, 2.5])
-def test_crps_of_a_gaussian_is_the_closed_form(value: float) -> None:
+def test_crps_of_a_gaussian_has_the_closed_form(value: float) -> None:
     mean, sigma, repeats = 0.4, 1.7, 40_000
     samples = np.random.default_rng(3).normal(mean, sigma, (5, repeats))
     result = crps(samples, np.full(repeats, value))
     z = (value - mean) / sigma
-    # Gneiting & Raftery 2007, equation (5), of a score that is to be small
+    # Gneiting & Raftery 2007, equation (5), with the opposite sign
     closed = sigma * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / math.sqrt(math.pi))
-    # unbiased from as few as five samples
+    # the estimate is unbiased for five samples
     assert abs(result.mean() - closed) < 4 * result.std() / math.sqrt(repeats)
 
 
-def test_crps_is_the_double_sum_over_pairs() -> None:
+def test_crps_equals_the_double_sum_over_pairs() -> None:
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(7, 3)), rng.normal(size=3)
     pairs = sum(abs(x[i] - x[j]) for i in range(7) for j in range(7)) / (7 * 6)
     np.testing.assert_allclose(crps(x, y), abs(x - y).mean(0) - pairs / 2)
-
-
-def test_crps_of_equal_samples_is_the_absolute_error() -> None:
-    np.testing.assert_allclose(crps(np.full((9, 2), 3.0), np.array([1.0, 4.5])), [2.0, 1.5])
 
 
 def test_crps_of_one_sample_is_refused() -> None:
@@ -41,15 +37,15 @@ def test_crps_of_one_sample_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("level", "number"), [(0.5, 39), (0.95, 39), (0.95, 99)])
-def test_bands_cover_their_level_whatever_the_distribution(level: float, number: int) -> None:
+def test_bands_cover_at_their_level(level: float, number: int) -> None:
     repeats = 20_000
-    drawn = np.random.default_rng(1).exponential(size=(number + 1, repeats))
-    low, high = band(drawn[1:], level)
-    covered = ((low <= drawn[0]) & (drawn[0] <= high)).sum()
+    samples = np.random.default_rng(1).exponential(size=(number + 1, repeats))
+    low, high = band(samples[1:], level)
+    covered = ((low <= samples[0]) & (samples[0] <= high)).sum()
     assert abs(covered - level * repeats) < 4 * math.sqrt(repeats * level * (1 - level))
 
 
-def test_intervals_of_means_go_by_cluster() -> None:
+def test_intervals_of_means_are_clustered() -> None:
     rng = np.random.default_rng(0)
     individual = rng.normal(size=40).repeat(25)
     label = np.arange(40).repeat(25)
@@ -71,7 +67,7 @@ def test_scores_of_known_samples() -> None:
     assert means["crps_gap_m"].mean == pytest.approx(2.0)
     assert means["crps_position_m@10s"].mean == pytest.approx(2.0)
     assert means["coverage_position_95"].mean == 0.0
-    # later than the sequence
+    # after the end of the sequence
     assert "crps_position_m@20s" not in means
 
 
@@ -79,20 +75,20 @@ def test_scores_of_people() -> None:
     measured = np.zeros((4, 3, 2))
     measured[:, 1] = (3.0, 4.0)
     measured[:, 2] = (3.0, 5.0)
-    # the first one is 1 m off in one component, which brings nobody nearer than 1 m
-    away = np.zeros((39, 4, 3, 2))
-    away[:, :, 0, 0] = 1.0
+    # the first person is displaced by 1 m in one component
+    displacement = np.zeros((39, 4, 3, 2))
+    displacement[:, :, 0, 0] = 1.0
     scores = Scores(1.0)
-    scores.add("a", measured + away, measured, np.zeros_like(away))
+    scores.add("a", measured + displacement, measured, np.zeros_like(displacement))
     means = scores.means(np.zeros(1, int))
     assert means["crps_position_m"].mean == pytest.approx(1 / 6)
-    # of three people one is at another distance from who is nearest
+    # one of three people has another distance to the nearest neighbour
     assert means["crps_nearest_m"].mean == pytest.approx((5 - np.hypot(2, 4)) / 3)
     assert means["coverage_position_95"].mean == pytest.approx(5 / 6)
     assert "crps_gap_m" not in means
 
 
-def test_the_nearest_other() -> None:
+def test_distance_to_the_nearest_neighbour() -> None:
     x = np.array([[[0.0, 0.0], [3.0, 4.0], [0.0, 1.0]]])
     np.testing.assert_allclose(nearest(x), [[1.0, np.hypot(3, 3), 1.0]])
     assert nearest(x[:, :1]).shape == (1, 0)

@@ -1,4 +1,4 @@
-"""A page is whole: one HTML file, the same in Markdown, the same numbers in every form."""
+"""Pages: a self-contained HTML file, the same in Markdown, and the tables as CSV."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from nnode.pages.page import (
 from nnode.pages.tables import markdown, number
 from nnode.plots.style import dress, new_figure
 
-#: Elements that have no end.
+#: Elements without an end tag.
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 
 
 class Reader(HTMLParser):
-    """What a browser would find: elements in order, texts of tables, unclosed elements."""
+    """Parses elements in order, texts of tables, and unclosed elements."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -69,9 +69,8 @@ class Reader(HTMLParser):
 
 
 def costs() -> pd.DataFrame:
-    draw = np.random.default_rng(3)
     frame = pd.DataFrame(
-        draw.normal(20, 30, (3, 4)),
+        np.random.default_rng(3).normal(20, 30, (3, 4)),
         index=pd.Index(["Lin", "Log", "N2"], name="model"),
         columns=["1-1_1", "1-1_2", "1-2_1", "average"],
     )
@@ -116,7 +115,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     names = ["study.html", "study.md", "costs.csv", "nested.csv", "speeds.png", "rows.csv"]
     assert [path.name for path in paths] == names
     files = {path.name for path in folder.rglob("*") if path.is_file()}
-    assert files == set(names)  # and nothing else, no temporary file
+    assert files == set(names)  # no other file
     return folder
 
 
@@ -125,12 +124,12 @@ def html(folder: Path) -> Reader:
     return Reader((folder / "study.html").read_text(encoding="utf-8"))
 
 
-def test_html_is_sound_and_needs_nothing_else(folder: Path, html: Reader) -> None:
+def test_html_is_valid_and_self_contained(folder: Path, html: Reader) -> None:
     assert html.open == []
     ids = html.all("id")
     assert len(ids) == len(set(ids))
     for link in html.all("href"):
-        # an address that a reader may follow is no part of the page
+        # links to other sites are allowed
         assert link.startswith(("#", "data:text/csv;", "https://example.org/"))
         assert not link.startswith("#") or unquote(link[1:]) in ids
     assert all(source.startswith("data:image/png;base64,") for source in html.all("src"))
@@ -143,7 +142,7 @@ def test_html_is_sound_and_needs_nothing_else(folder: Path, html: Reader) -> Non
     assert "@import" not in style
 
 
-def test_html_can_be_read_by_everyone(html: Reader) -> None:
+def test_html_is_accessible(html: Reader) -> None:
     elements = html.elements
     assert ("html", {"lang": "en"}) in elements
     assert any(a.get("name") == "viewport" for _, a in elements)
@@ -158,11 +157,11 @@ def test_html_can_be_read_by_everyone(html: Reader) -> None:
     levels = [int(tag[1]) for tag, _ in elements if re.fullmatch(r"h\d", tag)]
     assert levels == [1, 2, 3, 2, 2]
     links = [a["href"] for tag, a in elements if tag == "a"]
-    assert links[0] == "#text"  # past the contents
+    assert links[0] == "#text"  # skips the contents
     assert links[1:4] == ["#costs-in-m²-s", "#costs-in-m²-s-1", "#figures"]
 
 
-def test_tables_are_the_csv_s_numbers(folder: Path, html: Reader) -> None:
+def test_tables_agree_with_csv_files(folder: Path, html: Reader) -> None:
     frame = costs()
     exact = pd.read_csv(folder / "costs.csv", index_col="model")
     pd.testing.assert_frame_equal(exact, frame, check_exact=True)
@@ -212,16 +211,15 @@ def test_markdown_has_the_same_tables(folder: Path, html: Reader) -> None:
     assert "- data: sha256 0123\n- machine: two cores" in text
 
 
-def test_full_tables_go_to_csv_alone(tmp_path: Path) -> None:
+def test_full_table_is_in_csv_only(tmp_path: Path) -> None:
     full = pd.DataFrame({"x": [1 / 3, 0.1 + 0.2]})
     table = TableBlock("t", pd.DataFrame({"mean": [0.3]}), "Mean.", full=full)
     _, _, path = write_page([table], tmp_path, title="T")
-    back = pd.read_csv(path)
-    pd.testing.assert_frame_equal(back, full, check_exact=True)
+    pd.testing.assert_frame_equal(pd.read_csv(path), full, check_exact=True)
     assert Reader((tmp_path / "study.html").read_text()).tables == [[["mean"], ["0.30"]]]
 
 
-def test_sections_and_long_tables_are_folded_in_html_alone(tmp_path: Path) -> None:
+def test_sections_and_long_tables_are_folded_in_html(tmp_path: Path) -> None:
     rows = pd.DataFrame({"p": [0.5] * 13})
     page = [
         Heading("First"),
@@ -262,7 +260,7 @@ def test_sections_and_long_tables_are_folded_in_html_alone(tmp_path: Path) -> No
         ("1-1_1", "1-1_1"),
     ],
 )
-def test_numbers_as_text(value: object, text: str) -> None:
+def test_number_formats(value: object, text: str) -> None:
     assert number(value) == text
 
 
@@ -273,17 +271,17 @@ def test_digits_by_column() -> None:
     assert pd.read_csv(io.StringIO(block.csv())).shape == (1, 3)
 
 
-def test_pages_that_cannot_be_are_refused(tmp_path: Path) -> None:
+def test_invalid_pages_are_refused(tmp_path: Path) -> None:
     frame = pd.DataFrame({"a": [1.0]})
     figure = new_figure(2.0, 2.0)
-    wrong: dict[str, list[Block]] = {
+    invalid: dict[str, list[Block]] = {
         "tables are named t": [TableBlock("t", frame, "T."), TableBlock("T", frame, "T.")],
         "'a/b' cannot be used": [TableBlock("a/b", frame, "T.")],
         "figure f has no alternative": [FigureBlock("f", figure, "F.", " ")],
         "has level 1": [Heading("Title", 1)],
         "rows and columns of the frame": [TableBlock("t", frame, "T.", bold=frame.T.eq(1))],
     }
-    for message, page in wrong.items():
+    for message, page in invalid.items():
         with pytest.raises(ValueError, match=message):
             write_page(page, tmp_path / "x", title="T")
     (tmp_path / "file").write_text("")
@@ -304,7 +302,7 @@ HOSTILE = (
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_text_from_files_is_no_markup_in_markdown(tmp_path: Path, name: str) -> None:
+def test_text_from_files_is_escaped_in_markdown(tmp_path: Path, name: str) -> None:
     frame = pd.DataFrame({name: [name]}, index=pd.Index([name], name=name))
     page = [Heading(name), TableBlock("t", frame, f"Of {markdown(name)}."), Provenance({"a": name})]
     write_page(page, tmp_path, title=name, subtitle=f"S {markdown(name)}", stem="page")
@@ -313,28 +311,15 @@ def test_text_from_files_is_no_markup_in_markdown(tmp_path: Path, name: str) -> 
     html = MarkdownIt("commonmark", {"xhtmlOut": False}).enable("table").render(text)
     shown = Reader(html)
     tags = {tag for tag, _ in shown.elements}
-    assert tags <= {
-        "h1",
-        "h2",
-        "p",
-        "a",
-        "table",
-        "thead",
-        "tbody",
-        "tr",
-        "th",
-        "td",
-        "hr",
-        "ul",
-        "li",
-    }
+    table_tags = {"table", "thead", "tbody", "tr", "th", "td"}
+    assert tags <= {"h1", "h2", "p", "a", "hr", "ul", "li"} | table_tags
     assert shown.all("href") == ["t.csv"]
     plain = re.sub(r"\s+", " ", name).replace("\x1b", r"\x1b")
     assert [cell.strip() for row in shown.tables[0] for cell in row] == [plain] * 4
 
 
 @pytest.mark.parametrize(
-    "words",
+    "text",
     [
         "<script>alert(1)</script>",
         "`a` <img src=x> `b`",
@@ -345,42 +330,38 @@ def test_text_from_files_is_no_markup_in_markdown(tmp_path: Path, name: str) -> 
         "![x](https://example.org/x.png)",
     ],
 )
-def test_paragraphs_hold_no_html_and_no_images(tmp_path: Path, words: str) -> None:
-    write_page([Text(words)], tmp_path, title="a", stem="page")
+def test_paragraphs_contain_no_html_and_no_images(tmp_path: Path, text: str) -> None:
+    write_page([Text(text)], tmp_path, title="a", stem="page")
     html = MarkdownIt("commonmark", {"xhtmlOut": False}).render((tmp_path / "page.md").read_text())
     assert not {tag for tag, _ in Reader(html).elements} & {"script", "img"}
 
 
-def test_code_stays_as_it_is(tmp_path: Path) -> None:
-    words = "If `a < b` then a < b.\n\n```python\nif a < b: pass\n```"
-    write_page([Text(words)], tmp_path, title="a", stem="page")
+def test_code_is_not_escaped(tmp_path: Path) -> None:
+    code = "If `a < b` then a < b.\n\n```python\nif a < b: pass\n```"
+    write_page([Text(code)], tmp_path, title="a", stem="page")
     text = (tmp_path / "page.md").read_text()
     assert "If `a < b` then a &lt; b." in text
     assert "if a < b: pass" in text
 
 
-def test_spreadsheets_find_no_formulas(tmp_path: Path) -> None:
-    cells = ["=1+1", "+a", "-a", "@a", "\ta", "\ra", "'=a", "-1.5", "+3e2", "plain", "", None, -2]
+def test_csv_cells_are_no_formulas(tmp_path: Path) -> None:
+    escaped = {
+        "=1+1": "'=1+1",
+        "+a": "'+a",
+        "-a": "'-a",
+        "@a": "'@a",
+        "\ta": "'\ta",
+        "\ra": "'\ra",
+        "'=a": "''=a",
+    }
+    unchanged = {"-1.5": "-1.5", "+3e2": "+3e2", "plain": "plain", "": "", None: "", -2: "-2"}
+    cells = [*escaped, *unchanged]
     frame = pd.DataFrame({"=name": cells, "x": np.arange(-6.0, 7)})
     text = csv_text(frame)
-    found = pd.read_csv(io.StringIO(text), keep_default_na=False, dtype=str)
-    assert list(found) == ["'=name", "x"]
-    assert list(found["'=name"]) == [
-        "'=1+1",
-        "'+a",
-        "'-a",
-        "'@a",
-        "'\ta",
-        "'\ra",
-        "''=a",
-        "-1.5",
-        "+3e2",
-        "plain",
-        "",
-        "",
-        "-2",
-    ]
-    assert [float(x) for x in found["x"]] == list(frame["x"])
-    kept = [cell for cell in cells if isinstance(cell, str)]
-    assert [csv_cell(cell) for cell in found["'=name"][: len(kept)]] == kept
-    assert (TableBlock("t", frame, "").csv()) == text
+    table = pd.read_csv(io.StringIO(text), keep_default_na=False, dtype=str)
+    assert list(table) == ["'=name", "x"]
+    assert list(table["'=name"]) == [*escaped.values(), *unchanged.values()]
+    assert [float(x) for x in table["x"]] == list(frame["x"])
+    strings = [cell for cell in cells if isinstance(cell, str)]
+    assert [csv_cell(cell) for cell in table["'=name"][: len(strings)]] == strings
+    assert TableBlock("t", frame, "").csv() == text

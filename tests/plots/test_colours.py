@@ -1,4 +1,4 @@
-"""Colours that stay apart for eyes that see fewer of them.
+"""Colours are distinguishable with colour vision deficiencies.
 
 The matrices are those of complete protanopia, deuteranopia and tritanopia in Machado, Oliveira and
 Fernandes, "A physiologically-based model for simulation of color vision deficiency", IEEE TVCG 15
@@ -18,8 +18,8 @@ from nnode.diagnosis.report.figures.marks import AFTER, BEFORE
 from nnode.plots.quality import STYLES
 from nnode.plots.style import GREY, OKABE_ITO
 
-EYES = {
-    "all three cones": np.eye(3),
+VISION = {
+    "normal": np.eye(3),
     "protanopia": [
         [0.152286, 1.052583, -0.204868],
         [0.114503, 0.786281, 0.099216],
@@ -47,49 +47,47 @@ XYZ = np.array(
 )
 WHITE = XYZ.sum(1)
 
-#: Least distance of colours that line style and marker tell apart as well, and of those that are
-#: told apart by nothing else.
-APART, ALONE = 15.0, 25.0
+#: Minimum distance of colours that also differ in line style and marker, and of other colours.
+WITH_MARKERS, COLOUR_ONLY = 15.0, 25.0
 
 
-def lab(colour: str, eye: str) -> np.ndarray:
-    """CIELAB coordinates of a colour as an eye sees it."""
-    coded = np.array(to_rgb(colour))
-    linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
-    ratio = XYZ @ np.clip(np.array(EYES[eye]) @ linear, 0, 1) / WHITE
+def lab(colour: str, vision: str) -> np.ndarray:
+    """CIELAB coordinates of a colour as perceived with a kind of vision."""
+    srgb = np.array(to_rgb(colour))
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    ratio = XYZ @ np.clip(np.array(VISION[vision]) @ linear, 0, 1) / WHITE
     f = np.where(ratio > 216 / 24389, np.cbrt(ratio), (24389 / 27 * ratio + 16) / 116)
     return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
 
 
-def distance(a: str, b: str, eye: str) -> float:
-    return float(np.linalg.norm(lab(a, eye) - lab(b, eye)))
+def distance(a: str, b: str, vision: str) -> float:
+    return float(np.linalg.norm(lab(a, vision) - lab(b, vision)))
 
 
-def test_distances_are_those_of_the_literature() -> None:
-    assert lab("#ffffff", "all three cones") == pytest.approx([100, 0, 0], abs=1e-6)
+def test_conversion_agrees_with_the_literature() -> None:
+    assert lab("#ffffff", "normal") == pytest.approx([100, 0, 0], abs=1e-6)
     # the primary red of sRGB in CIELAB, D65
-    assert lab("#ff0000", "all three cones") == pytest.approx([53.24, 80.09, 67.20], abs=0.02)
-    for eye in EYES:  # greys look the same to all
-        assert lab("#777777", eye) == pytest.approx(lab("#777777", "all three cones"), abs=0.05)
-    # a pair that many plots use, and that deuteranopes confuse
-    assert distance("#d62728", "#2ca02c", "all three cones") > 100
-    assert distance("#c44e00", "#6c7a00", "deuteranopia") < APART
+    assert lab("#ff0000", "normal") == pytest.approx([53.24, 80.09, 67.20], abs=0.02)
+    for vision in VISION:  # greys are perceived alike
+        assert lab("#777777", vision) == pytest.approx(lab("#777777", "normal"), abs=0.05)
+    # a common pair of colours that deuteranopes confuse
+    assert distance("#d62728", "#2ca02c", "normal") > 100
+    assert distance("#c44e00", "#6c7a00", "deuteranopia") < WITH_MARKERS
 
 
-@pytest.mark.parametrize("eye", EYES)
-def test_all_colours_of_the_palette_stay_apart(eye: str) -> None:
+@pytest.mark.parametrize("vision", VISION)
+def test_palette_is_distinguishable(vision: str) -> None:
     for a, b in combinations(OKABE_ITO, 2):
-        assert distance(OKABE_ITO[a], OKABE_ITO[b], eye) > APART, (a, b)
+        assert distance(OKABE_ITO[a], OKABE_ITO[b], vision) > WITH_MARKERS, (a, b)
 
 
-@pytest.mark.parametrize("eye", EYES)
-def test_colours_that_mean_something_by_themselves_stay_far_apart(eye: str) -> None:
-    before, after = BEFORE["color"], AFTER["color"]
-    for a, b in combinations((before, after, GREY, "#ffffff"), 2):
-        assert distance(a, b, eye) > ALONE, (a, b)
+@pytest.mark.parametrize("vision", VISION)
+def test_colours_without_markers_are_distinguishable(vision: str) -> None:
+    for a, b in combinations((BEFORE["color"], AFTER["color"], GREY, "#ffffff"), 2):
+        assert distance(a, b, vision) > COLOUR_ONLY, (a, b)
 
 
-def test_what_shares_a_picture_differs_without_colour_too() -> None:
+def test_markers_differ() -> None:
     assert BEFORE["marker"] != AFTER["marker"]
     markers = [marker for _, marker in STYLES.values()]
     assert len(set(markers)) == len(markers)

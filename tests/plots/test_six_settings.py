@@ -1,4 +1,4 @@
-"""The paper's six settings against its printed table."""
+"""The paper's six settings agree with its printed table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nnode.model import Crowd, make_law
 from nnode.plots import save, six_settings
 from nnode.plots.settings import Setting
 
-#: Calibrated values as printed (section 6.5) and half a unit of their last digit.
+#: Printed calibrated values (section 6.5), and half a unit of their last digit.
 PRINTED = {"A": 0.0044, "k": 34.9539, "kappa": 9.8894}
 HALF = 0.5e-4
 
@@ -27,13 +27,12 @@ TABLE = {
 
 
 def _social(B: float = 0.05) -> Crowd:
-    return Crowd(
-        [make_law("relaxation", tau=0.5), make_law("social_force", **PRINTED, r=0.25, B=B)]
-    ).double()
+    force = make_law("social_force", **PRINTED, r=0.25, B=B)
+    return Crowd([make_law("relaxation", tau=0.5), force]).double()
 
 
 def _tolerance(x_blue, v_blue) -> np.ndarray:
-    """Rounding of the printed force plus that of the three printed parameters, (2,) N."""
+    """Rounding errors of the printed force and of the three printed parameters, ``(2,)`` N."""
     dx = 2 * np.array(x_blue, dtype=float)
     dv = np.array(v_blue, dtype=float) - (0, 1)
     d = np.hypot(*dx)
@@ -43,7 +42,7 @@ def _tolerance(x_blue, v_blue) -> np.ndarray:
     parameters = (
         np.exp(overlap / 0.05) * np.abs(n) + overlap * np.abs(n) + overlap * abs(dv @ t) * np.abs(t)
     )
-    return HALF + HALF * parameters + 1e-6  # the last: float32 parameters
+    return HALF + HALF * parameters + 1e-6  # and float32 parameters
 
 
 @pytest.mark.parametrize("name", TABLE)
@@ -61,7 +60,7 @@ def test_printed_forces(name: str) -> None:
     assert (np.abs(np.subtract(row["force_red"], red)) <= tolerance).all()
 
 
-def test_the_other_B_does_not_give_the_printed_table() -> None:
+def test_other_B_gives_other_forces() -> None:
     _, table = six_settings(_social(B=0.1))
     assert table["force_blue"][0] == pytest.approx((0.0, 2.1052), abs=HALF + 1e-5)
 
@@ -86,7 +85,7 @@ def test_settings_and_parts_of_networks() -> None:
         np.testing.assert_allclose(wall[1], force.wall(at))
 
 
-def test_arrows_are_the_table() -> None:
+def test_arrows_agree_with_the_table() -> None:
     figure, table = six_settings(_social())
     panels = [ax for ax in figure.axes if ax.get_title()]
     assert [ax.get_title() for ax in panels] == list(table["setting"])
@@ -102,15 +101,15 @@ def test_arrows_are_the_table() -> None:
         }
         scales |= {(a.get_gid(), a.scale, a.scale_units) for a in arrows}
     assert len(scales) == 2  # one for velocities, one for forces
-    says = " ".join(text.get_text() for ax in figure.axes for text in ax.texts)
-    assert "this long: 1 m/s" in says
+    legend = " ".join(text.get_text() for ax in figure.axes for text in ax.texts)
+    assert "this long: 1 m/s" in legend
     longest = max(np.hypot(*force) for force in table["force_blue"])
-    assert f"this long: {longest:.3g} N" in says
+    assert f"this long: {longest:.3g} N" in legend
 
 
-def test_own_settings(tmp_path) -> None:
-    mine = [Setting("close", (0.1, 0.0), (-0.1, 0.0), (0.0, 0.0), (0.0, 0.0))]
-    figure, table = six_settings(_social(), mine)
+def test_user_s_settings(tmp_path) -> None:
+    settings = [Setting("close", (0.1, 0.0), (-0.1, 0.0), (0.0, 0.0), (0.0, 0.0))]
+    figure, table = six_settings(_social(), settings)
     # at rest only the normal force acts: A exp(0.3 / 0.05) + 0.3 k
     force = 0.0044 * np.exp(6.0) + 0.3 * 34.9539
     assert table["force_blue"][0] == pytest.approx((force, 0.0), rel=1e-5)

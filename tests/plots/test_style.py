@@ -1,4 +1,4 @@
-"""The common look, and saving."""
+"""The common style of figures, and saving."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def figure() -> Figure:
     return figure
 
 
-def test_files_and_notebooks_have_150_dots_per_inch(figure: Figure, tmp_path: Path) -> None:
+def test_resolution_of_files_and_notebooks(figure: Figure, tmp_path: Path) -> None:
     path = save(figure, tmp_path / "new" / "a.png")
     assert [p.name for p in path.parent.iterdir()] == ["a.png"]
     for png in (path.read_bytes(), figure._repr_png_()):  # type: ignore[attr-defined]
@@ -35,22 +35,22 @@ def test_files_and_notebooks_have_150_dots_per_inch(figure: Figure, tmp_path: Pa
         assert struct.unpack(">II", png[16:24]) == (3 * 150, 2 * 150)
 
 
-def test_failed_save_keeps_the_old_file_and_leaves_nothing(
+def test_failed_save_keeps_the_old_file(
     figure: Figure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = save(figure, tmp_path / "a.png")
-    before, whole = path.read_bytes(), Image.Image.save
+    content, original_save = path.read_bytes(), Image.Image.save
 
-    def half(image, target, *values, **names):  # type: ignore[no-untyped-def]
+    def failing(image, target, *values, **names):  # type: ignore[no-untyped-def]
         if isinstance(target, io.BytesIO):
-            return whole(image, target, *values, **names)
+            return original_save(image, target, *values, **names)
         Path(target).write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Image.Image, "save", half)
+    monkeypatch.setattr(Image.Image, "save", failing)
     with pytest.raises(ConfigError, match=r"a\.png.*No space left"):
         save(figure, path)
-    assert path.read_bytes() == before
+    assert path.read_bytes() == content
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
@@ -58,7 +58,9 @@ def test_failed_save_keeps_the_old_file_and_leaves_nothing(
     ("name", "message"),
     [("a.pdf", r"\.png, got .*a\.pdf"), ("file/a.png", r"file/a\.png could not be written")],
 )
-def test_save_names_bad_paths(figure: Figure, tmp_path: Path, name: str, message: str) -> None:
+def test_unusable_paths_are_refused(
+    figure: Figure, tmp_path: Path, name: str, message: str
+) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=message):
         save(figure, tmp_path / name)
@@ -71,14 +73,14 @@ def test_curves_differ_without_colour() -> None:
     assert curve_style(len(styles)) == styles[0]
 
 
-def test_colours_in_grey() -> None:
-    """The sequential map is monotone, and all colours stand out from white."""
+def test_brightness_of_colours() -> None:
+    """The sequential map is monotone, and all colours contrast with white."""
     assert (np.diff(colormaps[SEQUENTIAL](np.linspace(0, 1, 64))[:, :3] @ GREY) > 0).all()
     for name, colour in OKABE_ITO.items():
         assert np.dot(to_rgb(colour), GREY) < 0.75, name
 
 
-def test_dress_sets_the_fonts_of_ticks_drawn_later(figure: Figure) -> None:
+def test_font_size_of_tick_labels(figure: Figure) -> None:
     ax = figure.axes[0]
     ax.set_xlim(0, 1000)
     figure.draw_without_rendering()

@@ -1,4 +1,4 @@
-"""Searches for estimates that cannot converge step by step."""
+"""Estimation where single steps fail: kinks, overflow and unstable responses."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ VARIANCES = Variances(
 
 
 class Kink:
-    """The response 1 + |theta| of all samples, which are 0: steps jump across the kink at 0."""
+    """The response 1 + |theta| to samples of 0; search steps jump across the kink at 0."""
 
     def __init__(self) -> None:
-        self.tried: list[float] = []
+        self.trials: list[float] = []
 
     def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
-        self.tried.append(float(theta[0]))
+        self.trials.append(float(theta[0]))
         shape = DRIVERS, SAMPLES
         errors = 0.1 * np.random.default_rng(1).standard_normal(shape)
         return Linearised(
@@ -48,17 +48,17 @@ class Kink:
         )
 
 
-def test_a_search_around_a_kink_ends_with_its_most_likely_iterate() -> None:
+def test_search_across_a_kink_returns_the_best_iterate() -> None:
     model = Kink()
     result = estimate(model, WhiteNoise(), np.array([0.7]), VARIANCES)
-    assert abs(result.theta[0]) == min(abs(theta) for theta in model.tried)
+    assert abs(result.theta[0]) == min(abs(theta) for theta in model.trials)
     assert not result.converged
 
 
 @pytest.mark.thorough
-def test_further_steps_never_make_an_estimate_less_likely() -> None:
+def test_more_steps_do_not_lower_the_likelihood() -> None:
     sequences = nnode.sequences(platoons("idm", "speed_zone", 0.15, 3, 4, 4, 0.0))
-    # far from the zone that slows the vehicles, steps raise the pushes in place of the likelihood
+    # the zone starts far from the true one: steps raise the pushes, not the likelihood
     zone = {"name": "speed_zone", "alpha": 0.8, "a": 200.0, "b": 380.0}
     system = build_model(model_options("idm", "measured", effects=[zone])).double()
     model = Followers(system, paths_of(list(sequences), 0.2)).with_random(["idm.T"])
@@ -81,24 +81,24 @@ def test_further_steps_never_make_an_estimate_less_likely() -> None:
 
 
 class Overflow(Kink):
-    """The same, whose simulations reach numbers that cannot be squared where theta is negative."""
+    """A :class:`Kink` whose residuals overflow when squared where theta is negative."""
 
     def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
         data = super().__call__(theta, agents, start)
         return replace(data, residual=data.residual * 1e200) if theta[0] < 0 else data
 
 
-def test_trial_parameters_that_blow_up_are_refused_without_a_warning() -> None:
+def test_overflowing_trials_are_rejected_without_warning() -> None:
     model = Overflow()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         result = estimate(model, WhiteNoise(), np.array([0.7]), VARIANCES)
-    assert min(model.tried) < 0 < result.theta[0]
+    assert min(model.trials) < 0 < result.theta[0]
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.5])
-def test_steps_to_an_unstable_linear_response_are_not_taken(limit: float) -> None:
-    """The samples are 1 - theta, and small changes grow without bound where theta > ``limit``."""
+def test_steps_to_an_unstable_linear_response_are_rejected(limit: float) -> None:
+    """The residual is 1 - theta, and small changes grow without bound where theta > ``limit``."""
 
     def response(theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
         shape = DRIVERS, SAMPLES

@@ -1,4 +1,4 @@
-"""Errors of the speeds of smoothed leaders."""
+"""The error of smoothed leader speeds."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from nnode.population.followers import LEADER_ERROR, drivers_differ, leader_erro
 from tests.diagnosis.platoons import lin, platoons
 
 SEED = 4
-#: Samples at the ends, where errors are larger.
+#: Samples to leave out at both ends, where errors are larger.
 ENDS = 10
 
 
 def measured(noise: float, samples: int | None = None) -> list[Sequence]:
-    made = platoons(number=6, seconds=30.0, noise=noise, seed=SEED)
-    return [s if samples is None else s.part(0.0, samples / s.n_samples) for s in made]
+    sequences = platoons(number=6, seconds=30.0, noise=noise, seed=SEED)
+    return [s if samples is None else s.part(0.0, samples / s.n_samples) for s in sequences]
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.5])
-def test_it_is_the_error_of_smoothed_speeds_relative_to_their_variation(noise: float) -> None:
+def test_leader_error_is_the_relative_error_of_smoothed_speeds(noise: float) -> None:
     errors, variations = [], []
     for s, true in zip(measured(noise), measured(0.0), strict=True):
         speed = np.gradient(smooth(s.x[..., 0]), s.dt, axis=0)
@@ -32,7 +32,7 @@ def test_it_is_the_error_of_smoothed_speeds_relative_to_their_variation(noise: f
     assert leader_error(measured(noise)) == pytest.approx(expected, rel=0.2)
 
 
-def test_drivers_may_differ_unless_the_error_is_large_or_not_known() -> None:
+def test_random_effects_need_a_small_and_known_leader_error() -> None:
     assert leader_error(measured(0.0)) == 0.0
     assert drivers_differ(lin(), measured(0.0))
     assert drivers_differ(lin(), measured(0.5))

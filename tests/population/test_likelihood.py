@@ -1,4 +1,4 @@
-"""The Kalman filter and Woodbury's identity against a dense Gaussian."""
+"""The marginal likelihood (Kalman filter, Woodbury identity) against a dense Gaussian."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from scipy.stats import multivariate_normal
 
 from nnode.population.likelihood import Linearised, Marginal, PushNoise, marginal
 
-#: Pushes: standard deviation, time (s); sampling interval, s; errors of measurement, m.
+#: Pushes: standard deviation and correlation time (s); sampling interval, s; measurement error, m.
 SIGMA, TAU, DT, ERROR = 0.4, 1.7, 0.2, 0.05
-#: Standard deviations of the agents' and of the starts' deviations.
+#: Standard deviations of the random effects and of the starts.
 SPREAD, START = np.array([0.3, 0.7]), np.array([0.2])
 
 
 def example(seed: int, states: int, leader: tuple[float, float] = (0.0, 1.0)) -> Linearised:
-    """Three segments of two agents, some samples missing.
+    """Three segments of two agents; some samples are missing.
 
     Args:
-        leader: standard deviation and time of errors of the leader's path.
+        leader: standard deviation and correlation time of errors of the leader's path.
     """
     rng = np.random.default_rng(seed)
     segments, samples = 3, 12
@@ -40,42 +40,41 @@ def example(seed: int, states: int, leader: tuple[float, float] = (0.0, 1.0)) ->
 
 
 def covariance(data: Linearised, lasting: tuple[float, ...]) -> np.ndarray:
-    """Of all samples of all segments, without any filter.
+    """The dense covariance matrix of all samples of all segments.
 
     Args:
-        lasting: standard deviation and time of errors that last, or nothing.
+        lasting: standard deviation and correlation time of measurement errors, or nothing.
     """
     segments, samples = data.residual.shape
-    apart = np.abs(np.arange(samples)[:, None] - np.arange(samples)) * DT
-    whole = np.zeros((segments * samples, segments * samples))
+    lag = np.abs(np.arange(samples)[:, None] - np.arange(samples)) * DT
+    matrix = np.zeros((segments * samples, segments * samples))
     assert data.step is not None
     assert data.forced is not None
     for s in range(segments):
-        own = slice(s * samples, (s + 1) * samples)
+        block = slice(s * samples, (s + 1) * samples)
         start = data.start[s] * START
-        whole[own, own] = start @ start.T + ERROR**2 * np.eye(samples)
+        matrix[block, block] = start @ start.T + ERROR**2 * np.eye(samples)
         for p, (sigma, tau) in enumerate([(SIGMA, TAU), data.leader]):
             response = np.zeros((samples, samples))
             state = np.zeros((data.step.shape[-1], samples))
             for k in range(samples - 1):
-                both = np.eye(samples)[k] + np.eye(samples)[k + 1]
-                state = data.step[s, k] @ state + np.outer(data.forced[s, k, :, p], both)
+                ends = np.eye(samples)[k] + np.eye(samples)[k + 1]
+                state = data.step[s, k] @ state + np.outer(data.forced[s, k, :, p], ends)
                 response[k + 1] = state[0]
-            process = sigma**2 * np.exp(-apart / tau)
-            whole[own, own] += response @ process @ response.T
+            process = sigma**2 * np.exp(-lag / tau)
+            matrix[block, block] += response @ process @ response.T
         if lasting:
-            whole[own, own] += lasting[0] ** 2 * np.exp(-apart / lasting[1])
+            matrix[block, block] += lasting[0] ** 2 * np.exp(-lag / lasting[1])
     random = (data.by_deviation * SPREAD).reshape(segments * samples, -1)
     same = np.equal.outer(*[np.repeat(data.agent, samples)] * 2)
-    found: np.ndarray = whole + same * (random @ random.T)
-    return found
+    return np.asarray(matrix + same * (random @ random.T))
 
 
 @pytest.mark.parametrize("leader", [(0.0, 1.0), (0.3, 0.5)])
 @pytest.mark.parametrize("lasting", [(), (0.1, 0.7)])
 @pytest.mark.parametrize("states", [1, 2])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_filter_is_a_dense_gaussian(
+def test_filter_equals_a_dense_gaussian(
     seed: int, states: int, lasting: tuple[float, ...], leader: tuple[float, float]
 ) -> None:
     data = example(seed, states, leader)
@@ -90,21 +89,21 @@ def test_the_filter_is_a_dense_gaussian(
 
     noise = PushNoise()
     products = noise.products(data, np.array([SIGMA, TAU, ERROR, *lasting]))
-    found = marginal(data, products, SPREAD, START)
+    result = marginal(data, products, SPREAD, START)
     restricted = marginal(data, products, SPREAD, START, restricted=True)
 
-    assert found.loglik == pytest.approx(loglik, rel=1e-8)
-    assert found.each.sum() == pytest.approx(loglik, rel=1e-8)
+    assert result.loglik == pytest.approx(loglik, rel=1e-8)
+    assert result.each.sum() == pytest.approx(loglik, rel=1e-8)
     assert restricted.loglik == pytest.approx(loglik + loss, rel=1e-8)
-    np.testing.assert_allclose(found.change, change, rtol=1e-8)
-    np.testing.assert_allclose(found.information, information, rtol=1e-8)
+    np.testing.assert_allclose(result.change, change, rtol=1e-8)
+    np.testing.assert_allclose(result.information, information, rtol=1e-8)
     agent = np.repeat(data.agent, data.observed.shape[1])[observed]
-    z, rest = data.by_deviation.reshape(-1, 2)[observed], np.linalg.solve(v, w - x @ change)
+    weighted = np.linalg.solve(v, w - x @ change)
     for d in range(2):
-        own = z * (agent == d)[:, None]
-        np.testing.assert_allclose(found.deviations[d], SPREAD**2 * (own.T @ rest), rtol=1e-7)
-        left = SPREAD**2 - SPREAD**4 * np.diag(own.T @ np.linalg.solve(v, own))
-        np.testing.assert_allclose(found.variances[d], left, rtol=1e-7)
+        z = data.by_deviation.reshape(-1, 2)[observed] * (agent == d)[:, None]
+        np.testing.assert_allclose(result.deviations[d], SPREAD**2 * (z.T @ weighted), rtol=1e-7)
+        variance = SPREAD**2 - SPREAD**4 * np.diag(z.T @ np.linalg.solve(v, z))
+        np.testing.assert_allclose(result.variances[d], variance, rtol=1e-7)
 
 
 @pytest.mark.parametrize("restricted", [False, True])
@@ -129,14 +128,14 @@ def test_derivatives_by_standard_deviations(restricted: bool) -> None:
     np.testing.assert_allclose(derivatives, differences, rtol=1e-5)
 
 
-def test_bounded_changes_are_the_most_likely_ones_within_the_bounds() -> None:
+def test_bounded_change_maximises_the_likelihood() -> None:
     data = example(5, 2)
     products = PushNoise().products(data, np.array([SIGMA, TAU, ERROR]))
     free = marginal(data, products, SPREAD, START)
     low, high = free.change - 1.0, free.change + np.array([-0.2, 1.0, 1.0])
-    found = marginal(data, products, SPREAD, START, low=low, high=high)
-    assert found.change[0] == pytest.approx(high[0])
-    fixed = found.change + np.outer(np.linspace(-1e-3, 1e-3, 3), [0.0, 1.0, 0.0])
+    bounded = marginal(data, products, SPREAD, START, low=low, high=high)
+    assert bounded.change[0] == pytest.approx(high[0])
+    fixed = bounded.change + np.outer(np.linspace(-1e-3, 1e-3, 3), [0.0, 1.0, 0.0])
     values = [marginal(data, products, SPREAD, START, low=c, high=c).loglik for c in fixed]
-    assert values[1] == pytest.approx(found.loglik)
+    assert values[1] == pytest.approx(bounded.loglik)
     assert max(values) == values[1] < free.loglik

@@ -1,4 +1,4 @@
-"""Estimates of mixed models against those of R's nlme 3.1, which has the same method."""
+"""Mixed-model estimates against R's nlme 3.1, which uses the same method."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nnode.population.estimate import Estimate, Variances, estimate
 from nnode.population.likelihood import Linearised, WhiteNoise
 
 FOLDER = Path(__file__).with_name("data")
-#: Relative difference for derivatives of a function that is known to 1e-16.
+#: Relative step of finite differences.
 DIFFERENCE = 1e-5
 
 #: Values ``(D, K)`` of a function with parameters ``(P, D, 1)``.
@@ -23,12 +23,12 @@ Function = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Curves:
-    """A function of time with parameters that differ between subjects, as a response.
+    """The response of curves whose parameters differ between subjects.
 
     Attributes:
         function: the curves of all subjects.
-        y: ``(D, K)`` what was measured.
-        random: numbers of the parameters that differ.
+        y: ``(D, K)`` measurements.
+        random: indices of the parameters that differ.
     """
 
     function: Function
@@ -36,17 +36,17 @@ class Curves:
     random: list[int]
 
     def __call__(self, theta: np.ndarray, agents: np.ndarray, start: np.ndarray) -> Linearised:
-        own = np.tile(theta[:, None, None], (1, len(self.y), 1))
+        parameters = np.tile(theta[:, None, None], (1, len(self.y), 1))
         if agents.size:
-            own[self.random] += agents.T[..., None]
+            parameters[self.random] += agents.T[..., None]
         columns = []
         for p, value in enumerate(theta):
             step = np.zeros((len(theta), 1, 1))
             step[p] = DIFFERENCE * abs(value)
-            slope = self.function(own + step) - self.function(own - step)
+            slope = self.function(parameters + step) - self.function(parameters - step)
             columns.append(slope / (2 * step[p]))
         fixed = np.stack(columns, -1)
-        residual = self.y - self.function(own)
+        residual = self.y - self.function(parameters)
         if agents.size:
             residual = residual + np.einsum("dkq,dq->dk", fixed[..., self.random], agents)
         return Linearised(
@@ -60,18 +60,18 @@ class Curves:
 
 
 def table(name: str, subject: str) -> tuple[list[str], dict[str, np.ndarray]]:
-    """Names of subjects, and ``(D, K)`` of each column."""
-    read = pd.read_csv(FOLDER / f"{name}.csv", comment="#", dtype={subject: str})
-    names = list(dict.fromkeys(read[subject]))
-    parts = [read[read[subject] == one] for one in names]
+    """Names of subjects, and the ``(D, K)`` values of each column."""
+    data = pd.read_csv(FOLDER / f"{name}.csv", comment="#", dtype={subject: str})
+    names = list(dict.fromkeys(data[subject]))
+    parts = [data[data[subject] == name] for name in names]
     return names, {
         column: np.stack([part[column].to_numpy(dtype=float) for part in parts])
-        for column in read.columns.drop(subject)
+        for column in data.columns.drop(subject)
     }
 
 
 def spreads(residual: float, *random: float) -> Variances:
-    """Where the search for standard deviations begins, with bounds that are far away: 30 times."""
+    """Initial standard deviations, with bounds that are a factor of 30 away."""
     start = np.array([residual, *random])
     return Variances(
         noise=np.array([residual]),
@@ -82,36 +82,36 @@ def spreads(residual: float, *random: float) -> Variances:
     )
 
 
-def errors(found: Estimate) -> np.ndarray:
+def errors(result: Estimate) -> np.ndarray:
     """``(P,)`` standard errors of the parameters."""
-    return np.sqrt(np.diag(np.linalg.inv(found.marginal.information)))
+    return np.sqrt(np.diag(np.linalg.inv(result.marginal.information)))
 
 
-def test_orange_trees_that_grow_to_sizes_of_their_own_are_nlme_s() -> None:
+def test_orange_tree_growth_as_nlme() -> None:
     names, data = table("orange", "Tree")
 
-    def size(own: np.ndarray) -> np.ndarray:
-        most, middle, scale = own
-        return np.asarray(most / (1 + np.exp(-(data["age"] - middle) / scale)))
+    def size(parameters: np.ndarray) -> np.ndarray:
+        asymptote, middle, scale = parameters
+        return np.asarray(asymptote / (1 + np.exp(-(data["age"] - middle) / scale)))
 
-    found = estimate(
+    result = estimate(
         Curves(size, data["circumference"], [0]),
         WhiteNoise(),
         np.array([192.0, 728.0, 350.0]),
         spreads(10.0, 20.0),
         tolerance=1e-7,
     )
-    assert found.converged
-    # nlme stops where its next step is small beside the parameters: further steps move xmid and
-    # scal in the fifth digit, and all that depends on them
-    np.testing.assert_allclose(found.theta, [191.0500, 722.5593, 344.1684], rtol=2e-5)
-    np.testing.assert_allclose(found.variances.row, [7.846254, 31.48255], rtol=1e-6)
-    np.testing.assert_allclose(found.marginal.loglik, -131.584554, atol=3e-5)
-    np.testing.assert_allclose(errors(found), [15.4463, 33.6118, 25.9585], rtol=4e-5)
+    assert result.converged
+    # nlme stops when its next step is small relative to the parameters; further steps would
+    # change the fifth digit of xmid and scal, and all values that depend on them
+    np.testing.assert_allclose(result.theta, [191.0500, 722.5593, 344.1684], rtol=2e-5)
+    np.testing.assert_allclose(result.variances.row, [7.846254, 31.48255], rtol=1e-6)
+    np.testing.assert_allclose(result.marginal.loglik, -131.584554, atol=3e-5)
+    np.testing.assert_allclose(errors(result), [15.4463, 33.6118, 25.9585], rtol=4e-5)
     ranef = {"3": -37.0002, "1": -29.4036, "5": -5.1795, "2": 31.5650, "4": 40.0183}
-    wanted = [ranef[name] for name in names]
-    np.testing.assert_allclose(found.agents[:, 0], wanted, atol=4e-4)
-    np.testing.assert_allclose(found.marginal.deviations[:, 0], wanted, atol=4e-4)
+    expected = [ranef[name] for name in names]
+    np.testing.assert_allclose(result.agents[:, 0], expected, atol=4e-4)
+    np.testing.assert_allclose(result.marginal.deviations[:, 0], expected, atol=4e-4)
 
 
 @pytest.mark.parametrize(
@@ -122,15 +122,15 @@ def test_orange_trees_that_grow_to_sizes_of_their_own_are_nlme_s() -> None:
         (False, [1.3636123, 1.3511790, 0.1463190], -219.8691349),
     ],
 )
-def test_a_linear_mixed_model_of_growing_children_is_nlme_s(
+def test_linear_mixed_model_of_children_as_nlme(
     restricted: bool, variances: list[float], loglik: float
 ) -> None:
     names, data = table("orthodont", "Subject")
 
-    def line(own: np.ndarray) -> np.ndarray:
-        return np.asarray(own[0] + own[1] * data["age"])
+    def line(parameters: np.ndarray) -> np.ndarray:
+        return np.asarray(parameters[0] + parameters[1] * data["age"])
 
-    found = estimate(
+    result = estimate(
         Curves(line, data["distance"], [0, 1]),
         WhiteNoise(),
         np.array([10.0, 1.0]),
@@ -138,12 +138,12 @@ def test_a_linear_mixed_model_of_growing_children_is_nlme_s(
         restricted=restricted,
         tolerance=1e-6,
     )
-    assert found.converged
-    np.testing.assert_allclose(found.theta, [16.7611111, 0.6601852], rtol=1e-7)
-    np.testing.assert_allclose(found.variances.row, variances, rtol=1e-5)
-    np.testing.assert_allclose(found.marginal.loglik, loglik, atol=1e-7)
+    assert result.converged
+    np.testing.assert_allclose(result.theta, [16.7611111, 0.6601852], rtol=1e-7)
+    np.testing.assert_allclose(result.variances.row, variances, rtol=1e-5)
+    np.testing.assert_allclose(result.marginal.loglik, loglik, atol=1e-7)
     if restricted:
-        np.testing.assert_allclose(errors(found), [0.7137960, 0.0656052], rtol=1e-5)
+        np.testing.assert_allclose(errors(result), [0.7137960, 0.0656052], rtol=1e-5)
         np.testing.assert_allclose(
-            found.agents[names.index("M16")], [-0.3324690, -0.0553999], rtol=3e-5
+            result.agents[names.index("M16")], [-0.3324690, -0.0553999], rtol=3e-5
         )

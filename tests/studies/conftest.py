@@ -1,4 +1,4 @@
-"""Tables of a page from invented results."""
+"""Tables of a study's page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The demonstration, as `make demo` runs it, with fewer platoons and epochs."""
+"""The demonstration of `make demo`, with fewer platoons and epochs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from studies.demo.study import demo
 
 
 @pytest.mark.thorough
-def test_the_demo_ends_with_one_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demo_writes_one_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = demo(tmp_path, platoons=16, epochs=2)
     printed = capsys.readouterr().out
     assert printed.rstrip().endswith(f"{page}")

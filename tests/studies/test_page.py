@@ -1,4 +1,4 @@
-"""Templates of pages and tidy frames, on small tables; the quick studies on the recordings."""
+"""Page templates, tidy frames and options of studies; quick studies of the recordings."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def loader(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page, "PackageLoader", lambda *_: templates)
 
 
-def test_blocks_stand_in_the_template_s_order(loader: None) -> None:
+def test_blocks_of_a_template(loader: None) -> None:
     blocks = page.page("x", TABLE, number=2.0, drawn=new_figure(1, 1))
     first, text, table, second, figure, end = blocks
     assert (first, second) == (Heading("First", 2), Heading("Second", 3))
@@ -54,12 +54,12 @@ def test_blocks_stand_in_the_template_s_order(loader: None) -> None:
     assert (figure.caption, figure.alt) == ("A figure.", "A line.")
 
 
-def test_what_the_template_misses_is_an_error(loader: None) -> None:
+def test_missing_template_value_is_an_error(loader: None) -> None:
     with pytest.raises(jinja2.UndefinedError, match="number"):
         page.page("x", TABLE)
 
 
-def test_bold_cells_are_the_least_among_some_rows_or_in_a_row() -> None:
+def test_bold_cells_are_the_lowest_of_rows_or_columns() -> None:
     assert page.lowest_cells(TABLE, ["a"], ["x", "y"])["a"].tolist() == [False, True, False]
     assert page.lowest_cells(TABLE, ["a", "b"], axis=1).to_numpy().tolist() == [
         [False, True],
@@ -68,7 +68,7 @@ def test_bold_cells_are_the_least_among_some_rows_or_in_a_row() -> None:
     ]
 
 
-def test_one_row_per_task_and_one_per_number() -> None:
+def test_tidy_frames() -> None:
     tasks = [Task(f"k{x}", square, {"x": x}) for x in (1, 2)]
     frames = frame.tidy(tasks, {"k1": {"y": 1}, "k2": {"y": 4}})
     assert frames.to_dict("index") == {
@@ -89,20 +89,20 @@ def test_means_and_differences_resample_clusters() -> None:
     noise = np.random.default_rng(0).normal(size=40)[cluster]
     costs = frame.by_unit({"a": 2 + noise, "b": 1 + noise, "c": np.inf + 0 * noise}, cluster)
     mean = frame.means(costs, 0)
-    # of 40 independent clusters, not of 120 units
-    half = 1.96 * noise[::3].std() / np.sqrt(40)
-    assert mean.loc["a", "high"] - mean.loc["a", "mean"] == pytest.approx(half, rel=0.1)
+    # the standard error follows from 40 clusters, not from 120 units
+    half_width = 1.96 * noise[::3].std() / np.sqrt(40)
+    assert mean.loc["a", "high"] - mean.loc["a", "mean"] == pytest.approx(half_width, rel=0.1)
     assert np.isnan(mean.loc["c", "low"])
-    away = frame.differences(costs, [("a", "b"), ("c", "b")], 0)
-    first = away.loc[("a", "b")]
+    differences = frame.differences(costs, [("a", "b"), ("c", "b")], 0)
+    first = differences.loc[("a", "b")]
     assert list(first[["difference", "low", "high", "better"]]) == pytest.approx([1, 1, 1, 0])
     assert first["p"] < 1e-3
-    assert away.loc[("c", "b"), "difference"] == np.inf
-    assert np.isnan(away.loc[("c", "b"), "low"])
+    assert differences.loc[("c", "b"), "difference"] == np.inf
+    assert np.isnan(differences.loc[("c", "b"), "low"])
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         (TrafficStudyOptions(restarts=0), "study.restarts=0 must be at least 1"),
         (TrafficStudyOptions(folds=1), "study.folds=1 must be at least 2"),
@@ -112,8 +112,8 @@ def test_means_and_differences_resample_clusters() -> None:
         (CrowdStudyOptions(horizons=[1.0, 0.0]), "study.horizons=.* must be positive"),
     ],
 )
-def test_options_out_of_range_are_named(options: StudyOptions, words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
+def test_options_out_of_range_are_refused(options: StudyOptions, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         checked(options)
 
 
@@ -125,7 +125,7 @@ def test_quick_options() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", command.STUDIES)
-def test_a_quick_study_makes_its_page(name: str, real_data: Path, tmp_path: Path) -> None:
+def test_quick_study_writes_its_page(name: str, real_data: Path, tmp_path: Path) -> None:
     from omegaconf import OmegaConf
 
     from nnode.config import SCHEMAS

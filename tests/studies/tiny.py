@@ -1,4 +1,4 @@
-"""A study of squares, to test what runs studies."""
+"""A study of squares, for tests of the runner and the command."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SUBTITLE = "Of *two* numbers."
 
 
 def run(options: StudyOptions, folder: Path) -> list[Block]:
-    """Compute two squares, and wait where the folder does not say to stay awake."""
+    """Compute two squares and run two sleeping tasks."""
     assert options.workers is not None
     folder.mkdir(parents=True, exist_ok=True)
     outcome = run_tasks(

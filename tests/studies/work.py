@@ -1,4 +1,4 @@
-"""Work for the runner's tests, and a small study that can be stopped from outside."""
+"""Tasks for tests of the runner, and a small study that can be stopped from outside."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from studies.runner import Task, run_tasks
 
 
 def square(x: float, log: str) -> dict[str, Any]:
-    """The square, and a line in a file of all calls."""
+    """The square; each call is logged in a file."""
     with open(log, "a") as file:
         file.write(f"{x:g}\n")
     return {"y": x * x}
@@ -28,7 +28,7 @@ def cube(x: float, log: str) -> dict[str, Any]:
 
 
 def conditions() -> dict[str, Any]:
-    """Values that JSON has no words for, and what the call runs in."""
+    """Values without a JSON representation, and the process and threads of the call."""
     return {
         "values": [float("nan"), float("inf"), -0.1, 1e-300],
         "text": "κ",
@@ -39,7 +39,6 @@ def conditions() -> dict[str, Any]:
 
 
 def fail(kind: str) -> dict[str, Any]:
-    """Fail in one of many ways."""
     if kind == "data":
         raise DataError("recording 7: no rows")
     if kind == "python":
@@ -53,7 +52,7 @@ def fail(kind: str) -> dict[str, Any]:
 
 def simulate(law: str) -> dict[str, Any]:
     """The end of a small simulation by compiled code."""
-    # imported here: all workers read this file
+    # imported here, because all workers import this module
     from benchmarks.speed.problems import Shape, pose
     from nnode.simulation import FusedSolver
 
@@ -63,14 +62,14 @@ def simulate(law: str) -> dict[str, Any]:
 
 
 def sleep(folder: str, name: str) -> dict[str, Any]:
-    """Leave a sign with the process's id; sleep, unless the folder says not to."""
+    """Write the process id to a file; sleep, unless the folder contains the file ``awake``."""
     (Path(folder) / f"sign-{name}").write_text(str(os.getpid()))
     time.sleep(0.0 if (Path(folder) / "awake").exists() else 600.0)
     return {"name": name}
 
 
 def tasks(folder: Path) -> list[Task]:
-    """Two that are quick and start first, two that sleep."""
+    """Two quick tasks, which start first, and two sleeping tasks."""
     log = str(folder / "calls")
     quick = [Task(f"quick-{x:g}", square, {"x": x, "log": log}, cost=2.0) for x in (1.0, 2.0)]
     sleeping = [Task(f"sleep-{n}", sleep, {"folder": str(folder), "name": n}) for n in "ab"]
@@ -78,7 +77,7 @@ def tasks(folder: Path) -> list[Task]:
 
 
 def study(folder: Path, workers: int) -> None:
-    """Run these tasks, and end as scripts do when they are stopped."""
+    """Run the tasks, and exit like the scripts when interrupted."""
     try:
         run_tasks(tasks(folder), folder, workers=workers, fingerprint="f", title="test")
     except Interrupted as error:

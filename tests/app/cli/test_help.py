@@ -1,4 +1,4 @@
-"""Every command's help says what it does, what can be chosen, and gives examples that work."""
+"""Help texts: purpose, choices, options, and examples that compose."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def test_help_names_purpose_choices_options_and_results(name: str) -> None:
         assert group.startswith("hydra/") or chosen is None or f"\n  * {chosen} " in text
     assert max(len(line) for line in text.splitlines()) <= 100
     assert not re.search(r":\w+:`|``", text)  # markup of docstrings
-    assert not re.search(r"((?:\w+ \| )+\w+): \1", text)  # choices that are said twice
+    assert not re.search(r"((?:\w+ \| )+\w+): \1", text)  # repeated choices
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_every_example_has_options_that_exist(name: str) -> None:
+def test_examples_compose(name: str) -> None:
     commands = examples(words(name))
     assert commands
     for command in commands:
@@ -44,29 +44,29 @@ def test_every_example_has_options_that_exist(name: str) -> None:
         composed(*command)
 
 
-def test_a_wrong_example_would_be_found() -> None:
+def test_examples_are_extracted_from_text() -> None:
     (command,) = examples("Examples:\n  nnode train modle=lin \\\n    seed=1\n")
     assert command == ["train", "modle=lin", "seed=1"]
 
 
-def test_every_option_and_every_choice_says_what_it_means() -> None:
+def test_every_option_and_choice_is_documented() -> None:
     groups = {"model", "data", "solver", "optimizer", "trainer", "study", "split", "loader"}
     groups |= {"discover", "benchmark", "benchmark_discovery"}
     for key, schema in {**SCHEMAS, **benchmark_config.SCHEMAS}.items():
         kind = schema if isinstance(schema, type) else type(schema)
-        silent = {field.name for field in fields(kind)} - set(remarks(kind)) - groups
-        assert not silent, f"{key}: a comment beside {silent} becomes their line of the help"
+        undocumented = {field.name for field in fields(kind)} - set(remarks(kind)) - groups
+        assert not undocumented, f"{key}: {undocumented} need a comment, which is their help"
     for path in CONF.glob("*/*.yaml"):
         assert re.fullmatch(r".+\.", first_comment(path)), path
 
 
-def test_a_script_prints_its_help_with_choices_of_one_s_own(script: Script, tmp_path: Path) -> None:
+def test_help_shows_the_user_s_choices(script: Script, tmp_path: Path) -> None:
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "mine.yaml").write_text(
         "# A law of my own.\ndefaults: [lin_schema, _self_]\nname: mine\nv0: 12.0\n"
     )
-    own = ["--config-dir", str(tmp_path), "model=mine", "solver=fused", "seed=7"]
-    done = script("train", "--help", *own)
+    options = ["--config-dir", str(tmp_path), "model=mine", "solver=fused", "seed=7"]
+    done = script("train", "--help", *options)
     assert done.stderr == ""
     assert done.stdout.startswith("Calibrate a model to measured trajectories.")
     for line in (
@@ -76,16 +76,16 @@ def test_a_script_prints_its_help_with_choices_of_one_s_own(script: Script, tmp_
         assert line in done.stdout
 
 
-#: A command whose standard output nobody reads.
-UNREAD = """
+#: A command whose standard output is a closed pipe.
+CLOSED_PIPE = """
 import os
 from nnode.app.commands.evaluate import main
-ours, theirs = os.pipe()
-os.dup2(theirs, 1)
-os.close(ours)
+reader, writer = os.pipe()
+os.dup2(writer, 1)
+os.close(reader)
 main()
 """
 
 
-def test_a_reader_that_has_seen_enough_is_no_error(script: Script) -> None:
-    assert script(UNREAD, "--help", status=-signal.SIGPIPE).stderr == ""
+def test_closed_pipe_is_no_error(script: Script) -> None:
+    assert script(CLOSED_PIPE, "--help", status=-signal.SIGPIPE).stderr == ""

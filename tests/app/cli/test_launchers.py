@@ -1,4 +1,4 @@
-"""Training in several processes, and sweeps whose runs are other processes."""
+"""Training in several processes, and launchers of sweeps."""
 
 from __future__ import annotations
 
@@ -34,41 +34,41 @@ PROBLEM = (
 
 @pytest.fixture(scope="module")
 def prepared(script: Script, raw: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The override that takes prepared traffic."""
+    """The option that selects prepared traffic data."""
     folder = tmp_path_factory.mktemp("prepared")
-    script("prepare_data", "data=demo_traffic", f"data.source={raw}", f"hydra.run.dir={folder}")
+    script("prepare_data", "data=demo_traffic", f"data.source={raw}", folder=folder)
     return f"data.prepared={folder}"
 
 
 @pytest.fixture(scope="module")
 def alone(script: Script, prepared: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a training in one process."""
+    """The folder of a training in a single process."""
     folder = tmp_path_factory.mktemp("alone")
-    script("train", *PROBLEM, prepared, f"hydra.run.dir={folder}")
+    script("train", *PROBLEM, prepared, folder=folder)
     return folder
 
 
 def problem(*changes: str) -> list[str]:
-    """The problem's options, some of them changed or added."""
+    """The options of `PROBLEM` with changes and additions."""
     names = {change.partition("=")[0] for change in changes}
-    return [*(one for one in PROBLEM if one.partition("=")[0] not in names), *changes]
+    return [*(option for option in PROBLEM if option.partition("=")[0] not in names), *changes]
 
 
 def start(*overrides: str, temporary: Path) -> subprocess.Popen[str]:
-    """Two processes; their temporary files go to a folder of their own."""
+    """A training in two processes, which put temporary files into ``temporary``."""
     temporary.mkdir(exist_ok=True)
     program = [*TORCHRUN, "-m", "nnode", "train"]
     return background(*overrides, program=program, TMPDIR=str(temporary))
 
 
 def difference(a: Path, b: Path) -> float:
-    """Largest difference of the last parameters of two runs."""
+    """The largest difference between the final parameters of two runs."""
     first, second = (load_checkpoint(p / "checkpoints" / "last.pt") for p in (a, b))
     assert first.progress["step"] == second.progress["step"] == 20
     return max(float((first.model[k] - second.model[k]).abs().max()) for k in first.model)
 
 
-@pytest.mark.thorough  # as tests of the trainer do with fewer commands
+@pytest.mark.thorough
 def test_two_processes_train_as_one(alone: Path, prepared: str, tmp_path: Path) -> None:
     run, temporary = tmp_path / "run", tmp_path / "tmp"
     process = start(*PROBLEM, prepared, f"hydra.run.dir={run}", temporary=temporary)
@@ -78,14 +78,14 @@ def test_two_processes_train_as_one(alone: Path, prepared: str, tmp_path: Path) 
     assert out.count("best checkpoint:") == 1
     assert out.count("sequences train") == 1
     assert {p.name for p in run.iterdir()} == {p.name for p in alone.iterdir()}
-    assert not list(temporary.glob("nnode-*"))  # the second process has cleaned up
+    assert not list(temporary.glob("nnode-*"))  # the second process removed its files
 
 
 @pytest.mark.thorough
-def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_path: Path) -> None:
+def test_two_processes_stop_and_one_resumes(script: Script, prepared: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     last = run / "checkpoints" / "last.pt"
-    # long enough that the signal meets it
+    # long enough to be interrupted
     options = problem("trainer.max_epochs=100000", "trainer.save_every=0", prepared)
     process = start(*options, f"hydra.run.dir={run}", temporary=tmp_path / "tmp")
     while not last.exists() and process.poll() is None:
@@ -96,8 +96,7 @@ def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_p
     assert errors.count("everything up to here is in") == 1
     saved = load_checkpoint(last)
     end = saved.progress["epoch"] + 1
-    # another number of processes goes on
-    script("train", f"resume={last}", f"trainer.max_epochs={end}", f"hydra.run.dir={run}")
+    script("train", f"resume={last}", f"trainer.max_epochs={end}", folder=run)
     assert load_checkpoint(last).progress["epoch"] == end
 
 
@@ -109,24 +108,24 @@ def test_stopped_together_and_gone_on_alone(script: Script, prepared: str, tmp_p
         ("solver.dt=0.03", "error: solver.dt=0.03 s does not divide", 2),  # with the data
     ],
 )
-def test_an_error_is_said_once(
+def test_error_is_printed_once(
     forks: Forks, prepared: str, tmp_path: Path, override: str, message: str, status: int
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
-    # what torchrun tells its processes
-    place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
-    places = [{**place, "RANK": rank, "LOCAL_RANK": rank} for rank in "01"]
-    run = f"hydra.run.dir={tmp_path / 'run'}"
-    processes = [forks.start("train", *problem(override), prepared, run, **own) for own in places]
+    environment = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
+    options = (*problem(override), prepared, f"hydra.run.dir={tmp_path / 'run'}")
+    processes = [
+        forks.start("train", *options, **environment, RANK=rank, LOCAL_RANK=rank) for rank in "01"
+    ]
     errors = [process.communicate()[1] for process in processes]
     assert [process.returncode for process in processes] == [status, status]
     assert "".join(errors).count(message) == 1
 
 
-@pytest.mark.thorough  # processes of some launchers load all libraries
+@pytest.mark.thorough
 @pytest.mark.parametrize("launcher", ["basic", "cores", "submitit_local"])
-def test_a_sweep_ends_with_one_table_and_survives_a_failing_run(
+def test_sweep_continues_after_a_failed_run(
     script: Script, prepared: str, tmp_path: Path, launcher: str
 ) -> None:
     done = script(
@@ -147,10 +146,10 @@ def test_a_sweep_ends_with_one_table_and_survives_a_failing_run(
     assert "sweep.csv" in done.stdout
 
 
-def test_failures_of_an_earlier_sweep_in_the_same_folder_do_not_count(
+def test_failures_of_an_earlier_sweep_are_ignored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runs, "_sweep", {})  # commands that later tests fork inherit this process
+    monkeypatch.setattr(runs, "_sweep", {})  # forked commands inherit this state
     config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
     failed = {"error": "of an earlier sweep"}
     for job in ("0", "1"):
@@ -167,8 +166,8 @@ def test_failures_of_an_earlier_sweep_in_the_same_folder_do_not_count(
     assert pd.read_csv(tmp_path / "sweep.csv")["model"].tolist()[0] == "lin"
 
 
-def test_slurm_launcher_gives_submitit_what_it_knows() -> None:
+def test_slurm_launcher_settings() -> None:
     settings = composed("train", "hydra/launcher=slurm").hydra.launcher
     assert settings._target_.endswith("submitit_launcher.SlurmLauncher")
     assert settings.cpus_per_task == 1
-    assert settings.max_num_timeout == 0  # of the plugin's own
+    assert settings.max_num_timeout == 0

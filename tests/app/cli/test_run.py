@@ -1,4 +1,4 @@
-"""Command lines compose, wrong ones are refused before work starts, and errors have a status."""
+"""Valid command lines compose; invalid ones give one error line and an exit status."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from nnode.__main__ import main as program
-from nnode.app.cli.typed import shell_override
 from nnode.app.training import build_solver
 from nnode.calibrate.options import FusedOptions
 from nnode.errors import ConfigError
@@ -37,30 +36,31 @@ from tests.app.conftest import CONF, Script, composed
         ["hydra/launcher=slurm", "hydra.launcher.partition=all"],
     ],
 )
-def test_right_options_compose(overrides: list[str]) -> None:
+def test_valid_options_compose(overrides: list[str]) -> None:
     composed("train", *overrides)
 
 
-def test_a_mapping_takes_any_name() -> None:
+def test_mapping_option_accepts_any_key() -> None:
     overrides = ["data=vehicles", "data.path=a.csv", "data.columns.time=t"]
     assert composed("train", *overrides).data.columns == {"time": "t"}
 
 
 def test_every_choice_composes() -> None:
-    # other commands have no group that this one does not have; one choice of every group at a time,
-    # but experiments choose themselves
+    # Other commands have no further groups. Experiments choose groups themselves.
     groups = composed("train").hydra.runtime.choices
     files = {group: sorted((CONF / group).glob("*.yaml")) for group in groups}
     for experiment in files.pop("experiment"):
         composed("train", f"experiment={experiment.stem}")
-    for chosen in zip_longest(*([f"{g}={f.stem}" for f in own] for g, own in files.items())):
-        composed("train", *filter(None, chosen))
+    for choices in zip_longest(
+        *([f"{g}={path.stem}" for path in paths] for g, paths in files.items())
+    ):
+        composed("train", *filter(None, choices))
 
 
 VEHICLES = "data=vehicles 'data.columns={vehicle: vehicle, time: time, x: x}'"
-#: What is typed, what the answer has to contain, and the exit status.
+#: Command line, pattern of the error message, and exit status (2 if absent).
 WRONG = [
-    # what there is not, with what is nearest
+    # unknown names, with a suggestion
     ("train modle=lin", r"train has no option modle; did you mean model\? train has model, "),
     ("train model=linn", r"no model=linn; did you mean model=lin\? model is one of a10, "),
     ("train -m model=lin,idmm", r"no model=idmm; did you mean model=idm\? model is one of"),
@@ -109,7 +109,7 @@ WRONG = [
         r"parameters.T=-3: T .* at least 0.05 s and at most 5 s; -3 is not: type .*T.value='1.2 s'",
     ),
     ("train model=idm data=esimas solver.method=eulerr", r"did you mean euler\?"),
-    # values, and what is no option
+    # invalid values and syntax
     ("train trainer.max_epochs=three", "trainer.max_epochs=three: expected a whole number"),
     ("train seed=abc", "seed=abc: expected a whole number"),
     ("train seed.x=1", "seed.x=1: seed is a value, without options of its own"),
@@ -132,7 +132,7 @@ WRONG = [
     ("train --shell-completion", "there is no flag --shell-completion"),
     ("train --cfg jobs", r"argument -c/--cfg: .* \(choose from 'job', 'hydra', 'all'\)"),
     ("train --config-dir /nowhere", "--config-dir /nowhere: there is no such folder"),
-    # what is wrong with files and values
+    # missing arguments, unreadable files
     ("export", "error: run is missing; type run=VALUE, --help shows examples\n$"),
     ("train data=table", "error: data.domain is missing; type data.domain=VALUE"),
     ("train mine.csv", "error: mine.csv is no option: expected NAME=VALUE, --help shows"),
@@ -172,8 +172,8 @@ WRONG = [
     ("train -m seed=1,2 hydra.sweep.dir=/proc/none", "/proc/none cannot be made: .*sweep.dir=", 1),
 ]
 
-#: Words of Hydra's, of OmegaConf's and of Python's that no answer has.
-UNSAID = (
+#: Words of Hydra, OmegaConf and Python that no message contains.
+INTERNAL = (
     *("Traceback", "_schema", "HYDRA_FULL_ERROR", "search path", "Options'", "hydra.cc"),
     *("possible interpolation", "raised while", "mandatory", "full_key", "ListConfig"),
     "DictConfig",
@@ -201,10 +201,10 @@ def files(raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("line", "words", "status"),
-    [(*row, 2)[:3] for row in WRONG],  # the status is 2 if none is given
+    [(*row, 2)[:3] for row in WRONG],
     ids=[line for line, *_ in WRONG],
 )
-def test_a_wrong_command_is_answered_in_words(
+def test_invalid_command_gives_one_error_line(
     script: Script, files: Path, tmp_path: Path, line: str, words: str, status: int
 ) -> None:
     name, *arguments = shlex.split(line.replace("$T", str(files)))
@@ -212,7 +212,7 @@ def test_a_wrong_command_is_answered_in_words(
         arguments += [f"hydra.run.dir={tmp_path}", f"hydra.sweep.dir={tmp_path}"]
     done = script(name, *arguments, status=status)
     assert re.search(words, done.stderr)
-    for word in UNSAID:
+    for word in INTERNAL:
         assert word not in done.stderr
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
@@ -220,53 +220,46 @@ def test_a_wrong_command_is_answered_in_words(
     assert not (tmp_path / "checkpoints").exists()
 
 
-def test_a_file_that_may_not_be_read(script: Script, tmp_path: Path) -> None:
-    """The superuser may read all, so the system's refusal is staged."""
-    path = tmp_path / "shut.csv"
+def test_file_without_read_permission(script: Script, tmp_path: Path) -> None:
+    """The system's refusal is simulated because the superuser may read every file."""
+    path = tmp_path / "protected.csv"
     path.write_text("sequence,time,agent,x\n0,0,a,0\n")
     code = f"""
 import sys
 from nnode.app.commands.train import main
-def shut(event, arguments):
+def refuse(event, arguments):
     if event == "open" and arguments[0] == {str(path)!r}:
         raise PermissionError(13, "Permission denied", {str(path)!r})
-sys.addaudithook(shut)
+sys.addaudithook(refuse)
 main()
 """
     options = ["data=table", "data.domain=traffic", f"data.path={path}"]
-    done = script(code, *options, f"hydra.run.dir={tmp_path / 'run'}", status=1)
+    done = script(code, *options, folder=tmp_path / "run", status=1)
     assert done.stderr.startswith(f"error: {path} cannot be read")
     assert "Permission denied" in done.stderr
 
 
-def test_what_is_shown_in_place_of_working(script: Script) -> None:
+def test_configuration_and_version_are_printed(script: Script) -> None:
     assert "hidden: 4" in script("train", "--cfg", "job", "model=n4", "-p", "model").stdout
     assert re.fullmatch(r"nnode \d+\.\d+\.\d+\n", script("train", "--version").stdout)
 
 
-def test_the_fused_solver_gets_its_options() -> None:
-    solver = build_solver(
-        FusedOptions(dt=0.01, threads=2, cutoff=2.5, cutoff_error=1e-6, method="ballistic")
-    )
+def test_fused_solver_receives_its_options() -> None:
+    options = {"dt": 0.01, "threads": 2, "cutoff": 2.5, "cutoff_error": 1e-6, "method": "ballistic"}
+    solver = build_solver(FusedOptions(**options))
     assert isinstance(solver, FusedSolver)
-    given = {"dt": 0.01, "threads": 2, "cutoff": 2.5, "cutoff_error": 1e-6}
-    assert vars(solver) == {**given, "method": "ballistic", "uncompiled": ""}
+    assert vars(solver) == {**options, "uncompiled": ""}
     with pytest.raises(ConfigError, match=r"solver\.cutoff_error=2 must be"):
         build_solver(FusedOptions(cutoff_error=2))
 
 
-def test_what_is_printed_can_be_pasted_into_a_shell() -> None:
-    for place in ("runs/a/last.pt", "/tmp/a folder/it's/last.pt", "a,b=[c]/x.pt"):
-        assert composed("train", *shlex.split(shell_override("resume", place))).resume == place
-
-
 @pytest.mark.parametrize(
-    ("given", "meant"), [("diagnose", "discover"), ("fit", "train"), ("dicover", "discover")]
+    ("typed", "meant"), [("diagnose", "discover"), ("fit", "train"), ("dicover", "discover")]
 )
-def test_an_unknown_command_is_told_the_one_that_was_meant(
-    given: str, meant: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_unknown_command_gets_a_suggestion(
+    typed: str, meant: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["nnode", given])
+    monkeypatch.setattr("sys.argv", ["nnode", typed])
     with pytest.raises(SystemExit, match="2"):
         program()
     assert capsys.readouterr().err.endswith(f"did you mean {meant}?\n")

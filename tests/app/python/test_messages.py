@@ -1,4 +1,4 @@
-"""Options in messages for who calls in Python."""
+"""Messages name options that Python accepts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nnode.errors import IN_PYTHON, ConfigError, DataError
 from tests.data.check.planted import cars
 
 
-def test_what_a_message_names_is_taken() -> None:
+def test_option_named_in_a_message_is_accepted() -> None:
     table = pd.concat(
         [
             cars(3, 6.0).assign(sequence=k).rename(columns={"veh": "agent", "t": "time"})
@@ -28,12 +28,12 @@ def test_what_a_message_names_is_taken() -> None:
         nnode.fit(table, "traffic", fault="keep")
 
 
-def test_what_may_be_two_things_is_an_error_that_names_both() -> None:
+def test_ambiguous_tables_give_an_error_with_the_options() -> None:
     table = cars(4, 10.0)
-    two = table.assign(track=table.veh + (table.t > 5))
+    ambiguous = table.assign(track=table.veh + (table.t > 5))
     with pytest.raises(ConfigError, match=r"agent may be veh or track.*data\.columns\.agent=veh"):
-        nnode.fit(two, "traffic")
-    assert len(nnode.sequences(two, columns={"agent": "track"})) > 0
+        nnode.fit(ambiguous, "traffic")
+    assert len(nnode.sequences(ambiguous, columns={"agent": "track"})) > 0
     frames = table.assign(frame=(10 * table.t).round()).drop(columns=["t", "v"])
     with pytest.raises(ConfigError, match=r"5 or 10 or .* frames/s fit: .*data\.frame_rate=\d+"):
         nnode.fit(frames, "traffic")

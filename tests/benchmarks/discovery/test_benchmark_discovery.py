@@ -1,4 +1,4 @@
-"""The benchmark of the diagnosis, with a quick substitute for the diagnosis."""
+"""The benchmark of the diagnosis, with a substitute for the diagnosis."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from nnode.diagnosis import thresholds
 from nnode.errors import ConfigError, DataError
 
 CALLS: list[dict[str, Any]] = []
-ONE = {"domains": ["traffic"], "arms": ["single"]}
+TRAFFIC = {"domains": ["traffic"], "arms": ["single"]}
 
 
 def relative_speed(path: Path, domain: str, **given: Any) -> SimpleNamespace:
-    """Names relative speed always, and refuses data with jumps."""
+    """A diagnosis that always reports relative speed and refuses data with jumps."""
     assert {p.name for p in path.parent.iterdir()} <= {"trajectories.csv", "walls.csv"}
     values = {name: v for name, v in vars(thresholds).items() if name.isupper()}
     CALLS.append({"domain": domain, "thresholds": values, **given})
@@ -49,18 +49,16 @@ def diagnosis(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run(folder: Path, **options: Any) -> pd.DataFrame:
-    given = {
-        **{"workers": 1, "seeds": 1, "nothing_seeds": 1, "sizes": [3]},
-        **{"strengths": ["full"], "baseline_seeds": 0, **options},
-    }
-    chosen = DiscoveryBenchmarkConfig(benchmark_discovery=DiscoveryBenchmarkOptions(**given))
-    benchmark_discovery(OmegaConf.structured(chosen), folder)
+    small = {"workers": 1, "seeds": 1, "nothing_seeds": 1, "sizes": [3], "strengths": ["full"]}
+    chosen = DiscoveryBenchmarkOptions(**{**small, "baseline_seeds": 0, **options})
+    config = DiscoveryBenchmarkConfig(benchmark_discovery=chosen)
+    benchmark_discovery(OmegaConf.structured(config), folder)
     return pd.read_csv(folder / "synthetic.csv", keep_default_na=False)
 
 
-def test_named_effects_are_scored_and_finished_cases_are_kept(tmp_path):
-    run(tmp_path, **ONE, effects=["time_gap"])
-    rows = run(tmp_path, **ONE, effects=["relative_speed", "time_gap"]).set_index("hidden")
+def test_effects_are_scored_and_finished_cases_are_kept(tmp_path):
+    run(tmp_path, **TRAFFIC, effects=["time_gap"])
+    rows = run(tmp_path, **TRAFFIC, effects=["relative_speed", "time_gap"]).set_index("hidden")
     assert len(CALLS) == 2
     assert rows.loc["relative_speed", "exact"]
     assert rows.loc["time_gap", ["exact", "class_right"]].tolist() == [False, True]
@@ -71,7 +69,7 @@ def test_named_effects_are_scored_and_finished_cases_are_kept(tmp_path):
     assert "1 of 2 (50 %, 1–99 %)" in page
 
 
-def test_false_names_and_failures_are_counted(tmp_path):
+def test_false_effects_and_failures_are_counted(tmp_path):
     rows = run(tmp_path, domains=["traffic"], arms=["nothing", "fault"], variants=["white", "jump"])
     jumped = rows.set_index("variant").loc["jump"]
     assert (jumped["verdict"], jumped["failure"]) == ("error", "DataError: too far within one step")
@@ -79,19 +77,19 @@ def test_false_names_and_failures_are_counted(tmp_path):
     assert (rows.loc[rows["arm"] == "nothing", "false_names"] == "relative_speed").all()
 
 
-def test_published_seeds_follow_from_a_commit_and_the_page_says_so(tmp_path):
-    run(tmp_path, **ONE, effects=["inertia"], first_seed=3)
+def test_seeds_of_a_commit(tmp_path):
+    run(tmp_path, **TRAFFIC, effects=["inertia"], first_seed=3)
     assert "development" in (tmp_path / "benchmark.md").read_text()
     commit = "0" * 40
-    rows = run(tmp_path, **ONE, effects=["inertia"], seeds_of=commit)
-    # cases of other seeds are not mixed in
+    rows = run(tmp_path, **TRAFFIC, effects=["inertia"], seeds_of=commit)
+    # cases of other seeds are excluded
     assert list(rows["seed"]) == [first_seed(commit)]
     page = (tmp_path / "benchmark.md").read_text()
     assert f"from the hash of the commit that froze the rules, {commit}" in page
     assert "development" not in page
 
 
-def test_the_diagnosis_is_given_the_base_model_and_no_more(tmp_path):
+def test_diagnosis_gets_the_base_model_only(tmp_path):
     run(tmp_path, arms=["single"], effects=["inertia", "drift"], noises=[0.0])
     crowd, traffic = sorted(CALLS, key=lambda call: call["domain"])
     assert traffic["model"]["term"] in ("lin", "log")
@@ -100,10 +98,10 @@ def test_the_diagnosis_is_given_the_base_model_and_no_more(tmp_path):
     assert crowd["walls"].name == "walls.csv"
 
 
-def test_the_default_has_all_arms():
-    every = synthetic.cases("synthetic", DiscoveryBenchmarkOptions(baseline_seeds=0), 0)
+def test_default_cases_contain_all_arms():
+    cases = synthetic.cases("synthetic", DiscoveryBenchmarkOptions(baseline_seeds=0), 0)
     for domain in ("traffic", "crowd"):
-        part = [a["case"] for a in every.values() if a["case"]["domain"] == domain]
+        part = [a["case"] for a in cases.values() if a["case"]["domain"] == domain]
         nothing = [case["variant"] for case in part if case["arm"] == "nothing"]
         assert len(nothing) == 400 * len(set(nothing)) >= 1600
         singles = [case["effects"][0] for case in part if case["arm"] == "single"]
@@ -112,8 +110,8 @@ def test_the_default_has_all_arms():
 
 
 @pytest.mark.thorough
-def test_each_threshold_is_halved_and_doubled(tmp_path):
-    rows = run(tmp_path, **ONE, kinds=["rules"], effects=["inertia"])
+def test_thresholds_are_halved_and_doubled(tmp_path):
+    rows = run(tmp_path, **TRAFFIC, kinds=["rules"], effects=["inertia"])
     number = sum(name.isupper() for name in vars(thresholds))
     assert len(set(rows["thresholds"])) == len(rows) == 1 + 2 * number
     assert len({str(call["thresholds"]) for call in CALLS}) == len(CALLS) == len(rows)
@@ -135,15 +133,15 @@ def test_each_threshold_is_halved_and_doubled(tmp_path):
         ({"baseline_seeds": 2}, "baseline_seeds=2 needs pysindy: install .* or give 0"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(tmp_path, monkeypatch, options, message):
+def test_invalid_options_are_refused(tmp_path, monkeypatch, options, message):
     monkeypatch.setattr(synthetic, "find_spec", lambda name: None if name == "pysindy" else name)
     with pytest.raises(ConfigError, match=message):
-        run(tmp_path, **{**ONE, **options})
+        run(tmp_path, **{**TRAFFIC, **options})
     assert not CALLS
 
 
 def test_shares_have_exact_intervals() -> None:
-    # Clopper and Pearson 1934: 0 of 10 leaves up to 1 - 0.025^(1/10)
+    # Clopper and Pearson 1934: the upper limit of 0 of 10 is 1 - 0.025^(1/10)
     limit = 100 * (1 - 0.025**0.1)
     assert share(pd.Series([False] * 10 + [None])) == f"0 of 10 (0 %, 0–{limit:.0f} %)"
     assert share(pd.Series([None], dtype=object)) == "–"

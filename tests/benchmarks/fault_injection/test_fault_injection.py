@@ -1,4 +1,4 @@
-"""Misuse on purpose, shortly; the whole of it with -m slow."""
+"""Short campaigns of fault injection; complete campaigns with -m slow."""
 
 from __future__ import annotations
 
@@ -15,44 +15,45 @@ from benchmarks.fault_injection.targets import Target
 from tests.app.conftest import Script, composed
 
 
-def report(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
+def run(script: Script, folder: Path, *overrides: str) -> dict[str, Any]:
+    """The report of campaigns without losses."""
     script("fault_injection", *overrides, f"hydra.run.dir={folder}")
-    found: dict[str, Any] = json.loads((folder / "report.json").read_text())
-    assert found["losses"] == 0
-    return found
+    report: dict[str, Any] = json.loads((folder / "report.json").read_text())
+    assert report["losses"] == 0
+    return report
 
 
 @pytest.mark.thorough
-def test_every_campaign_shortly(script: Script, tmp_path: Path) -> None:
-    found = report(script, tmp_path, "jobs=[prepare_data]", "kills=6", "repeats=2", "inputs=1150")
-    assert found["tried"]["kills"] == 6
-    assert found["tried"]["fuzz"] >= 1150
-    assert found["tried"]["disk"] >= 6
-    assert found["tried"]["folder"] >= 2
-    rows = {(row["campaign"], row["what"]): row for row in found["rows"]}
+def test_short_campaigns(script: Script, tmp_path: Path) -> None:
+    report = run(script, tmp_path, "jobs=[prepare_data]", "kills=6", "repeats=2", "inputs=1150")
+    assert report["tried"]["kills"] == 6
+    assert report["tried"]["fuzz"] >= 1150
+    assert report["tried"]["disk"] >= 6
+    assert report["tried"]["folder"] >= 2
+    rows = {(row["campaign"], row["what"]): row for row in report["rows"]}
     assert rows["kills", "prepare_data"]["facts"]["ends compared"] >= 1
     assert rows["disk", "prepare_data, size of files"]["facts"]["refused"] >= 3
     for (campaign, _), row in rows.items():
         if campaign == "fuzz":
             assert row["facts"]["read"] + row["facts"]["refused"] == row["tried"] >= 50
-    # nothing of the campaigns is left beside the report
-    assert not [p.name for p in tmp_path.iterdir() if p.name in ("kills", "disk", "fuzz")]
+    # files of the campaigns are removed
+    assert not {p.name for p in tmp_path.iterdir()} & {"kills", "disk", "fuzz"}
 
 
 @pytest.mark.slow
 def test_all_jobs(script: Script, tmp_path: Path) -> None:
-    found = report(script, tmp_path, "campaigns=[kills,disk,folder]", "kills=50")
-    assert found["tried"]["kills"] >= 50
+    report = run(script, tmp_path, "campaigns=[kills,disk,folder]", "kills=50")
+    assert report["tried"]["kills"] >= 50
 
 
 @pytest.mark.slow
 def test_many_inputs(script: Script, tmp_path: Path) -> None:
-    found = report(script, tmp_path, "campaigns=[fuzz]", "inputs=104000")
-    assert found["tried"]["fuzz"] >= 100_000
+    report = run(script, tmp_path, "campaigns=[fuzz]", "inputs=104000")
+    assert report["tried"]["fuzz"] >= 100_000
 
 
 @pytest.mark.thorough
-def test_a_reader_that_misbehaves_is_a_loss(tmp_path: Path) -> None:
+def test_misbehaving_readers_are_losses(tmp_path: Path) -> None:
     outside, scratch = tmp_path / "elsewhere", tmp_path / "fuzz"
     scratch.mkdir()
 
@@ -75,6 +76,6 @@ def test_a_reader_that_misbehaves_is_a_loss(tmp_path: Path) -> None:
     assert (rows[3].losses, rows[3].tried, rows[3].facts["read"]) == ([], 10, 10)
 
 
-def test_the_jobs_are_asked_for_in_words_that_the_scripts_know(tmp_path: Path) -> None:
+def test_jobs_have_valid_options(tmp_path: Path) -> None:
     for job in jobs(tmp_path / "raw"):
         composed(job.name, *job.first)

@@ -1,4 +1,4 @@
-"""A diagnosis that is timed, and the comparison of two checkouts."""
+"""The timed diagnosis, and the comparison of two checkouts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from benchmarks.speed import against, diagnosis
 
 
-def test_platoons_follow_each_other() -> None:
+def test_platoons_do_not_collide() -> None:
     time, x = diagnosis.data(3, vehicles=5, seconds=20.0)
     assert x.shape == (*time.shape, 5)
     assert (np.diff(x, axis=2) > diagnosis.LENGTH).all()
@@ -18,7 +18,7 @@ def test_platoons_follow_each_other() -> None:
 
 
 @pytest.mark.thorough
-def test_a_checkout_is_compared_with_itself(capfd: pytest.CaptureFixture[str]) -> None:
+def test_comparison_of_a_checkout_with_itself(capfd: pytest.CaptureFixture[str]) -> None:
     against.main(["--against", str(diagnosis.HERE), "--cases", "diagnosis_4"])
     row = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert row["same"]

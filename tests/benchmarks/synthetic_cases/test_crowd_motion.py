@@ -1,4 +1,4 @@
-"""People move as the formulas say: closed forms, symmetry, and another integrator.
+"""The motion of people against closed forms, symmetry and another integrator.
 
 Places, velocities and forces are complex numbers.
 """
@@ -14,7 +14,7 @@ from benchmarks.synthetic_cases.crowd.motion import Base, Hidden, People, accele
 
 BASE = Base(A=16.0, k=400.0, kappa=20.0)
 FREE = Base(A=0.0, k=0.0, kappa=0.0)
-# contacts have a kink, at which no method keeps its order
+# without contacts, whose kink lowers the order of every method
 SMOOTH = Base(A=16.0, k=0.0, kappa=0.0)
 NOTHING = Hidden()
 WALL = np.array([[-5, 5]], complex)
@@ -34,7 +34,7 @@ def acceleration(
     eta=0.0,
     since=0.0,
 ):
-    """``(N,)`` m/s² of people who, where nothing else is said, steer straight on."""
+    """``(N,)`` accelerations (m/s²); without ``goal`` people steer straight ahead."""
     x, v = np.array(x, complex), np.array(v, complex)
     group = np.full(len(x), -1) if group is None else np.array(group)
     goal = x + 1e6 * v if goal is None else np.array(goal, complex)
@@ -46,7 +46,7 @@ def decay(distance: float, size: float = 16.0, reach: float = 0.3) -> float:
     return size * float(np.exp(-distance / reach))
 
 
-#: A pair in which each sees the other straight ahead, and one in which both walk to the right.
+#: Velocities of a pair that approaches head-on, and of a pair that walks in the same direction.
 X, V, AFTER = [0, 1.2], [1, -1], [1, 0.5]
 PAIR = decay(1.2 - 0.5) / 2
 TURN = np.exp(0.5j)
@@ -55,10 +55,10 @@ TURN = np.exp(0.5j)
 @pytest.mark.parametrize(
     ("x", "v", "scene", "expected"),
     [
-        # people turn to the destination at the present speed
+        # relaxation to the direction of the destination at the current speed
         ([0], [1.5], {"goal": [100j], "base": FREE}, [-3 + 3j]),
         ([0], [1.5], {"goal": [100j], "base": FREE, "eta": 0.5}, [-4.5 + 4.5j]),
-        # the social force, also in contact, sliding past each other
+        # the social force without and with contact and sliding
         ([0, 1], [1, 1], {}, [-decay(0.5) / 2, decay(0.5) / 2]),
         (
             [0, 0.4],
@@ -66,9 +66,9 @@ TURN = np.exp(0.5j)
             {},
             [-(decay(-0.1) + 40) / 2 - 2j, (decay(-0.1) + 40) / 2 + 2j],
         ),
-        # points of walls count by their mean
+        # the mean over points of walls
         ([0.5j], [1], {"points": [0, 100, 200, 300]}, [decay(0.25) * 1j / 4]),
-        # effects on the pair force change it alone
+        # effects on the pair force
         (X, AFTER, {"hidden": Hidden(lambda_=0.2)}, [-PAIR, 0.2 * PAIR]),
         (X, V, {"hidden": Hidden(T_a=0.2)}, [-decay(0.3) / 2, decay(0.3) / 2]),
         (X, V, {"hidden": Hidden(theta=0.5)}, [-PAIR * TURN, PAIR * TURN]),
@@ -80,7 +80,7 @@ TURN = np.exp(0.5j)
             {"base": FREE, "hidden": Hidden(friction=0.6)},
             [-1.2 * np.exp(-1), 1.2 * np.exp(-1)],
         ),
-        # groups draw together
+        # group cohesion
         (
             [0, 1j, 2, 3 + 3j],
             [1] * 4,
@@ -97,12 +97,12 @@ TURN = np.exp(0.5j)
         ),
     ],
 )
-def test_accelerations_are_what_their_formulas_say(x, v, scene, expected):
+def test_accelerations_by_hand(x, v, scene, expected):
     np.testing.assert_allclose(acceleration(x, v, **scene), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("hidden", "first"),
+    ("hidden", "expected"),
     [
         (Hidden(A_2=0.5, B_2=0.8), -decay(0.7, 0.5, 0.8)),
         (Hidden(side=0.4), -0.4j * (1 - np.exp(-1 / (1 + np.exp(-6.0))))),
@@ -117,12 +117,12 @@ def test_accelerations_are_what_their_formulas_say(x, v, scene, expected):
         (Hidden(push=0.3, push_T=1.0), 0.3j),
     ],
 )
-def test_effects_without_the_base_force_are_what_their_formulas_say(hidden, first):
-    found = acceleration(X, V, FREE, hidden, clock=0.25, since=2.0)
-    np.testing.assert_allclose(found[0], first, atol=1e-9)
+def test_effects_without_base_force_by_hand(hidden, expected):
+    result = acceleration(X, V, FREE, hidden, clock=0.25, since=2.0)
+    np.testing.assert_allclose(result[0], expected, atol=1e-9)
 
 
-def test_turning_the_scene_turns_the_accelerations():
+def test_accelerations_rotate_with_the_scene():
     rng, turn = np.random.default_rng(4), np.exp(0.7j)
     x, v = (rng.uniform(0, 4, (6, 2)) @ [1, 1j], rng.normal(0, 1, (6, 2)) @ [1, 1j])
     strengths = {"A_2": 0.3, "lambda_": 0.3, "T_a": 0.4, "side": 0.3, "theta": 0.4, "align": 0.2}
@@ -132,8 +132,8 @@ def test_turning_the_scene_turns_the_accelerations():
     np.testing.assert_allclose(turned, acceleration(x, v, **scene) * turn, rtol=1e-6, atol=1e-6)
 
 
-def test_another_integrator_finds_the_same_motion_and_errors_fall_sixteenfold(monkeypatch):
-    # the force of a wall's points ends abruptly at a distance: the two ends alone are far away
+def test_motion_as_another_integrator_with_errors_of_fourth_order(monkeypatch):
+    # the force of a wall's points is cut off at a distance: use the two distant ends only
     monkeypatch.setattr(motion, "WALL_SPACING", 100.0)
     long = np.array([[-50.0, 0.0, 50.0, 0.0]])
     x = np.array([1j, 3 + 1.3j, 0.5 + 2.5j, 3.2 + 2.4j])

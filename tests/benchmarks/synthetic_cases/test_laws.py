@@ -1,4 +1,4 @@
-"""Platoons of the literature's laws, against what their sources say of steady driving."""
+"""Platoons of laws from the literature, against their equilibrium gaps."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import pytest
 from benchmarks.synthetic_cases.laws import RANGES, STEP, followed, measured, still
 from nnode.errors import ConfigError
 
-MIDDLE = {law: {k: (a + b) / 2 for k, (a, b) in every.items()} for law, every in RANGES.items()}
+MIDDLE = {law: {k: (a + b) / 2 for k, (a, b) in ranges.items()} for law, ranges in RANGES.items()}
 SPEED, AHEAD = 7.0, 4.5
 
 
 def steady(law: str) -> float:
-    """Net gap at a steady speed behind a vehicle of 4.5 m, as the formula solved by hand says."""
+    """The analytic net gap (m) at a steady speed behind a vehicle of 4.5 m."""
     p = MIDDLE[law]
     share = SPEED / p.get("v0", np.inf)
     if law == "lin":
@@ -24,14 +24,14 @@ def steady(law: str) -> float:
         return float((p["s0"] + SPEED * p["T"]) / np.sqrt(1 - share**4))
     if law in ("krauss", "helly"):
         return p["s0"] + SPEED * p["T"]
-    if law == "gipps":  # drivers guess right how their leaders brake
+    if law == "gipps":  # drivers assume the leader's true braking
         return p["s0"] + 1.5 * SPEED * p["T"]
     offset = np.tanh(p["s_c"] / p["w"])
     return float(p["s_c"] + p["w"] * np.arctanh(share * (1 + offset) - offset))
 
 
 @pytest.mark.parametrize("law", RANGES)
-def test_who_follows_steadily_keeps_the_gap_of_his_law(law: str) -> None:
+def test_equilibrium_gaps(law: str) -> None:
     steps = round(240 / STEP)
     lead = SPEED * STEP * np.arange(steps)
     x = followed(law, MIDDLE[law], lead, np.full(3, AHEAD), np.zeros((steps, 2)))
@@ -41,18 +41,18 @@ def test_who_follows_steadily_keeps_the_gap_of_his_law(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", RANGES)
-def test_nobody_drives_backwards_or_into_anybody(law: str) -> None:
+def test_no_collisions_or_reversing(law: str) -> None:
     table, _ = measured(law, 3, sequences=4, seconds=20.0)
     for _, run in table.groupby("sequence"):
         x = run.pivot(index="time", columns="agent", values="x").to_numpy()
-        # errors of measurement are 0.3 m at most, and drivers disturb themselves
+        # the data contain measurement errors of up to 0.3 m and driver noise
         assert (np.diff(x[::25], axis=0) > -2.0).all()
         assert (np.diff(x, axis=1) > 1.0).all()
 
 
-def test_equal_cases_give_equal_tables() -> None:
-    first, again, other = (measured("idm", s, sequences=2, seconds=5.0)[0] for s in (7, 7, 8))
-    assert first.equals(again)
+def test_tables_are_reproducible() -> None:
+    first, repeated, other = (measured("idm", s, sequences=2, seconds=5.0)[0] for s in (7, 7, 8))
+    assert first.equals(repeated)
     assert not first.equals(other)
     _, parameters = measured("idm", 7, sequences=1, seconds=5.0)
     assert all(a <= parameters[k] <= b for k, (a, b) in RANGES["idm"].items())

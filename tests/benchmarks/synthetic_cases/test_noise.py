@@ -1,3 +1,5 @@
+"""Ornstein-Uhlenbeck noise."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -7,21 +9,21 @@ from benchmarks.synthetic_cases.noise import ornstein_uhlenbeck
 
 
 @pytest.mark.parametrize("heavy", [False, True])
-def test_variance_is_one_at_all_times_and_correlation_falls_exponentially(heavy):
+def test_variance_and_autocorrelation(heavy):
     rng = np.random.default_rng(1)
     paths = ornstein_uhlenbeck(rng, (20_000, 41), step=0.1, correlation=2.0, heavy_tails=heavy)
     # the variance of t-distributed kicks is itself uncertain: their fourth moment is infinite
     assert paths.var(0) == pytest.approx(1.0, abs=0.25 if heavy else 0.06)
-    together = (paths[:, 0] * paths[:, 20]).mean() / paths.var()
-    assert together == pytest.approx(np.exp(-1.0), abs=0.05)
+    correlation = (paths[:, 0] * paths[:, 20]).mean() / paths.var()
+    assert correlation == pytest.approx(np.exp(-1.0), abs=0.05)
 
 
-def test_each_path_keeps_its_own_correlation_time():
+def test_correlation_time_of_each_path():
     rng = np.random.default_rng(2)
     tau = np.array([0.5, 4.0])
     paths = ornstein_uhlenbeck(rng, (2, 200_000), step=0.1, correlation=tau)
-    along = (paths[:, 5:] * paths[:, :-5]).mean(1)
-    np.testing.assert_allclose(along, np.exp(-0.5 / tau), atol=0.05)
+    correlation = (paths[:, 5:] * paths[:, :-5]).mean(1)
+    np.testing.assert_allclose(correlation, np.exp(-0.5 / tau), atol=0.05)
 
 
 def test_heavy_tails_are_heavier():

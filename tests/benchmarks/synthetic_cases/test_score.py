@@ -1,4 +1,4 @@
-"""Scores of made-up reports against made-up truths."""
+"""Scores of synthetic reports for known truths."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.synthetic_cases import score as scoring
 
-#: Classes as a catalogue states them.
+#: Classes of effects, as in a catalogue.
 CLASSES = {
     **dict.fromkeys(("reaction_delay", "inertia"), "late"),
     **dict.fromkeys(("relative_speed", "time_gap", "asymmetric_response"), "ahead"),
@@ -37,7 +37,7 @@ def truth(*effects: str, arm: str = "single", **more: Any) -> dict[str, Any]:
 
 
 def report(*effects: str, verdict: str = "named", **more: Any) -> dict[str, Any]:
-    """A report of effects, each with its equals after a stroke."""
+    """A report of effects, each with its alternatives after a slash."""
     named = []
     for effect in effects:
         name, *equals = effect.split("/")
@@ -46,7 +46,7 @@ def report(*effects: str, verdict: str = "named", **more: Any) -> dict[str, Any]
     return {"verdict": verdict, "effects": named} | more
 
 
-def lead(name: str) -> dict[str, Any]:
+def hypothesis(name: str) -> dict[str, Any]:
     """A report of an unconfirmed effect."""
     return report(
         verdict="none", hypotheses=[{"name": name, "coefficients": {}, "alternatives": []}]
@@ -62,14 +62,14 @@ INEXACT = {"exact": False, "class_right": False}
 
 
 @pytest.mark.parametrize(
-    ("hidden", "found", "row"),
+    ("hidden", "result", "row"),
     [
         (
             truth("relative_speed"),
             report("relative_speed"),
             {"exact": True, "class_right": True, "right": True, "false_name": False},
         ),
-        # equals are never exact and have a measure of their own
+        # indistinguishable effects are never exact and have a separate measure
         *(
             (
                 truth("inertia"),
@@ -84,32 +84,32 @@ INEXACT = {"exact": False, "class_right": False}
                 ("reaction_delay/time_gap", False, True, "reaction_delay"),
             )
         ),
-        # classes are those of the catalogue; two effects without one are not in the same
+        # classes are those of the catalogue; effects without a class share none
         (truth("inertia"), report("reaction_delay"), {"class_right": True}),
         (truth("speed_zone"), report("speed_period"), {"class_right": False}),
-        # unconfirmed effects are hypotheses and no names
+        # unconfirmed effects are hypotheses
         (
             truth("relative_speed"),
-            lead("relative_speed"),
+            hypothesis("relative_speed"),
             INEXACT | {"right": False, "named": "", "hypotheses": "relative_speed"},
         ),
-        (truth("relative_speed"), lead("speed_zone"), {"false_name": False}),
-        (NOTHING, lead("speed_zone"), {"right": True, "hypothesis": True}),
+        (truth("relative_speed"), hypothesis("speed_zone"), {"false_name": False}),
+        (NOTHING, hypothesis("speed_zone"), {"right": True, "hypothesis": True}),
         (
             truth("relative_speed"),
             report("relative_speed", "speed_zone"),
             INEXACT | {"false_names": "speed_zone", "false_name": True},
         ),
-        # pairs match one to one: the exact name must not be matched with another of its class
+        # pairs match one to one: an exact name is not matched with another of its class
         (PAIR, report("time_gap"), INEXACT),
         (PAIR, report("time_gap", "asymmetric_response"), {"exact": False, "class_right": True}),
         (PAIR, report("time_gap", "relative_speed"), {"exact": True}),
-        # people who differ may be named where they do
+        # heterogeneous people may be reported if they are heterogeneous
         (NOTHING, report(**NONE), {"right": True}),
         (NOTHING, report("walker_heterogeneity"), {"right": False}),
         (DIFFERENT, report("walker_heterogeneity"), {"right": True}),
         (DIFFERENT, report("walker_heterogeneity", "inertia"), {"right": False}),
-        # what the catalogue lacks is unknown; whatever the verdict, a name is false
+        # effects outside of the catalogue are unknown; every name is false
         (OUTSIDE, report(**UNKNOWN), {"right": True}),
         *(
             (
@@ -124,13 +124,13 @@ INEXACT = {"exact": False, "class_right": False}
         (STILL, report(**NONE, not_testable=["inertia"]), {"right": True}),
         (STILL, report("inertia", not_testable=["inertia"]), {"right": False}),
         (STILL, report("time_gap", not_testable=["inertia"]), {"right": False}),
-        # a sound sequence that is blamed
+        # a fault that is reported in a sequence without faults
         (
             NOTHING,
             report(**NONE, data_faults=[FAULT]),
             {"located": None, "blamed": True, "right": False},
         ),
-        # the first screen and its clusters
+        # screening p-value and clusters
         *(
             (
                 DIFFERENT,
@@ -159,20 +159,20 @@ INEXACT = {"exact": False, "class_right": False}
         ),
     ],
 )
-def test_a_report_is_scored(
-    hidden: dict[str, Any], found: dict[str, Any], row: dict[str, Any]
+def test_scores_of_reports(
+    hidden: dict[str, Any], result: dict[str, Any], row: dict[str, Any]
 ) -> None:
-    scored = scoring.score(hidden, found, CLASSES)
+    scored = scoring.score(hidden, result, CLASSES)
     assert {name: scored[name] for name in row} == row
 
 
-def test_without_classes_only_equals_count() -> None:
+def test_effects_without_classes_match_by_name() -> None:
     row = scoring.score(truth("inertia"), report("reaction_delay"), {})
     assert not row["class_right"]
 
 
 @pytest.mark.parametrize(
-    ("found", "located", "blamed"),
+    ("result", "located", "blamed"),
     [
         ({"sequence": "s001", "agents": ["s001v2"], "time": 10.9}, True, False),
         ({"sequence": "other/s001", "agents": [3], "time": 9.2}, True, False),
@@ -182,28 +182,28 @@ def test_without_classes_only_equals_count() -> None:
         ({"sequence": "s002", "agents": ["s002v2"], "time": 10.0}, False, True),
     ],
 )
-def test_a_fault_is_located_by_sequence_agent_and_time(
-    found: dict[str, Any], located: bool, blamed: bool
+def test_faults_are_located_by_sequence_agent_and_time(
+    result: dict[str, Any], located: bool, blamed: bool
 ) -> None:
     hidden = truth(arm="fault", data_faults=[FAULT])
-    row = scoring.score(hidden, report(**NONE, data_faults=[found]), {})
+    row = scoring.score(hidden, report(**NONE, data_faults=[result]), {})
     assert (row["located"], row["blamed"], row["right"]) == (located, blamed, located)
     elsewhere = FAULT | {"sequence": "trajectories/s003"}
-    row = scoring.score(hidden, report(**NONE, data_faults=[found, elsewhere, FAULT]), {})
+    row = scoring.score(hidden, report(**NONE, data_faults=[result, elsewhere, FAULT]), {})
     assert (row["located"], row["blamed"], row["right"]) == (True, True, False)
 
 
-def test_coefficients_are_compared_with_regard_to_what_means_no_effect() -> None:
-    hidden, found = truth("speed_zone"), report("speed_zone")
-    found["effects"][0]["coefficients"] = {
+def test_coefficient_errors_are_relative_to_no_effect() -> None:
+    hidden, result = truth("speed_zone"), report("speed_zone")
+    result["effects"][0]["coefficients"] = {
         "alpha": {"value": 0.84, "low": 0.79, "high": 0.89},
         "a": {"value": 320.0, "low": 310.0, "high": 330.0},
         "b": {"value": 520.0, "low": 480.0, "high": 560.0},
     }
-    alpha, a, b = scoring.coefficient_rows(hidden["effects"], found["effects"])
+    alpha, a, b = scoring.coefficient_rows(hidden["effects"], result["effects"])
     assert (alpha["relative"], alpha["of_size"]) == pytest.approx((0.05, 0.2))
     assert [r["covered"] for r in (alpha, a, b)] == [True, False, True]
     assert (a["relative"], a["absolute"]) == (None, 20.0)
-    assert scoring.score(hidden, found, {})["overlap"] == pytest.approx(180 / 220)
-    found["effects"][0]["coefficients"]["a"]["value"] = 510.0
-    assert scoring.score(hidden, found, {})["overlap"] == 0.0
+    assert scoring.score(hidden, result, {})["overlap"] == pytest.approx(180 / 220)
+    result["effects"][0]["coefficients"]["a"]["value"] = 510.0
+    assert scoring.score(hidden, result, {})["overlap"] == 0.0

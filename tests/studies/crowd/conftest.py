@@ -1,4 +1,4 @@
-"""The crowd study's calibrations in float64: the networks' code is compiled for it anyway."""
+"""The crowd study in float64, for which the networks' code is compiled in any case."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from studies.crowd import tasks
 
 
 @pytest.fixture(autouse=True, scope="package")
-def one_precision() -> Iterator[None]:
+def double_precision() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tasks, "DTYPE", dict.fromkeys(tasks.DTYPE, torch.float64))
         yield

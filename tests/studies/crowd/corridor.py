@@ -1,4 +1,4 @@
-"""A few people in a corridor, simulated with known forces by another solver than the studies'."""
+"""People in a corridor, simulated with known forces by another solver than the study's."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DT = 0.04
 
 
 def sequence(rng: np.random.Generator, number: int, samples: int, people: int) -> Sequence:
-    """People at random places who walk either way; their positions are those of free walkers."""
+    """People at random places on straight paths in both directions."""
     x = np.stack([rng.uniform(-2, 2, people), rng.uniform(0.4, 3.6, people)], -1)
     v = np.stack([rng.choice([-1.0, 1.0], people), rng.normal(0, 0.1, people)], -1)
     extra = {
@@ -33,20 +33,20 @@ def sequence(rng: np.random.Generator, number: int, samples: int, people: int) -
 def walkers(
     seed: int, *, system: System | None = None, samples: int = 16, people: int = 12, number: int = 3
 ) -> list[Sequence]:
-    """Sequences of different numbers of people; with ``system`` they move as it says."""
+    """Sequences of different numbers of people, on straight paths or simulated by ``system``."""
     rng = np.random.default_rng(seed)
-    made = [sequence(rng, i, samples, people - i) for i in range(number)]
+    sequences = [sequence(rng, i, samples, people - i) for i in range(number)]
     if system is None:
-        return made
+        return sequences
     with torch.no_grad():
-        moved = TorchdiffeqSolver("euler", "discrete")(system, collate(made))
-    assert moved.v is not None
+        run = TorchdiffeqSolver("euler", "discrete")(system, collate(sequences))
+    assert run.v is not None
     return [
-        replace(s, x=moved.x[:, i, : s.n_agents].numpy(), v=moved.v[:, i, : s.n_agents].numpy())
-        for i, s in enumerate(made)
+        replace(s, x=run.x[:, i, : s.n_agents].numpy(), v=run.v[:, i, : s.n_agents].numpy())
+        for i, s in enumerate(sequences)
     ]
 
 
-def corridor(seed: int, **how: Any) -> Batch:
-    """These sequences as a batch."""
-    return collate(walkers(seed, **how))
+def corridor(seed: int, **options: Any) -> Batch:
+    """The sequences of :func:`walkers` as a batch."""
+    return collate(walkers(seed, **options))

@@ -1,4 +1,4 @@
-"""The tables of the crowd study, from invented results whose numbers are known by hand."""
+"""The tables of the crowd study, from synthetic results whose numbers are known."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ FIRST = invented.FORCE[1]
 @pytest.mark.parametrize(
     ("table", "rows", "columns", "values"),
     [
-        # all sequences cost the same, whatever is resampled
+        # all sequences have the same cost, so that intervals have no width
         ("crowd_costs", "SF", ["printed (m²)", "here (m²)"], [printed.costs["sf"], 2.0 / DT]),
         *(
             ("crowd_costs", label, ["here (m² s)", "from", "to"], [cost] * 3)
             for label, cost in (("SF", 2.0), ("NN", 1.0), ("NN, walls alone", 1.9))
         ),
         ("crowd_parameters", "here, 1 s", NAMES, FIRST),
-        # of 20 refits from half of it to one and a half
+        # 95 % of 20 refits from 0.5 to 1.5 times the estimate
         ("crowd_parameters", "here, 1 s", [f"{n} from" for n in NAMES], 0.525 * np.array(FIRST)),
         ("crowd_parameters", "here, 1 s", [f"{n} to" for n in NAMES], 1.475 * np.array(FIRST)),
         ("crowd_parameters", "printed, 1 s", NAMES, list(printed.parameters.values())),
@@ -63,7 +63,7 @@ FIRST = invented.FORCE[1]
         ("crowd_restarts", "SF", "J (m² s)", [2.0, 2.2]),
         ("crowd_restarts", ("NN", 0), "likeness, sum", 1.0),
         ("crowd_restarts", ("NN, walls alone", 0), "size, pair", 0.0),
-        # the start after the random ones is the best network of the walls alone
+        # the start after the random ones is the best network of the walls
         ("crowd_restarts", ("NN", 2), "size, pair", 0.0),
         ("parameters", ("sf", "all", 1.0, 0), "value", FIRST),
         ("parameters", ("sf", "all", 2.0, 0), "value", invented.FORCE[2]),
@@ -76,7 +76,7 @@ def test_cells(
     np.testing.assert_allclose(cells, values, rtol=1e-6)
 
 
-def test_the_player_shows_the_longest_sequences(blocks: list[Block]) -> None:
+def test_player_shows_the_longest_sequences(blocks: list[Block]) -> None:
     (block,) = (b for b in blocks if isinstance(b, ReplayBlock))
     scenes = list(block.scenes)
     assert (block.total, len(scenes)) == (24, 8)
@@ -93,11 +93,11 @@ def test_blocks_of_time(tables: dict[str, pd.DataFrame]) -> None:
     assert tables["crowd_horizons"].loc[("held out", "NN")].between(1.0, 2.0).all()
     table = tables["crowd_blocks"]
     assert len(table) == 8
-    # everyone walks 1 m/s along the corridor and a little across
+    # people walk 1 m/s along the corridor and slightly across
     assert table["speed"].to_numpy() == pytest.approx(1.0, abs=0.02)
 
 
-def test_starts_go_on_from_the_network_of_the_walls(tables: dict[str, pd.DataFrame]) -> None:
+def test_last_start_is_the_network_of_the_walls(tables: dict[str, pd.DataFrame]) -> None:
     table = tables["crowd_restarts"].loc["NN", "size, pair"]
     assert list(table.index) == [0, 1, 2]
     assert table[1] > 0.0

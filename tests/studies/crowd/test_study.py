@@ -1,4 +1,4 @@
-"""The crowd study's pieces on small made-up corridors, and the whole of it on the real one."""
+"""Parts of the crowd study on small synthetic corridors."""
 
 from __future__ import annotations
 
@@ -23,50 +23,49 @@ TRUE = np.array([0.05, 40.0, 12.0])
 
 
 def chain(folder: Path, number: int = 20) -> str:
-    """Sequences of one second after another; neighbours share half of their people."""
+    """Consecutive sequences of one second; successive ones share half of their people."""
     rng = np.random.default_rng(0)
-    made = []
+    sequences = []
     for i in range(number):
         people = tuple(str(p) for p in range(2 * i, 2 * i + 4))
-        made.append(replace(sequence(rng, i, 26, 4), agents=people))
-    write_store(folder, made, {"dt": 0.04})
+        sequences.append(replace(sequence(rng, i, 26, 4), agents=people))
+    write_store(folder, sequences, {"dt": 0.04})
     return str(folder)
 
 
-def test_nobody_is_on_both_sides_and_each_sequence_is_held_out_at_most_once(tmp_path):
+def test_folds_share_no_people_and_hold_out_each_sequence_once(tmp_path):
     folder = chain(tmp_path / "store")
     held: list[int] = []
     for fold in range(4):
         train, out = parts(folder, f"fold-{fold}", 4, (0.0, 20.0))
-        on_both = {f"{2 * i + k}" for i in train for k in range(4)} & {
-            f"{2 * i + k}" for i in out for k in range(4)
-        }
         assert train
         assert out
-        assert not on_both
-        assert not set(train) & set(out)
+        people, held_out_people = (
+            {2 * i + k for i in part for k in range(4)} for part in (train, out)
+        )
+        assert not people & held_out_people
         held += out
     assert sorted(held) == list(range(20))
     assert parts(folder, ALL, 4, (0.0, 20.0)) == (list(range(20)), [])
 
 
-def test_a_sequence_across_the_border_is_in_no_block():
+def test_sequence_across_a_border_is_in_no_block():
     starts = np.array([0.0, 4.0, 5.0, 9.5])
     result = fold_of(starts, starts + 1.5, 2, (0.0, 11.0))
     assert result.tolist() == [0, 0, -1, 1]
 
 
-def test_stretches_of_time_are_numbered_by_recording():
+def test_time_groups():
     rng = np.random.default_rng(0)
     items = [sequence(rng, i, 26, 2) for i in (0, 3, 10, 11)]
     items.append(replace(items[0], recording="another"))
     assert time_groups(items).tolist() == [0, 0, 1, 1, 2]
 
 
-def test_turning_a_corridor_changes_nothing_for_a_force_without_directions():
+def test_only_anisotropic_forces_depend_on_the_corridor_s_direction():
     rng = np.random.default_rng(1)
     along_x = [sequence(rng, i, 20, 15) for i in range(2)]
-    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])  # to the left: the corridor then runs along y
+    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])  # to the left, along y
 
     def left(s: Sequence) -> Sequence:
         assert s.walls is not None
@@ -91,7 +90,7 @@ def test_turning_a_corridor_changes_nothing_for_a_force_without_directions():
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, 2])
-def test_known_parameters_are_found_from_the_papers_starts(seed):
+def test_parameters_are_recovered_from_the_paper_s_starts(seed):
     batch = corridor(3, system=system_of("sf", TRUE), samples=26, people=40, number=4)
     start = row_of(new_system("sf", seed))
     assert start.max() > 10
@@ -99,17 +98,17 @@ def test_known_parameters_are_found_from_the_papers_starts(seed):
     assert row == pytest.approx(TRUE, rel=1e-3)
 
 
-def test_weights_choose_the_sequences():
-    batch_of_two = collate(
+def test_weights_of_sequences():
+    batch = collate(
         walkers(seed, system=system_of("sf", row), samples=26, people=60, number=1)[0]
         for seed, row in ((1, TRUE), (2, 2 * TRUE))
     )
-    row, _ = calibrate("sf", batch_of_two, TRUE, weights=np.array([0.0, 1.0]))
+    row, _ = calibrate("sf", batch, TRUE, weights=np.array([0.0, 1.0]))
     assert row == pytest.approx(2 * TRUE, rel=1e-3)
 
 
 @pytest.mark.thorough
-def test_walls_alone_leave_people_without_force_and_still_learn():
+def test_network_of_walls_has_no_pair_force_and_is_trained():
     batch = corridor(3, system=system_of("sf", 50 * TRUE), people=20)
     start = row_of(new_system("nn", 5))
     row, _ = calibrate("nn", batch, start, people=False, steps=2)
@@ -121,7 +120,7 @@ def test_walls_alone_leave_people_without_force_and_still_learn():
     assert costs("nn", row, batch).mean() < costs("nn", first, batch).mean()
 
 
-def test_even_pace_arrives_in_time_and_never_hurries():
+def test_even_pace_is_constant_and_arrives_in_time():
     batch = corridor(1)
     x = even_pace(batch).x
     torch.testing.assert_close(x[-1], batch.destination)
@@ -129,7 +128,7 @@ def test_even_pace_arrives_in_time_and_never_hurries():
     torch.testing.assert_close(step, step[:1].expand_as(step))
 
 
-def test_force_by_distance_is_that_of_the_formula():
+def test_force_by_distance_as_the_formula():
     measured = crowd_forces.Measured.of(corridor(5, people=120, number=2))
     system = system_of("sf", [0.5, 30.0, 0.0])
     result = crowd_forces.away_by_distance(system, measured)
@@ -141,7 +140,7 @@ def test_force_by_distance_is_that_of_the_formula():
     assert result.loc[0.375, "facing"] == pytest.approx(expected, rel=1e-6)
 
 
-def test_parts_add_up_to_what_the_model_adds_to_the_relaxation():
+def test_pair_and_wall_forces_add_up():
     measured = crowd_forces.Measured.of(corridor(6))
     system = new_system("nn", 8)
     result = crowd_forces.accelerations(system, measured)
@@ -150,26 +149,25 @@ def test_parts_add_up_to_what_the_model_adds_to_the_relaxation():
     assert interaction(system) is system.terms[1]
 
 
-def test_a_pull_to_a_speed_is_found():
+def test_relaxation_to_a_speed_is_estimated():
     v = np.array([[0.5, 0.0], [-1.0, 0.2], [1.5, 0.1], [-0.8, 0.0]])
-    pull = 0.4 * (np.sign(v[:, :1]) * 1.2 - v[:, :1])
-    parts = {"v": v, "sum": np.concatenate([pull, np.zeros((4, 1))], 1)}
+    relaxation = 0.4 * (np.sign(v[:, :1]) * 1.2 - v[:, :1])
+    parts = {"v": v, "sum": np.concatenate([relaxation, np.zeros((4, 1))], 1)}
     assert crowd_forces.slope(parts) == pytest.approx((0.4, 1.2))
 
 
-def test_likeness_is_the_sign_and_share_of_agreement():
+def test_likeness_is_a_correlation():
     field = np.random.default_rng(0).normal(size=(100, 2))
     assert crowd_forces.likeness(field, 3 * field + 7) == pytest.approx(1.0)
     assert crowd_forces.likeness(field, -field) == pytest.approx(-1.0)
     assert np.isnan(crowd_forces.likeness(field, 0 * field))
 
 
-def test_settings_stand_beside_the_printed_forces():
+def test_forces_as_printed():
     from nnode.plots.settings import six_settings
 
     system = system_of("sf", list(printed.parameters.values()))
     table = beside_printed("sf", six_settings(system)[1])
     assert len(table) == 12
     for part in ("F_x", "F_y"):
-        away = (table[part] - table[f"{part} printed"]).abs().max()
-        assert away < 1e-4
+        np.testing.assert_allclose(table[part], table[f"{part} printed"], rtol=0, atol=1e-4)

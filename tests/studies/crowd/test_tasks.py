@@ -1,4 +1,4 @@
-"""The crowd study's calculations on people who move as the social force says."""
+"""The crowd study's tasks on people who are simulated by the social force."""
 
 from __future__ import annotations
 
@@ -14,53 +14,57 @@ from studies.crowd.tasks import costs, system_of
 from tests.studies.crowd.corridor import DT, walkers
 
 TRUE = np.array([0.05, 40.0, 12.0])
-#: Starts of the sequences, s: two in each half of the recording, in four stretches of 10 s.
+#: Starts of the sequences (s): two in each half of the recording, in four groups of 10 s.
 STARTS = (0.0, 10.0, 20.0, 30.0)
 PEOPLE = 30
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> str:
-    made = []
+    sequences = []
     for number, start in enumerate(STARTS):
         truth = system_of("sf", TRUE)
-        (one,) = walkers(number, system=truth, samples=26, people=PEOPLE, number=1)
+        (s,) = walkers(number, system=truth, samples=26, people=PEOPLE, number=1)
         agents = tuple(f"{number}-{i}" for i in range(PEOPLE))
         time = start + DT * np.arange(26)
-        made.append(replace(one, name=f"made/{number}", recording="made", time=time, agents=agents))
-    place = tmp_path_factory.mktemp("crowd")
-    write_store(place, made, {"dt": DT})
-    return str(place)
+        sequences.append(
+            replace(s, name=f"made/{number}", recording="made", time=time, agents=agents)
+        )
+    path = tmp_path_factory.mktemp("crowd")
+    write_store(path, sequences, {"dt": DT})
+    return str(path)
 
 
-def test_a_fit_finds_the_truth_without_the_block_that_is_held_out(folder: str) -> None:
+def test_fit_recovers_the_truth_and_tests_the_held_out_block(folder: str) -> None:
     result = tasks.fit("sf", folder, "fold-1", 2, [0.0, 31.0], 0, (1.2 * TRUE).tolist(), 4)
     assert result["row"] == pytest.approx(TRUE, rel=1e-3)
     assert list(result["train"]) == ["made/0", "made/1"]
     assert list(result["heldout"]) == ["made/2", "made/3"]
     assert result["J"] == pytest.approx(np.mean(list(result["train"].values())))
-    # those who were held out move by the same law
-    lost = tasks.baselines(folder)["costs"]["relaxation"]
-    assert max(result["heldout"].values()) < 1e-4 * min(lost.values())
+    # people in the held-out block obey the same law
+    baseline = tasks.baselines(folder)["costs"]["relaxation"]
+    assert max(result["heldout"].values()) < 1e-4 * min(baseline.values())
 
 
-def test_refits_to_resampled_data_without_noise_stay_where_they_are(folder: str) -> None:
+def test_refits_to_resampled_exact_data_recover_the_truth(folder: str) -> None:
     result = tasks.resample(folder, TRUE.tolist(), 5, 1, 4, 0)
     assert np.array(result["rows"]).shape == (3, 3)
     for row in result["rows"]:
         assert row == pytest.approx(TRUE, rel=1e-3)
 
 
-def test_baselines_calibrate_nothing(folder: str) -> None:
+def test_baselines_of_all_sequences(folder: str) -> None:
     result = tasks.baselines(folder)
     names = [f"made/{number}" for number in range(4)]
     assert all(list(by_name) == names for by_name in result["costs"].values())
-    # no interaction is the social force without strength
-    none = costs("sf", [0.0, 0.0, 0.0], chosen(folder, range(4)))
-    assert list(result["costs"]["relaxation"].values()) == pytest.approx(none.tolist(), rel=1e-9)
+    # the baseline without interaction is the social force with zero strengths
+    expected = costs("sf", [0.0, 0.0, 0.0], chosen(folder, range(4)))
+    assert list(result["costs"]["relaxation"].values()) == pytest.approx(
+        expected.tolist(), rel=1e-9
+    )
 
 
-def test_a_force_without_directions_holds_in_a_corridor_that_lies_another_way(folder: str) -> None:
+def test_transfer_of_an_isotropic_force(folder: str) -> None:
     result = tasks.transfer(folder, {"sf": TRUE.tolist()})["runs"]["made"]
     baselines = tasks.baselines(folder)["costs"]
     for name, costs_along in baselines.items():

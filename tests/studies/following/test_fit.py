@@ -1,6 +1,8 @@
-"""Folds, pairs of platoons, and calibrations of pairs whose law is known."""
+"""Folds, pairs of platoons, and calibrations of pairs with a known law."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +16,13 @@ from nnode.model.laws import CAR_FOLLOWING_LAWS, law_from
 from nnode.simulation.fused import FusedSolver
 from studies.following import data, printed, tasks
 from studies.following.tasks import EVERY, decay, key, published_law, starts
+from tests.builders import lane
 
 HELLY = {"c_s": 0.15, "c_v": 0.7, "T": 1.4, "s0": 3.0}
 
 
-def driven(number: int = 6, time_gaps: np.ndarray | None = None) -> list[Sequence]:
-    """Followers by Helly's law, stepped here by a plain loop, behind leaders that swing."""
+def helly_pairs(number: int = 6, time_gaps: np.ndarray | None = None) -> list[Sequence]:
+    """Followers by Helly's law, simulated in a plain loop behind oscillating leaders."""
     result = []
     time = 0.1 * np.arange(301)
     for i in range(number):
@@ -34,31 +37,24 @@ def driven(number: int = 6, time_gaps: np.ndarray | None = None) -> list[Sequenc
             a -= HELLY["c_v"] * (v[k] - lead_v[k])
             v[k + 1] = v[k] + 0.1 * a
             x[k + 1] = x[k] + 0.1 * (v[k] + v[k + 1]) / 2
-        result.append(
-            Sequence(
-                name=f"r/{i}",
-                recording="r",
-                time=time,
-                x=np.stack([x, lead], -1)[..., None],
-                v=np.stack([v, lead_v], -1)[..., None],
-                agents=(f"f{i}", f"l{i // 2}"),
-                length=np.array([np.nan, 4.0]),
-                split="train",
-            )
-        )
+        length, agents = np.array([np.nan, 4.0]), (f"f{i}", f"l{i // 2}")
+        extra = {"length": length, "agents": agents, "split": "train"}
+        x, v = np.stack([x, lead], -1), np.stack([v, lead_v], -1)
+        result.append(lane(x, 0.1, v=v, name=f"r/{i}", **extra))
     return result
 
 
 @pytest.fixture
-def pairs_by_helly(monkeypatch: pytest.MonkeyPatch) -> list[Sequence]:
-    pairs = driven()
+def study_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Sequence]:
+    """The pairs by Helly's law as the data of the study."""
+    pairs = helly_pairs()
     monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
     monkeypatch.setattr(data, "batch", lambda folder, test=False: collate(pairs))
     return pairs
 
 
-def test_candidates_are_stepped_as_in_the_published_comparisons() -> None:
-    steps = {name: one.system().step for name, one in EVERY.items()}
+def test_integration_methods_of_candidates() -> None:
+    steps = {name: candidate.system().step for name, candidate in EVERY.items()}
     maps = {name for name in steps if name.split(" ")[0] in ("krauss", "newell")}
     assert {steps[name] for name in maps} == {"semi_implicit"}
     assert {steps[name] for name in steps.keys() - maps} == {"ballistic"}
@@ -68,65 +64,63 @@ def test_candidates_are_stepped_as_in_the_published_comparisons() -> None:
 
 
 def test_clusters_stay_in_one_fold() -> None:
-    label = data.labels(driven())
+    label = data.labels(helly_pairs())
     assert label.tolist() == [0, 0, 1, 1, 2, 2]
     fold = folds(label, 2, seed=3)
     assert fold[::2].tolist() == fold[1::2].tolist()
     assert set(fold) == {0, 1}
 
 
-def test_followers_of_a_platoon_keep_their_leaders() -> None:
+def test_pairs_of_a_platoon() -> None:
     x = np.array([0.0, 20, 50, 90])[None, :] + 10 * 0.1 * np.arange(50)[:, None]
-    platoon = Sequence(
-        name="p", recording="p", time=0.1 * np.arange(50), x=x[..., None], agents=tuple("dcba")
-    )
-    pairs = data.behind(platoon)
+    pairs = data.behind(lane(x, 0.1, name="p", agents=tuple("dcba")))
     assert [pair.agents for pair in pairs] == [("b", "a"), ("c", "b"), ("d", "c")]
     last = pairs[0].part(0.7, 1.0)
     assert (last.n_samples, last.time[0]) == (15, pytest.approx(3.5))
     assert np.diff(last.x[0, :, 0]) == pytest.approx(40)
 
 
-def test_cross_validation_finds_the_hidden_law(pairs_by_helly: list[Sequence]) -> None:
+def test_cross_validation_recovers_the_law(study_pairs: list[Sequence]) -> None:
     result = tasks.cross_validate("", "helly", restarts=2, folds=2, seed=0)
     assert result["parameters"] == pytest.approx(HELLY, rel=1e-3)
     assert max(result["heldout"]["spacing"]) < 1e-3
     assert result["limits"] == []
 
 
-@pytest.mark.thorough  # calibrations of every pair, some thirty times
-def test_numbers_of_a_pair_that_last_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    gap_times = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
-    pairs = driven(time_gaps=gap_times)
+def halves(monkeypatch: pytest.MonkeyPatch, pairs: list[Sequence]) -> dict[str, Any]:
+    """Separate, pooled and shrunk calibrations of the halves of pairs."""
     monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
-    row = [HELLY[n] for n in ("c_s", "c_v", "T", "s0")]
-    result = tasks.halves("", "helly", row, folds=2, restarts=1, seed=0)
-    assert result["names"] == ["c_s", "c_v", "T", "s0"]
-    # the spread of the middle of the six time gaps, whose 5 % quantiles the ends are moved to
-    tame = np.clip(gap_times, *np.quantile(gap_times, [0.05, 0.95]))
-    assert result["spread"][2] == pytest.approx(np.std(tame, ddof=1), rel=0.05)
+    return tasks.halves("", "helly", list(HELLY.values()), folds=2, restarts=1, seed=0)
+
+
+@pytest.mark.thorough  # calibrates all pairs some thirty times
+def test_persistent_driver_differences_are_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
+    gap_times = np.array([1.0, 1.2, 1.4, 1.6, 1.8, 2.0])
+    result = halves(monkeypatch, helly_pairs(time_gaps=gap_times))
+    assert result["names"] == list(HELLY)
+    # the spread of the six time gaps, winsorised at their 5 % quantiles
+    winsorised = np.clip(gap_times, *np.quantile(gap_times, [0.05, 0.95]))
+    assert result["spread"][2] == pytest.approx(np.std(winsorised, ddof=1), rel=0.05)
     assert max(result["alone"]) < 0.01
     assert np.mean(result["pooled"]) > 0.5
     assert np.mean(result["shrunk"]) < 0.1 * np.mean(result["pooled"])
 
 
 @pytest.mark.thorough
-def test_errors_of_measurement_are_shrunk_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drivers who do not differ: the differences between separate calibrations are errors."""
-    rng, pairs = np.random.default_rng(1), driven()
+def test_shrinkage_removes_measurement_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drivers are identical: separate calibrations differ by measurement errors only."""
+    rng, pairs = np.random.default_rng(1), helly_pairs()
     for pair in pairs:
         pair.x[1:, 0] += 0.5 * rng.standard_normal((300, 1))
-    monkeypatch.setattr(data, "pairs", lambda folder, test=False: tuple(pairs))
-    row = [HELLY[n] for n in ("c_s", "c_v", "T", "s0")]
-    result = tasks.halves("", "helly", row, folds=2, restarts=1, seed=0)
+    result = halves(monkeypatch, pairs)
     alone = np.mean(result["alone"])
     assert np.mean(result["shrunk"]) < alone
     assert np.mean(result["pooled"]) < alone
 
 
-def test_a_profile_is_least_at_the_best_value(pairs_by_helly: list[Sequence]) -> None:
+def test_profile_is_minimal_at_the_estimate(study_pairs: list[Sequence]) -> None:
     cost = ResidualProblem(
-        EVERY["helly"].system(), collate(pairs_by_helly), FusedSolver(), Convention.spacing
+        EVERY["helly"].system(), collate(study_pairs), FusedSolver(), Convention.spacing
     )
     best = np.array([HELLY[n] for n in tasks.named(cost, cost.start)])
     before = cost.low.copy()
@@ -138,8 +132,8 @@ def test_a_profile_is_least_at_the_best_value(pairs_by_helly: list[Sequence]) ->
     assert cost.low.tolist() == before.tolist()
 
 
-def test_networks_are_penalised_and_laws_are_not() -> None:
-    batch = collate(driven(2))
+def test_only_networks_are_penalised() -> None:
+    batch = collate(helly_pairs(2))
     law = ResidualProblem(EVERY["helly"].system(), batch, FusedSolver())
     assert decay(law) is None
     with_network = ResidualProblem(EVERY["idm + network 4"].system(), batch, FusedSolver())
@@ -151,13 +145,13 @@ def test_networks_are_penalised_and_laws_are_not() -> None:
     assert len(np.unique(rows[:, 0])) == 3
 
 
-def test_names_of_candidates_are_file_names() -> None:
+def test_keys_of_candidates_are_unique_file_names() -> None:
     assert key("idm + reaction delay") == "idm-reaction_delay"
     assert len({key(name).casefold() for name in EVERY}) == len(EVERY)
 
 
-def test_the_jackknife_of_a_mean_is_its_usual_interval() -> None:
+def test_jackknife_of_a_mean_is_its_t_interval() -> None:
     values = np.random.default_rng(0).normal(size=(10, 2))
     without = (values.sum(0) - values) / 9
-    usual = values.std(0, ddof=1) / np.sqrt(10)
-    assert tasks.jackknifed(without) == pytest.approx(usual * stats.t.ppf(0.975, 9))
+    error = values.std(0, ddof=1) / np.sqrt(10)
+    assert tasks.jackknifed(without) == pytest.approx(error * stats.t.ppf(0.975, 9))

@@ -1,4 +1,4 @@
-"""The page from invented results, whose figures are known by hand."""
+"""The page from synthetic results, whose figures are known."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from studies.following.tasks import EVERY, OBJECTIVES, costs_of, key, named
 from studies.frame import tidy
 from studies.options import FollowingStudyOptions
 from studies.runner import Task
-from tests.studies.following.test_fit import driven
+from tests.studies.following.test_fit import helly_pairs
 
-#: By candidate: held-out and test error of every pair, m.
+#: Held-out and test error of each candidate, m.
 ERRORS = {"idm": (5.0, 3.0), "helly": (4.5, 3.2), "idm + memory": (4.0, 2.8)}
 MAKES = list(printed.platoon_errors)
 
 
-def invented() -> dict[str, dict[str, Any]]:
+def synthetic_results() -> dict[str, dict[str, Any]]:
     result: dict[str, dict[str, Any]] = {
         "floor": {"costs": [1.0] * 6, "limits": [[]] * 5 + [["v0"]]},
         "reproduced-platoon": {"law": printed.platoon_errors, "stopped": printed.platoon_errors},
@@ -38,7 +38,7 @@ def invented() -> dict[str, dict[str, Any]]:
         },
     }
     for name, (held, test) in ERRORS.items():
-        cost = costs_of(EVERY[name], collate(driven(1)))
+        cost = costs_of(EVERY[name], collate(helly_pairs(1)))
         row, values = cost.start.tolist(), named(cost, cost.start)
         noise = 0.1 * np.arange(6)
         result[f"cv-{key(name)}"] = {
@@ -123,9 +123,9 @@ def invented() -> dict[str, dict[str, Any]]:
 def study(monkeypatch: pytest.MonkeyPatch) -> Study:
     store = SimpleNamespace(folder="", manifest={"files": {}})
     stores = cast(Any, dict.fromkeys((PAIRS, PLATOONS, LEADERS), store))
-    monkeypatch.setattr(Study, "pairs", lambda self, test=False: tuple(driven()))
+    monkeypatch.setattr(Study, "pairs", lambda self, test=False: tuple(helly_pairs()))
     monkeypatch.setattr(stability, "platoon", lambda *args, **extra: np.full(11, 0.05))
-    options, results = FollowingStudyOptions(), invented()
+    options, results = FollowingStudyOptions(), synthetic_results()
 
     def done(tasks: list[Task]) -> pd.DataFrame:
         return tidy([task for task in tasks if task.key in results], results)
@@ -136,16 +136,16 @@ def study(monkeypatch: pytest.MonkeyPatch) -> Study:
 
 
 @pytest.mark.thorough
-def test_tables_hold_what_was_found(study: Study, tmp_path: Path) -> None:
-    placed = blocks(study)
-    tables = {b.name: b.frame for b in placed if isinstance(b, TableBlock)}
+def test_tables(study: Study, tmp_path: Path) -> None:
+    page = blocks(study)
+    tables = {b.name: b.frame for b in page if isinstance(b, TableBlock)}
     assert study.order == ["idm + memory", "helly", "idm"] == list(tables["candidates"].index)
-    away = tables["candidates"].loc["idm + memory", ["minus idm", "from", "to"]]
-    assert list(away) == pytest.approx([-1.0, -1.0, -1.0])
+    difference = tables["candidates"].loc["idm + memory", ["minus idm", "from", "to"]]
+    assert list(difference) == pytest.approx([-1.0, -1.0, -1.0])
     assert tables["test"].loc["idm + memory", "test"] == pytest.approx(3.05)
     assert tables["test"].loc["helly", "minus idm"] == pytest.approx(0.2)
     assert tables["published"]["difference"].abs().max() == pytest.approx(0)
-    # chosen inside the first 70 %, whatever the rest says
+    # chosen by the first 70 % only
     assert list(tables["platoon"].index[:2]) == ["idm", "helly"]
     assert tables["platoon"].loc["idm", "last 30 %"] == pytest.approx(3.0)
     assert tables["platoon"].loc["chosen by follower", "last 30 %"] == pytest.approx(3.0)
@@ -153,11 +153,11 @@ def test_tables_hold_what_was_found(study: Study, tmp_path: Path) -> None:
     assert tables["time_gaps"].loc["ACC, min", "median"] == pytest.approx(0.9)
     ends = tables["leaders"][["from", "to"]].astype(float).prod(axis=1)
     assert list(ends.index[ends > 0]) == ["T", "a", "b"]
-    paths = write_page(placed, tmp_path, title="Car following")
+    paths = write_page(page, tmp_path, title="Car following")
     assert all(path.stat().st_size for path in paths)
 
 
-def test_every_task_has_a_key_of_its_own(study: Study) -> None:
+def test_keys_of_tasks_are_unique(study: Study) -> None:
     first, later = training(study.options, study.stores), after(study)
     assert {task.key for task in first} == {f"cv-{key(name)}" for name in EVERY}
     keys = [task.key for task in (*first, *later)]

@@ -1,4 +1,4 @@
-"""Published errors of published parameters, computed again."""
+"""Published errors, recomputed from published parameters."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ def folders(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     return {name: str(store.folder) for name, store in result.items()}
 
 
-def test_nine_errors_of_test_pairs(folders: dict[str, str]) -> None:
+def test_published_errors_of_test_pairs(folders: dict[str, str]) -> None:
     result = tasks.reproduced_pairs(folders[PAIRS])
-    for law, theirs in printed.errors.items():
-        for objective, value in zip(printed.objectives, theirs, strict=True):
+    for law, expected in printed.errors.items():
+        for objective, value in zip(printed.objectives, expected, strict=True):
             errors = result[f"{law} {objective}"]
             assert len(errors) == 20
             assert np.mean(errors) == pytest.approx(value, abs=0.01), (law, objective)
 
 
-def test_four_errors_on_the_track(folders: dict[str, str]) -> None:
+def test_published_errors_of_the_platoon(folders: dict[str, str]) -> None:
     result = tasks.reproduced_platoon(folders[PLATOONS])
     assert result["stopped"] == pytest.approx(printed.platoon_errors, abs=0.03)

@@ -1,4 +1,4 @@
-"""Slopes, gains and platoons against what can be worked out by hand."""
+"""Linear stability against analytic solutions and simulated platoons."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def system(name: str, effects: tuple[str, ...] = (), leader: str = "measured") -
 
 
 def idm_gap(v: float) -> float:
-    """Of the shelf's values: (s0 + T v) / sqrt(1 - (v/v0)^4)."""
+    """The equilibrium gap (s0 + T v) / sqrt(1 - (v/v0)^4) with the default parameters."""
     return float((2 + 1.2 * v) / np.sqrt(1 - (v / 30) ** 4))
 
 
@@ -39,40 +39,43 @@ def test_equilibrium_of_idm() -> None:
 
 
 def test_slopes_of_idm() -> None:
-    v, a, b, wish = 8.0, 1.3, 1.7, 2 + 1.2 * 8.0
+    v, a, b, desired_gap = 8.0, 1.3, 1.7, 2 + 1.2 * 8.0
     s = idm_gap(v)
     result = stability.slopes(system("idm"), s, v, LENGTH)
-    assert result.s == pytest.approx(2 * a * wish**2 / s**3, rel=1e-5)
-    assert result.v == pytest.approx(-a * (4 * v**3 / 30**4 + 2 * wish * 1.2 / s**2), rel=1e-5)
-    assert result.dv == pytest.approx(-a * 2 * wish * v / (2 * np.sqrt(a * b) * s**2), rel=1e-5)
+    assert result.s == pytest.approx(2 * a * desired_gap**2 / s**3, rel=1e-5)
+    assert result.v == pytest.approx(
+        -a * (4 * v**3 / 30**4 + 2 * desired_gap * 1.2 / s**2), rel=1e-5
+    )
+    assert result.dv == pytest.approx(
+        -a * 2 * desired_gap * v / (2 * np.sqrt(a * b) * s**2), rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("name", [n for n in EVERY if not n.startswith(stability.MAPS)])
 def test_every_candidate_has_slopes(name: str) -> None:
-    # found.s is what a platoon passes on by: of no candidate it is nothing at every gap
-    one = EVERY[name].system()
-    result = [stability.slopes(one, gap, 6.0, LENGTH).s for gap in (8.0, 12.0, 20.0)]
-    assert np.isfinite(result).all()
-    assert np.abs(result).max() > 0
+    law = EVERY[name].system()
+    by_gap = [stability.slopes(law, gap, 6.0, LENGTH).s for gap in (8.0, 12.0, 20.0)]
+    assert np.isfinite(by_gap).all()
+    assert np.abs(by_gap).max() > 0
 
 
 @pytest.mark.parametrize("dv", [0.0, -0.3, -1.0])
 @pytest.mark.parametrize("s", [0.02, 0.1, 0.4])
 @pytest.mark.parametrize("v", [-0.1, -0.5, -1.0])
-def test_the_margin_says_whether_any_swing_grows(s: float, v: float, dv: float) -> None:
+def test_margin_is_negative_if_a_frequency_is_amplified(s: float, v: float, dv: float) -> None:
     slope = Slopes(s, v, dv)
-    grows = passed(slope, np.geomspace(1e-4, 5, 5000)).max() > 1 + 1e-9
-    assert grows == (slope.margin < 0)
+    amplified = passed(slope, np.geomspace(1e-4, 5, 5000)).max() > 1 + 1e-9
+    assert amplified == (slope.margin < 0)
 
 
-def test_optimal_velocity_is_stable_up_to_half_its_rate() -> None:
+def test_stability_limit_of_the_optimal_velocity_model() -> None:
     # Bando et al. 1995: stable where V'(s) < kappa / 2; f_s = kappa V', f_v = -kappa
     for share, stable in ((0.49, True), (0.51, False)):
         assert (Slopes(0.8 * 0.8 * share, -0.8, 0.0).margin > 0) == stable
 
 
 @pytest.mark.parametrize("effects", [(), ("inertia",), ("reaction_delay",)])
-def test_a_simulated_platoon_swings_as_the_linear_theory_says(effects: tuple[str, ...]) -> None:
+def test_gain_of_a_simulated_platoon(effects: tuple[str, ...]) -> None:
     law, v = system("helly", effects), 10.0
     gap = 2 + 1.2 * v
     slope = stability.slopes(law, gap, v, LENGTH)
@@ -83,5 +86,5 @@ def test_a_simulated_platoon_swings_as_the_linear_theory_says(effects: tuple[str
     assert swing[1:] / swing[:-1] == pytest.approx([gain] * 3, rel=0.01)
 
 
-def test_frequencies_hold_the_slowest_swings() -> None:
+def test_gain_at_the_lowest_frequency_is_one() -> None:
     assert passed(Slopes(0.1, -0.5, -0.3), FREQUENCIES[:1])[0] == pytest.approx(1, abs=1e-3)

@@ -1,4 +1,4 @@
-"""The prediction study's pieces on made-up pairs and on the published data."""
+"""Parts of the prediction study on synthetic pairs and on the published data."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ FREE = {"parameters": {"v0": "12 m/s"}, "rate": {"x": "v0"}}
 
 
 def pair(number: int, v0: float, split: str) -> Sequence:
-    """A follower at a constant speed, 40 m and 4 m of length behind a leader who is as fast."""
+    """A follower at the leader's constant speed, with a net gap of 40 m."""
     x = v0 * 0.1 * np.arange(31)[:, None] + np.array([0.0, 44.0])
     extra = {"agents": (f"f{number}", f"l{number}"), "length": np.array([np.nan, 4.0])}
     return lane(x, 0.1, v=v0, name=f"{split}/{number}", split=split, **extra)
 
 
-def test_the_metric_is_that_of_all_samples_together() -> None:
+def test_rmspe_of_all_samples() -> None:
     system = build_model({"term": "formula", "name": "free", "leader": "measured", "law": FREE})
     sums = tasks.squares(system, [pair(1, 12.0, "test"), pair(2, 10.0, "test")])
     time = 0.1 * np.arange(31)
@@ -41,7 +41,7 @@ def test_the_metric_is_that_of_all_samples_together() -> None:
     assert tasks.rmspe(sums, np.array([1.0, 0.0])) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_calibration_uses_training_events_alone(tmp_path: Path) -> None:
+def test_calibration_uses_training_events_only(tmp_path: Path) -> None:
     pairs = [pair(1, 9.0, "train"), pair(2, 9.0, "train"), pair(3, 11.0, "test")]
     write_store(tmp_path, pairs, {"dt": 0.1})
     result = tasks.follow("newell", str(tmp_path), 2, 0)
@@ -50,8 +50,8 @@ def test_a_calibration_uses_training_events_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_constant_velocity_has_nearly_the_published_errors(real_data: Path, tmp_path: Path) -> None:
-    """Windows are consecutive here, and begin at any sample in the published figures."""
+def test_constant_velocity_errors_as_published(real_data: Path, tmp_path: Path) -> None:
+    """Windows are consecutive here; in the published figures they begin at every sample."""
     if not (real_data / "eth_ucy").is_dir():
         pytest.skip("eth_ucy is not there")
     for name in SCENES[1:]:
@@ -64,18 +64,18 @@ def test_constant_velocity_has_nearly_the_published_errors(real_data: Path, tmp_
         (batch,) = chosen([str(store.folder)], [name], test=True)
         assert batch.n_samples == AHEAD + 1
         assert batch.preferred is not None
-        # everybody who is judged was there for all samples that are seen
+        # everyone is present in all observed samples
         (first, *_) = store
         assert first.dt * (SEEN - 1) == pytest.approx(2.8)
 
 
 @pytest.mark.real
-def test_the_configurations_are_those_of_the_study(real_data: Path) -> None:
+def test_configurations_as_in_the_study(real_data: Path) -> None:
     for name, option in (("waymo_pairs", events(str(real_data))), ("eth_ucy", scene("x", ""))):
-        shipped = data_options(name, {"path": option.path, "source": option.source})
+        packaged = data_options(name, {"path": option.path, "source": option.source})
         chosen = ("columns", "time_unit", "frame_rate", "velocity", "history", "t_seq")
         for key in (key for key in chosen if hasattr(option, key)):
-            assert getattr(shipped, key) == pytest.approx(getattr(option, key)), key
+            assert getattr(packaged, key) == pytest.approx(getattr(option, key)), key
 
 
 def test_tables_of_errors() -> None:

@@ -1,4 +1,4 @@
-"""Results of the traffic study's tasks, invented so that the page's numbers are known by hand."""
+"""Synthetic results of the traffic study's tasks, for which the page's numbers are known."""
 
 from __future__ import annotations
 
@@ -12,29 +12,28 @@ from studies.traffic import printed
 from studies.traffic.tasks import GAPS, model_options
 from tests.builders import lane
 
-#: Cost above the printed one, m² s; all others lie 1 below it. The second is of a wider search.
+#: Cost above the printed one (m² s) by the first and by a wider search; all others are 1 below.
 ABOVE = {
     ("log", "2-1_1"): (2.0, 2.0),
     ("n2", "3-1_1"): (1.0, -0.6),
     ("n4", "5-1_2"): (3.0, 4.0),
 }
-#: Share of the three sequences in three times a cost.
+#: Costs of the three sequences relative to their mean.
 SHARES = (0.5, 1.0, 1.5)
-#: Costs of sequences that were not seen, m² s; those of networks in the box and free.
+#: Costs of held-out sequences (m² s); those of networks in the box and free.
 UNSEEN = {"lin": 1.0, "log": 2.0, "no_interaction": 3.0, "constant_velocity": 4.0}
 BOX, FREE = 1.5, 10.0
-#: m/s; lin is faster than all others. m; lin ends at its bound in one recording.
+#: v0 of all models and of lin, m/s; L and its bound, m; the recording with L of lin at its bound.
 V0, V0_LIN, L, L_LEAST, LEAST_IN = 20.0, 25.0, 5.0, 2.0, "5-1_1"
 
 
 def platoons(name: str) -> list[Sequence]:
-    """Three cars at even speeds, three times."""
+    """Three sequences of three cars at constant speeds."""
     x = 4.0 * np.arange(6)[:, None] + np.array([0.0, 15.0, 40.0])
     return [lane(x, start=100.0 * i, name=f"{name}/{i:03}") for i in range(3)]
 
 
 def printed_cost(model: str, name: str) -> float:
-    """The printed cost, m² s."""
     return printed.costs[model][printed.recordings.index(name)]
 
 
@@ -54,12 +53,10 @@ def fit(
     recording_name: str,
     model: str,
     box: float | None,
-    restarts: int,
-    dt: float,
-    iterations: int,
     bootstrap: int,
     steps: list[float],
     seed: int,
+    **options: Any,
 ) -> dict[str, Any]:
     """In place of :func:`studies.traffic.tasks.fit`."""
     cost = printed_cost(model, recording_name)
@@ -89,7 +86,7 @@ def fit(
 
 
 def cross_validate(
-    folder: str, recording_name: str, model: str, box: float | None, **how: Any
+    folder: str, recording_name: str, model: str, box: float | None, **options: Any
 ) -> dict[str, Any]:
     """In place of :func:`studies.traffic.tasks.cross_validate`."""
     cost = UNSEEN.get(model, BOX if box else FREE)
@@ -97,7 +94,7 @@ def cross_validate(
     return {"costs": [cost] * 3, "groups": [0, 1, 2], **simple}
 
 
-def descend(recording_name: str, model: str, **how: Any) -> dict[str, Any]:
+def descend(recording_name: str, model: str, **options: Any) -> dict[str, Any]:
     """In place of :func:`studies.traffic.tasks.descend`."""
     cost = printed_cost(model, recording_name)
     return {
@@ -108,7 +105,7 @@ def descend(recording_name: str, model: str, **how: Any) -> dict[str, Any]:
     }
 
 
-def scan(recording_name: str, model: str, points: int, **how: Any) -> dict[str, Any]:
+def scan(recording_name: str, model: str, points: int, **options: Any) -> dict[str, Any]:
     """In place of :func:`studies.traffic.tasks.scan`: the cost grows with the length."""
     lengths = np.linspace(2, 12, points)
     cost = printed_cost(model, recording_name) + 1

@@ -1,4 +1,4 @@
-"""The tables of the traffic study, from invented results whose numbers are known by hand."""
+"""The tables of the traffic study, from synthetic results whose numbers are known."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def store(options: Any, policy: str, folder: Path) -> Store:
         "faults": [FAULT],
         "files": {"a": {"name": "a.mat", "sha256": "12ab"}},
     }
-    every = [s for name in printed.recordings for s in invented.platoons(name)]
-    return write_store(folder / "data" / policy, every, manifest)
+    sequences = [s for name in printed.recordings for s in invented.platoons(name)]
+    return write_store(folder / "data" / policy, sequences, manifest)
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,8 @@ def blocks(tmp_path_factory: pytest.TempPathFactory) -> list[Block]:
 
 
 MEAN = pd.DataFrame(printed.costs).mean()
-#: Nine recordings of ten lie 1 below the printed cost, the tenth where it was put.
-AWAY = pd.Series({"lin": -1.0, "n10": -1.0, "log": -0.7, "n2": -0.96, "n4": -0.6})
+#: Mean difference from the printed cost: -1 in nine recordings, see invented.ABOVE for the tenth.
+DIFFERENCE = pd.Series({"lin": -1.0, "n10": -1.0, "log": -0.7, "n2": -0.96, "n4": -0.6})
 ALL = slice(None)
 
 
@@ -52,17 +52,17 @@ ALL = slice(None)
     ("table", "rows", "columns", "values"),
     [
         ("averages", list(printed.average_costs), "printed", list(printed.average_costs.values())),
-        ("averages", list(AWAY.index), "here", (MEAN + AWAY)[AWAY.index]),
-        # half of it, and nothing was searched twice
+        ("averages", list(DIFFERENCE.index), "here", (MEAN + DIFFERENCE)[DIFFERENCE.index]),
+        # half of the cost, without a wider search
         (
             "averages",
-            list(AWAY.index),
+            list(DIFFERENCE.index),
             "faults dropped",
-            (MEAN + AWAY.replace(-0.96, -0.8))[AWAY.index] / 2,
+            (MEAN + DIFFERENCE.replace(-0.96, -0.8))[DIFFERENCE.index] / 2,
         ),
-        ("averages", list(AWAY.index), "paper's optimiser", MEAN[AWAY.index] + 2),
+        ("averages", list(DIFFERENCE.index), "paper's optimiser", MEAN[DIFFERENCE.index] + 2),
         ("averages", ["n4", "lin"], "weights in box", [MEAN["n4"] + 5, np.nan]),
-        # 95 % of 101 values over 4 m; one length is at its bound
+        # 95 % of 101 values in a range of 4 m; one length is at its bound
         (
             "table_1",
             [("lin", part) for part in ("here", "95 % low", "95 % high")],
@@ -70,12 +70,12 @@ ALL = slice(None)
             [[5.0, 2.0], [3.1, 0.1], [6.9, 3.9]],
         ),
         ("table_1", ("log", "difference"), "1-1_1", 5.0 - printed.lengths["log"][0]),
-        # a wider search was better
+        # the wider search is better
         ("table_2", "n2", "3-1_1", 23.5),
         ("table_2_lower", ("n4", "5-1_2"), ["printed", "here"], [72.02, 75.02]),
         ("table_2_lower", ("n4", "5-1_2"), "best tenth of starts", 76.02),
         ("table_2_lower", ("log", "2-1_1"), ["printed", "here", "grid"], [113.69, 115.69, 114.69]),
-        # the grid's nearest length to the printed 9.20 m is 9.25 m, 7.25 m above its least
+        # the length of the grid next to the printed 9.20 m is 9.25 m, 7.25 m above the lowest
         ("table_2_lower", ("log", "2-1_1"), "grid, printed L", 121.94),
         ("leader_speeds", "lin", ALL, 90.0),
         ("leader_speeds", ["n2", "n4", "n10", "log"], ALL, 72.0),
@@ -106,7 +106,7 @@ def test_intervals_and_differences(tables: dict[str, pd.DataFrame]) -> None:
     assert list(tables["steps"].columns)[:2] == ["0.2 s", "0.1 s"]
 
 
-def test_the_player_shows_every_recording(blocks: list[Block]) -> None:
+def test_player_shows_every_recording(blocks: list[Block]) -> None:
     (block,) = (b for b in blocks if isinstance(b, ReplayBlock))
     recordings = [scene.sequence.recording for scene in block.scenes]
     assert list(dict.fromkeys(recordings)) == list(printed.recordings)
@@ -117,8 +117,8 @@ def test_the_player_shows_every_recording(blocks: list[Block]) -> None:
         np.testing.assert_allclose(lead - lead[0], speed * time, atol=1e-6)
 
 
-def test_faulty_sequences_are_weighed(tables: dict[str, pd.DataFrame]) -> None:
-    # the faulty one makes half of the cost of one recording in ten
+def test_costs_of_faulty_sequences(tables: dict[str, pd.DataFrame]) -> None:
+    # the faulty sequence has half of the cost of its recording
     assert list(tables["faulty"].loc["n4"]) == pytest.approx([1, 30, 5.0, 2.0], rel=0.02)
     table = tables["dominating_sequences"]
     columns = ["sequence", "faults", "start (s)", "vehicles", "share lin (%)"]
@@ -126,7 +126,7 @@ def test_faulty_sequences_are_weighed(tables: dict[str, pd.DataFrame]) -> None:
     assert set(table["faults"].iloc[1:]) == {"none found"}
 
 
-def test_sources_and_all_parameters_are_named(
+def test_sources_and_parameters_are_listed(
     blocks: list[Block], tables: dict[str, pd.DataFrame]
 ) -> None:
     assert Provenance({"SHA-256 of a.mat": "12ab"}) in blocks

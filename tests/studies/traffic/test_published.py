@@ -1,4 +1,4 @@
-"""The published page's numbers, computed again from its own parameters."""
+"""The published page's numbers, recomputed from its parameters."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def mean_cost(system: System, folder: str, name: str, model: str, solver: Solver
 
 
 @pytest.mark.parametrize("model", ["lin", "log", "n2", "n4", "n10"])
-def test_costs_follow_from_the_parameters(
+def test_published_costs_follow_from_the_parameters(
     model: str, parameters: pd.DataFrame, table: pd.DataFrame, esimas: str
 ) -> None:
     renamed = parameters.rename(columns={"index": "index_"})
@@ -70,13 +70,13 @@ def test_costs_follow_from_the_parameters(
         system = calibrated(renamed, model, name)
         cost = mean_cost(system, esimas, name, model, FusedSolver(DT))
         assert cost == pytest.approx(table.loc[model, name], rel=1e-6), name
-    # the smallest recording by another solver as well
+    # by another solver for the smallest recording
     system = calibrated(renamed, model, "3-1_2")
     cost = mean_cost(system, esimas, "3-1_2", model, TorchdiffeqSolver("euler", "discrete", DT))
     assert cost == pytest.approx(table.loc[model, "3-1_2"], rel=1e-6)
 
 
-def test_the_average_is_one(table: pd.DataFrame) -> None:
+def test_averages_of_the_table(table: pd.DataFrame) -> None:
     pd.testing.assert_series_equal(
         table[list(printed.recordings)].mean(axis=1), table["average"], check_names=False
     )
@@ -84,11 +84,11 @@ def test_the_average_is_one(table: pd.DataFrame) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("model", "label"), [("sf", "SF"), ("nn", "NN")])
-def test_crowd_costs_follow_from_the_parameters(
+def test_published_crowd_costs_follow_from_the_parameters(
     model: str, label: str, real_data: Path, tmp_path: Path
 ) -> None:
     folder = PUBLISHED.parent / "crowd"
-    told = pd.read_csv(folder / "crowd_costs.csv", index_col=0)
+    table = pd.read_csv(folder / "crowd_costs.csv", index_col=0)
     rows = pd.read_csv(folder / "parameters.csv")
     rows = rows[(rows.model == model) & (rows["trained on"] == "all") & (rows["horizon (s)"] == 1)]
     options = CrowdStudyOptions(source=str(real_data))
@@ -98,22 +98,22 @@ def test_crowd_costs_follow_from_the_parameters(
         with torch.no_grad():
             return float(sequence_costs(solver(system, batch), batch).mean())
 
-    systems = [system_of(model, one["value"].to_list()) for _, one in rows.groupby("start")]
-    result = [cost(system, FusedSolver()) for system in systems]
+    systems = [system_of(model, row["value"].to_list()) for _, row in rows.groupby("start")]
+    costs = [cost(system, FusedSolver()) for system in systems]
     # the best one by another solver as well
-    best = systems[int(np.argmin(result))]
+    best = systems[int(np.argmin(costs))]
     repeated = cost(best, TorchdiffeqSolver("euler", "discrete"))
-    assert repeated == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
-    assert min(result) == pytest.approx(told.loc[label, "here (m² s)"], rel=1e-6)
-    assert 25 * min(result) == pytest.approx(told.loc[label, "here (m²)"], rel=1e-6)
+    assert repeated == pytest.approx(table.loc[label, "here (m² s)"], rel=1e-6)
+    assert min(costs) == pytest.approx(table.loc[label, "here (m² s)"], rel=1e-6)
+    assert 25 * min(costs) == pytest.approx(table.loc[label, "here (m²)"], rel=1e-6)
 
 
 @pytest.mark.parametrize("study", ["traffic", "crowd"])
-def test_pages_stand_alone(study: str) -> None:
+def test_pages_are_self_contained(study: str) -> None:
     folder = PUBLISHED.parent / study
     html = (folder / "study.html").read_text()
     assert not re.search(r'(src|href)="(?!data:|#)', html)
-    named = re.findall(r"\]\(([^)#][^)]*)\)", (folder / "study.md").read_text())
-    assert named
-    for path in named:
+    links = re.findall(r"\]\(([^)#][^)]*)\)", (folder / "study.md").read_text())
+    assert links
+    for path in links:
         assert (folder / path.split("#")[0]).is_file() or path.startswith("https://"), path
