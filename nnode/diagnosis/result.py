@@ -245,7 +245,7 @@ class Agents:
         p_value: one-sided, of no difference between agents, by cluster, corrected for all tests.
         lasts: s, the longest time constant of a transient deviation that is separable from a
             constant difference.
-        share: variance components as shares: recording, sequence, agent, mood (transient).
+        share: variance components as shares: recording, sequence, agent, transient.
         lags, common: s, and the autocovariance at these lags.
         later: mean square errors in the last part of the confirmation sequences by model, m².
         confirmed: one-sided p-value, by cluster, that agent-specific parameters do not predict the

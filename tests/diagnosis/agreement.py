@@ -1,4 +1,4 @@
-"""How far what an engine computes is from what simulations say."""
+"""Comparisons of an engine's derivatives with differences of simulations."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.model import System
 
 
-def distance(found: Tensor, expected: Tensor) -> float:
-    """Distance relative to what is expected, which is not zero."""
+def distance(actual: Tensor, expected: Tensor) -> float:
+    """Distance relative to the expected values, which are not zero."""
     assert expected.any()
-    return float((found - expected).norm() / expected.norm())
+    return float((actual - expected).norm() / expected.norm())
 
 
 def residuals(engine: Any, system: System) -> Tensor:
-    """``(n,)`` of a system's own parameters."""
-    found: Tensor = engine.residuals(system, ParameterVector(system).row[None])[0]
-    return found
+    """``(n,)`` with a system's parameters."""
+    residual: Tensor = engine.residuals(system, ParameterVector(system).row[None])[0]
+    return residual
 
 
 def differences(engine: Any, system: System, row: Tensor, step: Tensor) -> Tensor:
-    """``(P, n)`` central differences of the residuals by parameters."""
+    """``(P, n)`` central differences of the residuals by the parameters."""
     above, below = (engine.residuals(system, row + torch.diag(s)) for s in (step, -step))
     return (above - below) / (2 * step[:, None])

@@ -1,5 +1,7 @@
-"""Small platoons with known effects, by Runge and Kutta's method at a fifth of the sampling
-interval, written without the package's models; and the package's model of them."""
+"""Small platoons with known effects, simulated without the package, and their model.
+
+The simulation is Runge and Kutta's method at a fifth of the sampling interval.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,13 @@ from tests import builders
 
 V0, LENGTH, DT, SUBSTEPS = 28.0, 6.0, 0.2, 5
 
-#: Of positions ``(S, N)`` with the leaders', the law's speeds ``(S, N - 1)`` and the leaders'
-#: speeds ``(S,)``: m/s of the followers.
+#: Followers' speeds as a function of positions ``(S, N)``, the law's speeds ``(S, N - 1)`` and the
+#: leaders' speeds ``(S,)``.
 Effect = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def lin(*effects: dict[str, Any], v0: float = V0, length: float = LENGTH) -> System:
-    """The law that the followers drive by, with effects."""
+    """The law of the followers, with effects."""
     options = {"leader": "measured", "v0": v0, "L": length, "L_min": 1.0}
     system = build_model({"term": "lin", "name": "lin", **options})
     add_effects(system, list(effects))
@@ -46,18 +48,18 @@ def _leader(
 
 
 def _start(lead: np.ndarray, speed: np.ndarray, followers: int) -> np.ndarray:
-    """``(S, N - 1)`` places of followers who drive as fast as their leaders."""
+    """``(S, N - 1)`` positions of followers in equilibrium."""
     gap = LENGTH * V0 / (V0 - speed)
     return np.asarray(lead[:, None] - gap[:, None] * np.arange(followers, 0, -1.0))
 
 
 def _sequences(places: np.ndarray) -> list[Sequence]:
-    """Of places ``(K, S, N)``: one every 100 s, each with vehicles of its own."""
-    found = []
+    """One sequence every 100 s, each with its own vehicles, from positions ``(K, S, N)``."""
+    sequences = []
     for s, x in enumerate(places.swapaxes(0, 1)):
         agents = tuple(f"{s}-{i}" for i in range(x.shape[1]))
-        found.append(builders.lane(x, DT, start=100.0 * s, name=f"r/{s}", agents=agents))
-    return found
+        sequences.append(builders.lane(x, DT, start=100.0 * s, name=f"r/{s}", agents=agents))
+    return sequences
 
 
 def platoons(
@@ -72,11 +74,17 @@ def platoons(
     calm: float = 1.0,
     seed: int = 0,
 ) -> list[Sequence]:
-    """Platoons behind a leader whose speed varies, ``calm`` times as much; ``driver`` is the
-    standard deviation (m/s) of an Ornstein-Uhlenbeck disturbance of every follower's speed whose
-    correlation lasts for ``lasts`` s. A larger ``number`` adds platoons and changes none."""
+    """Platoons behind leaders of varying speed.
+
+    Args:
+        number: of platoons; a larger one adds platoons and changes none.
+        noise: standard deviation of measured positions, m.
+        driver, lasts: standard deviation (m/s) and correlation time (s) of an Ornstein-Uhlenbeck
+            disturbance of each follower's speed.
+        calm: factor of the variation of the leaders' speeds.
+    """
     rng = np.random.default_rng(seed)
-    half = DT / SUBSTEPS / 2  # the leader is known at half steps
+    half = DT / SUBSTEPS / 2  # the leaders' positions are computed at half steps
     samples, warm = round(seconds / DT) + 1, round(15 / DT)
     steps = SUBSTEPS * (samples + warm)
     time = half * np.arange(2 * steps + 2)
@@ -90,9 +98,9 @@ def platoons(
     keep = np.exp(-2 * half / lasts)
 
     def rate(x: np.ndarray, i: int, push: np.ndarray) -> np.ndarray:
-        every = np.column_stack([x, lead[i]])
-        wanted = law(np.diff(every))
-        return push + (wanted if effect is None else effect(every, wanted, speed[i]))
+        positions = np.column_stack([x, lead[i]])
+        speeds = law(np.diff(positions))
+        return push + (speeds if effect is None else effect(positions, speeds, speed[i]))
 
     x, push, rows = _start(lead[0], speed[0], vehicles - 1), shock[0], []
     for step in range(steps):
@@ -109,33 +117,33 @@ def platoons(
 
 
 def streams(
-    *, number: int = 8, vehicles: int = 5, window: float = 10.0, pace: float = 0.0, **given: Any
+    *, number: int = 8, vehicles: int = 5, window: float = 10.0, pace: float = 0.0, **options: Any
 ) -> list[Sequence]:
-    """Platoons that drive for long, cut into windows of ``window`` s that keep names and clock.
+    """Long platoons, cut into windows of ``window`` s with the same agents and clock.
 
     Args:
-        pace: standard deviation of the drivers' own paces, relative to the law.
-        given: as for :func:`platoons`.
+        pace: standard deviation of the drivers' relative speeds.
+        options: of :func:`platoons`.
     """
-    draw = np.random.default_rng((given.get("seed", 0), 1))
-    own = 1 + pace * draw.normal(size=(number, vehicles - 1))
-    whole = platoons(lambda x, law, lead: own * law, number=number, vehicles=vehicles, **given)
+    draw = np.random.default_rng((options.get("seed", 0), 1))
+    paces = 1 + pace * draw.normal(size=(number, vehicles - 1))
+    whole = platoons(lambda x, law, lead: paces * law, number=number, vehicles=vehicles, **options)
     size = round(window / DT)
     return [
         replace(
-            one,
-            name=f"{one.name}-{first // size}",
-            time=one.time[first : first + size + 1],
-            x=one.x[first : first + size + 1],
+            sequence,
+            name=f"{sequence.name}-{first // size}",
+            time=sequence.time[first : first + size + 1],
+            x=sequence.x[first : first + size + 1],
             kind=("car", "truck", *["car"] * (vehicles - 2)),
         )
-        for one in whole
-        for first in range(0, one.n_samples - size, size)
+        for sequence in whole
+        for first in range(0, sequence.n_samples - size, size)
     ]
 
 
 def relative_speed(kappa: float) -> Effect:
-    """W + kappa (speed ahead - W), from the leader backwards."""
+    """W + kappa (speed ahead - W)."""
 
     def effect(x: np.ndarray, law: np.ndarray, lead: np.ndarray) -> np.ndarray:
         ahead, speeds = lead, np.empty_like(law)
@@ -147,16 +155,16 @@ def relative_speed(kappa: float) -> Effect:
 
 
 def delayed(delay: float, number: int = 4, seconds: float = 20.0) -> list[Sequence]:
-    """Platoons of three that see their gap as it was ``delay`` s ago; small Euler steps."""
+    """Platoons of three with a reaction delay, simulated by small Euler steps."""
     rng = np.random.default_rng(3)
     every = 200
     step = DT / every
-    late, warm = round(delay / step), round(20 / DT)
+    lag, warm = round(delay / step), round(20 / DT)
     time = step * np.arange((round(seconds / DT) + 1 + warm) * every)
     lead, speed = np.array([_leader(rng, time) for _ in range(number)]).transpose(1, 2, 0)
     x = np.empty((len(time), number, 3))
     x[:, :, 2] = lead
-    x[: late + 1, :, :2] = _start(lead[0], speed[0], 2) + (lead - lead[0])[: late + 1, :, None]
-    for k in range(late, len(time) - 1):
-        x[k + 1, :, :2] = x[k, :, :2] + step * law(np.diff(x[k - late]))
+    x[: lag + 1, :, :2] = _start(lead[0], speed[0], 2) + (lead - lead[0])[: lag + 1, :, None]
+    for k in range(lag, len(time) - 1):
+        x[k + 1, :, :2] = x[k, :, :2] + step * law(np.diff(x[k - lag]))
     return _sequences(x[warm * every :: every])

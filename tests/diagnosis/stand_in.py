@@ -1,4 +1,4 @@
-"""A diagnosis with results made by hand, to test what stands before and after the real one."""
+"""A diagnosis with made results, to test commands and reports."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from nnode.model.effects import CATALOGUE, Effect, Strength
 from nnode.model.term import Interval, State
 from tests.diagnosis.recorded import ALPHA, PUSH, V0, WIND, ZONE, L
 
-#: A folder: the stand-in leaves a sign there and waits, so that it can be interrupted.
+#: A file that the stand-in writes before it waits, so that it can be interrupted.
 WAIT = "STAND_IN_WAITS_IN"
 
 
 @CATALOGUE.add
 class Wind(Effect):
-    """Everyone is pushed the same way."""
+    """A constant acceleration."""
 
     w_x: Tensor
     w_y: Tensor
@@ -69,28 +69,26 @@ def diagnose(
     nearer: object = None,
     hint: object = None,
 ) -> DiagnosisOutcome:
-    """Results that a right diagnosis of :mod:`tests.diagnosis.recorded` would come to."""
+    """Results that fit the data of :mod:`tests.diagnosis.recorded`."""
     if os.environ.get(WAIT):
         Path(os.environ[WAIT]).write_text("")
         time.sleep(60)
     traffic = system.domain == "traffic"
     number = max(1, round(options.confirmation * len(sequences)))
     confirmation = list(range(len(sequences) - number, len(sequences)))
+    if traffic:
+        name, values = "speed_zone", {"alpha": ALPHA, "a": ZONE[0], "b": ZONE[1]}
+    else:
+        name, values = "made_up_wind", {"w_x": WIND[0], "w_y": WIND[1]}
     base = calibrated(system)
     extended = deepcopy(base)
-    if traffic:
-        a, b = ZONE
-        values = {"alpha": ALPHA, "a": a, "b": b}
-        add_effects(extended, [{"name": "speed_zone", **values}])
-    else:
-        values = {"w_x": WIND[0], "w_y": WIND[1]}
-        add_effects(extended, [{"name": "made_up_wind", **values}])
-    name = "speed_zone" if traffic else "made_up_wind"
-    units = {**CATALOGUE.effects[name].strengths, **CATALOGUE.effects[name].settings}
+    add_effects(extended, [{"name": name, **values}])
+    kind = CATALOGUE.effects[name]
+    units = {**kind.strengths, **kind.settings}
     effect = NamedEffect(
         name=name,
-        formula=CATALOGUE.effects[name].formula,
-        source=CATALOGUE.effects[name].source,
+        formula=kind.formula,
+        source=kind.source,
         coefficients={
             key: Coefficient(v, v - 0.02 * abs(v) - 0.01, v + 0.03, units[key].unit)
             for key, v in values.items()
@@ -104,7 +102,7 @@ def diagnose(
         confirmed=0.01,
     )
     simulated = _simulated((base, extended), [sequences[i] for i in confirmation])
-    costs = np.array([[_cost(one) for one in pair] for pair in simulated])
+    costs = np.array([[_cost(simulation) for simulation in pair] for pair in simulated])
     before, after = costs.mean(0)
     floor = 0.0025 if traffic else 0.0002
     at = np.linspace(0, 1000, 12)
@@ -189,7 +187,7 @@ def diagnose(
 
 
 def drivers() -> Agents:
-    """Drivers who were found to differ, which confirmation sequences did not confirm."""
+    """Differences between drivers, which are not confirmed."""
     return Agents(
         name="driver_heterogeneity",
         strength=0.05,
@@ -198,7 +196,7 @@ def drivers() -> Agents:
         unit="1",
         p_value=0.02,
         lasts=8.0,
-        share={"recording": None, "sequence": 0.2, "agent": 0.5, "mood": 0.3},
+        share={"recording": None, "sequence": 0.2, "agent": 0.5, "transient": 0.3},
         lags=[2.0, 4.0, 8.0],
         common=[0.004, 0.003, 0.0025],
         later={"without numbers": 0.31, "own numbers": 0.32, "constant velocity": 0.9},
@@ -211,7 +209,7 @@ def drivers() -> Agents:
 
 @torch.no_grad()
 def calibrated(system: System) -> System:
-    """A copy with parameters that fit the recorded data without the effect."""
+    """A copy with the parameters of the recorded data, without the effect."""
     base = deepcopy(system)
     law, force = base.find_law("lin"), base.find_law("social_force")
     if law is not None:
@@ -232,14 +230,14 @@ def _simulated(
         column: list[Simulation | None] = []
         for x, s in zip(simulate(system, sequences), sequences, strict=True):
             if x is not None and s.x.shape[2] == 1:
-                x[:, -1] = np.nan  # the leader is given
+                x[:, -1] = np.nan  # the leader is an input
             column.append(None if x is None else Simulation(s, x, skip=1))
         columns.append(column)
     return list(zip(*columns, strict=True))
 
 
-def _cost(one: Simulation | None) -> float:
-    if one is None:
+def _cost(simulation: Simulation | None) -> float:
+    if simulation is None:
         return float("nan")
-    away = (one.x - one.sequence.x)[one.skip :]
-    return float(np.nanmean((away**2).sum(-1)))
+    error = (simulation.x - simulation.sequence.x)[simulation.skip :]
+    return float(np.nanmean((error**2).sum(-1)))

@@ -1,4 +1,4 @@
-"""The catalogue in words, and the effect that the docs show how to write."""
+"""The documentation of the catalogue and its example of a user-defined effect."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ LAW = {"name": "lin", "term": "lin", "leader": "measured", "v0": 20.0, "L": 8.0,
 DOCS = ROOT / "docs" / "discovery.md"
 
 
-def test_the_docs_show_the_catalogue_as_it_is() -> None:
+def test_docs_contain_catalogue() -> None:
     text = DOCS.read_text(encoding="utf-8")
     assert written(text, catalogue()) == text, f"run: python -m nnode.diagnosis.catalogue {DOCS}"
 
 
-def test_every_effect_has_a_row_with_its_source() -> None:
+def test_rows_of_effects() -> None:
     rows = {line.split("`")[1]: line for line in catalogue().splitlines() if line.startswith("| `")}
     for effect in CATALOGUE.effects.values():
         if effect is stand_in.Wind or not effect.__module__.startswith("nnode."):
@@ -45,23 +45,23 @@ def test_every_effect_has_a_row_with_its_source() -> None:
             assert f"{parameter}: " in rows[effect.name]
 
 
-def test_the_command_prints_and_writes(tmp_path, capsys) -> None:
+def test_command_prints_and_writes(tmp_path, capsys) -> None:
     main([])
     assert "| `speed_zone` |" in capsys.readouterr().out
     path = tmp_path / "doc.md"
-    path.write_text(f"before\n{MARKS[0]}\nthe table of before\n{MARKS[1]}\nafter\n")
+    path.write_text(f"before\n{MARKS[0]}\nold table\n{MARKS[1]}\nafter\n")
     main([str(path)])
     text = path.read_text()
     assert text.startswith(f"before\n{MARKS[0]}\n### Traffic\n")
     assert text.endswith(f"|\n{MARKS[1]}\nafter\n")
-    assert "the table of before" not in text
+    assert "old table" not in text
     with pytest.raises(ConfigError, match="expected the lines"):
         written("no marks", "")
 
 
 @pytest.fixture
 def documented(tmp_path, monkeypatch):
-    """The docs' example in a file of its own, known to the catalogue."""
+    """The file of the docs' example, which is loaded into the catalogue."""
     blocks = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
     (code,) = (block for block in blocks if "CATALOGUE.add" in block)
     assert len(code.strip().splitlines()) <= 30
@@ -72,16 +72,16 @@ def documented(tmp_path, monkeypatch):
     CATALOGUE.effects.pop("rear_pressure", None)
 
 
-def test_the_docs_example_is_an_effect_like_any_other(documented) -> None:
+def test_docs_example(documented) -> None:
     model = build_model({**LAW, "effects": [{"name": "rear_pressure", "c": 2.0}]})
-    own.load_own()  # a second time: it is known already
+    own.load_own()  # a second time
     (effect,) = effects_of(model)
     assert effect.name == "rear_pressure"
     sequence = lane(np.array([0.0, 20.0, 60.0]) + 3.2 * np.arange(3)[:, None])
     batch = collate([sequence])
     state = torch.tensor(0.0), model.initial(batch), model.scene(batch)
     rate = model(*state)[0, :, 0]
-    # the hindmost has nobody behind; the middle one is pushed from 20 m behind
+    # the last vehicle has no follower; the one ahead of it has one 20 m behind
     push = math.exp(-2.0)
     assert rate.tolist() == pytest.approx([20 * (1 - 8 / 20), 20 * (1 - 8 / 40) + 2 * push, 0.0])
     rate[1].backward()
@@ -100,7 +100,7 @@ def test_the_docs_example_is_an_effect_like_any_other(documented) -> None:
         ("import nothing_of_this_name", "fails: ModuleNotFoundError"),
     ],
 )
-def test_a_file_that_defines_no_effect_is_refused(tmp_path, monkeypatch, content, message) -> None:
+def test_invalid_file_of_effects(tmp_path, monkeypatch, content, message) -> None:
     path = tmp_path / "mine.py"
     if content is not None:
         path.write_text(content)

@@ -1,4 +1,4 @@
-"""Names are confirmed by clusters that nothing looked at, or they are hypotheses."""
+"""Confirmation of effects by held-back clusters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import yaml
 from nnode.app.discover import diagnose_table
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.data.clusters import least_number
-from nnode.data.sequence import Sequence
 from nnode.data.sequences import Sequences
 from nnode.diagnosis.compare import BetterLaw
 from nnode.diagnosis.division import divide
@@ -30,117 +29,108 @@ OPTIONS = DiscoverOptions(effects=["relative_speed"], structure=False)
 LAW = lin(v0=25.0, length=7.0)
 
 
-def turned() -> list[Sequence]:
-    """Platoons whose confirmation ones react the other way round."""
-    forth, back = (platoons(relative_speed(s * KAPPA), **MANY) for s in (1, -1))
-    confirmation = divide(forth, OPTIONS).confirmation.places
-    return [back[i] if i in confirmation else one for i, one in enumerate(forth)]
-
-
 @pytest.fixture(scope="module")
 def unconfirmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
-    """The report and the folder of a diagnosis whose confirmation clusters contradict the
-    exploration clusters."""
+    """A report and its folder. Confirmation platoons react opposite to exploration platoons."""
     folder = tmp_path_factory.mktemp("unconfirmed") / "run"
-    table = Sequences(turned()).to_dataframe()
+    exploration, opposite = (platoons(relative_speed(s * KAPPA), **MANY) for s in (1, -1))
+    confirmation = divide(exploration, OPTIONS).confirmation.places
+    sequences = [(opposite if i in confirmation else exploration)[i] for i in range(len(opposite))]
+    table = Sequences(sequences).to_dataframe()
     options = replace(OPTIONS, compare=[], replay=False)
     report = diagnose_table(table, "traffic", model="lin", folder=folder, options=options)
     return report.plain(), folder
 
 
-def test_what_is_worse_on_sealed_clusters_is_not_confirmed(
+def test_effect_that_confirmation_contradicts(
     unconfirmed: tuple[dict[str, Any], Path],
 ) -> None:
     report, _ = unconfirmed
     assert (report["verdict"], report["effects"]) == ("none", [])
-    (lead,) = report["hypotheses"]
-    assert lead["name"] == "relative_speed"
-    # the open clusters do say so: the least p that eleven of them allow
+    (hypothesis,) = report["hypotheses"]
+    assert hypothesis["name"] == "relative_speed"
+    # the smallest p-value of eleven exploration clusters
     assert (report["clusters"]["exploration"], report["clusters"]["confirmation"]) == (11, 5)
-    assert report["screen"]["p_value"] == lead["p_value"] == 2**-10
-    assert lead["coefficients"]["kappa"]["value"] == pytest.approx(KAPPA, abs=0.05)
-    # the confirmation ones are all worse
-    assert lead["confirmed"] == report["confirmation"]["p_value"] == 1.0
+    assert report["screen"]["p_value"] == hypothesis["p_value"] == 2**-10
+    assert hypothesis["coefficients"]["kappa"]["value"] == pytest.approx(KAPPA, abs=0.05)
+    # the errors of all confirmation clusters rise
+    assert hypothesis["confirmed"] == report["confirmation"]["p_value"] == 1.0
     assert report["confirmation"]["confirmed"] is False
 
 
-def test_what_is_not_confirmed_is_a_hypothesis_in_every_file(
+def test_files_of_unconfirmed_effect(
     unconfirmed: tuple[dict[str, Any], Path],
 ) -> None:
     _, folder = unconfirmed
-    own = load_checkpoint(folder / "checkpoints" / "best.pt").build()
-    assert effects_of(own) == []
-    assert set(own.physical()) == {"lin.v0", "lin.L"}
-    written = yaml.safe_load((folder / "model.yaml").read_text())
-    assert (written["effects"], written["name"]) == ([], "lin_calibrated")
+    model = load_checkpoint(folder / "checkpoints" / "best.pt").build()
+    assert effects_of(model) == []
+    assert set(model.physical()) == {"lin.v0", "lin.L"}
+    options = yaml.safe_load((folder / "model.yaml").read_text())
+    assert (options["effects"], options["name"]) == ([], "lin_calibrated")
     page = html.unescape((folder / "report.html").read_text())
-    first = page.index("relative_speed remains a hypothesis: ")
-    assert first < page.index("Coefficients</h2>")
+    hypothesis = page.index("relative_speed remains a hypothesis: ")
+    assert hypothesis < page.index("Coefficients</h2>")
 
 
-@pytest.mark.parametrize(("number", "confirmation"), [(7, 2), (7, 1)])
-def test_two_confirmation_clusters_are_enough_and_one_is_not(
-    number: int, confirmation: int
-) -> None:
-    options = replace(OPTIONS, confirmation=confirmation / (number + confirmation))
-    made = platoons(relative_speed(KAPPA), **{**MANY, "number": number + confirmation})
-    # a law that predicts no better than the model with the effect does not take its place
-    found = diagnose_law(LAW, made, options, nearer=BetterLaw("lin", LAW))
-    d = found.diagnosis
+@pytest.mark.parametrize("confirmation", [2, 1])
+def test_confirmation_requires_two_clusters(confirmation: int) -> None:
+    number = 7 + confirmation
+    options = replace(OPTIONS, confirmation=confirmation / number)
+    sequences = platoons(relative_speed(KAPPA), **{**MANY, "number": number})
+    # a law that predicts no better than the model with the effect does not replace it
+    outcome = diagnose_law(LAW, sequences, options, nearer=BetterLaw("lin", LAW))
+    d = outcome.diagnosis
     assert d.clusters.confirmation == confirmation
     if confirmation == 2:
         assert (d.verdict, d.hypotheses) == ("named", [])
         (effect,) = d.effects
-        # 2^-2 is the least p-value of two clusters, and the exploration clusters are sure
+        # 2^-2 is the smallest p-value of two clusters; that of the exploration clusters is small
         assert effect.confirmed == 0.25
         assert effect.combined < 0.05
     else:
         assert (d.verdict, d.effects) == ("none", [])
-        assert [one.name for one in d.hypotheses] == ["relative_speed"]
+        assert [hypothesis.name for hypothesis in d.hypotheses] == ["relative_speed"]
         assert "requires 2" in d.confirmation.reason
-        assert effects_of(found.extended) == []
+        assert effects_of(outcome.extended) == []
 
 
-def test_with_too_few_clusters_nothing_is_named_and_it_says_how_many_would_do() -> None:
+def test_too_few_clusters() -> None:
     sequences = platoons(relative_speed(KAPPA), **{**MANY, "number": 11})
-    found = diagnose_law(LAW, sequences, DiscoverOptions(structure=False))
-    d = found.diagnosis
+    d = diagnose_law(LAW, sequences, DiscoverOptions(structure=False)).diagnosis
     assert (d.verdict, d.effects, d.hypotheses) == ("not_testable", [], [])
-    # eight open clusters have 2^7 outcomes, too few for so many effects
-    effects = [one for one in CATALOGUE.of("traffic") if not issubclass(one, IndividualEffect)]
-    assert (
-        d.clusters.exploration
-        == 8
-        < d.clusters.least_exploration
-        == least_number(0.05, hypotheses=len(effects))
-    )
-    assert not any(one.testable for one in d.absences if one.name in {e.name for e in effects})
+    # eight exploration clusters have 2^7 outcomes, too few for the number of effects
+    effects = {e.name for e in CATALOGUE.of("traffic") if not issubclass(e, IndividualEffect)}
+    clusters = d.clusters
+    assert clusters.least_exploration == least_number(0.05, hypotheses=len(effects))
+    assert clusters.exploration == 8 < clusters.least_exploration
+    assert not any(absence.testable for absence in d.absences if absence.name in effects)
     assert "8 exploration clusters and 3 confirmation clusters" in sentence(d)
-    assert f"about {d.clusters.enough} clusters are needed" in sentence(d)
-    # so many would do, and not many fewer
-    for number, do in ((d.clusters.enough, True), (d.clusters.enough - 3, False)):
+    assert f"about {clusters.enough} clusters are needed" in sentence(d)
+    # the stated number is enough, and three fewer are not
+    for number, expected in ((clusters.enough, True), (clusters.enough - 3, False)):
         parts = divide(platoons(number=number, seconds=1.0), DiscoverOptions())
-        least = d.clusters.least_exploration, d.clusters.least_confirmation
-        enough = parts.exploration.clusters >= least[0] and parts.confirmation.clusters >= least[1]
-        assert enough == do
-    # what one would look at first is told all the same
+        enough = (
+            parts.exploration.clusters >= clusters.least_exploration
+            and parts.confirmation.clusters >= clusters.least_confirmation
+        )
+        assert enough == expected
+    # the strongest effects are reported nevertheless
     assert d.screen.strongest[0]["name"] in ("relative_speed", "asymmetric_response")
 
 
-def test_an_effect_of_all_is_named_although_drivers_differ() -> None:
-    own = 1 + 0.03 * np.random.default_rng(2).normal(size=(16, 4))
+def test_effect_is_confirmed_with_different_drivers() -> None:
+    paces = 1 + 0.03 * np.random.default_rng(2).normal(size=(16, 4))
     reaction = relative_speed(KAPPA)
-    made = platoons(
-        lambda x, law, lead: reaction(x, own * law, lead), number=16, driver=0.1, seed=200
+    sequences = platoons(
+        lambda x, law, lead: reaction(x, paces * law, lead), number=16, driver=0.1, seed=200
     )
-    d = diagnose_law(LAW, made, OPTIONS).diagnosis
+    d = diagnose_law(LAW, sequences, OPTIONS).diagnosis
     assert d.verdict == "named"
     assert d.effects[0].name == "relative_speed"
     kappa = d.effects[0].coefficients["kappa"]
     assert kappa.low < KAPPA < kappa.high
     assert kappa.value == pytest.approx(KAPPA, abs=0.05)
-    # how drivers differ stands beside it
-    found = {one.name: one for one in d.drivers}
-    assert 2.0 < found["v0"].estimate < 4.5
-    assert found["v0"].lower < 3.0 < found["v0"].upper
-    assert "relative_speed" not in {one.name for one in d.absences}
+    v0 = next(parameter for parameter in d.drivers if parameter.name == "v0")
+    assert 2.0 < v0.estimate < 4.5
+    assert v0.lower < 3.0 < v0.upper
+    assert "relative_speed" not in {absence.name for absence in d.absences}

@@ -1,4 +1,4 @@
-"""Effects and terms of the user's own: the engines ask them, or refuse in words."""
+"""User-defined effects and terms: engines evaluate them or explain why they cannot."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ from nnode.model.terms import Rule
 from tests.diagnosis.agreement import distance, residuals
 from tests.diagnosis.platoons import V0, lin, platoons
 
+VALUES = [0.05, -0.1, 0.02, 0.0, 0.0]
 ANY = Strength(0.0, 0.1, Interval(0.0, 5.0), "1")
 
 
@@ -39,7 +40,7 @@ def followers(state: State, change: Tensor) -> Tensor:
 
 
 class Haste(IndividualEffect):
-    """Every driver adds a speed of his own."""
+    """An offset of the speed for every driver."""
 
     name = "haste"
     domain = "traffic"
@@ -52,7 +53,7 @@ class Haste(IndividualEffect):
 
 
 class Optimal(Term):
-    """A law of the user's own, which is no law of the gap alone."""
+    """A user-defined law that is no :class:`FollowTheLeader`."""
 
     name = "optimal"
     formula = "v0 tanh(gap / d)"
@@ -78,67 +79,67 @@ def platoon_engine() -> TrafficEngine:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("base", "kind", "own"),
+    ("base", "kind", "values"),
     [
         (lin, Haste, None),
-        (lin, Haste, [0.05, -0.1, 0.02, 0.0, 0.0]),
+        (lin, Haste, VALUES),
         (lin, DriverHeterogeneity, None),
-        (lin, DriverHeterogeneity, [0.05, -0.1, 0.02, 0.0, 0.0]),
-        # a pace comes before the reaction to the speed ahead
+        (lin, DriverHeterogeneity, VALUES),
+        # the individual speed acts before the reaction to the speed ahead
         (partial(lin, {"name": "relative_speed", "kappa": 0.4}), DriverHeterogeneity, None),
         (partial(build_model, model_options("idm", "measured")), DriverHeterogeneity, None),
     ],
 )
-def test_a_lane_asks_an_individual_effect_what_it_does(
+def test_individual_columns_are_finite_differences(
     platoon_engine: TrafficEngine,
     base: Callable[[], System],
     kind: type[IndividualEffect],
-    own: list[float] | None,
+    values: list[float] | None,
 ) -> None:
-    engine, start = platoon_engine, np.array(own or [0.0] * 5)
+    engine, start = platoon_engine, np.array(values or [0.0] * 5)
     step = 1e-3 if kind is DriverHeterogeneity else 0.02
 
-    def model(numbers: np.ndarray) -> System:
-        people = dict.fromkeys(engine.names, numbers.tolist())
-        found, place = extended(base().double(), kind(people=people))
-        found.terms[place].get_parameter("sigma").requires_grad_(False)  # it is in no equation
-        return found
+    def model(values: np.ndarray) -> System:
+        people = dict.fromkeys(engine.names, values.tolist())
+        system, place = extended(base().double(), kind(people=people))
+        system.terms[place].get_parameter("sigma").requires_grad_(False)  # it is in no equation
+        return system
 
-    system = model(start) if own else base().double()
+    system = model(start) if values else base().double()
     columns = engine.individual(system, ParameterVector(system).row, kind, {})
     before = residuals(engine, model(start))
-    for place in range(4):  # the leader's place is the last
+    for place in range(4):  # the leader is the last
         after = residuals(engine, model(start + step * np.eye(5)[place]))
         assert distance(columns[place], (after - before) / step) < 0.06
     assert not columns[4].any()
 
 
 @pytest.mark.thorough
-def test_a_law_of_another_kind_is_diagnosed_in_a_lane() -> None:
+def test_effects_of_user_defined_law() -> None:
     engine = TrafficEngine(platoons(number=4, driver=0.2))
     fit = converged_fit(engine, Traffic([Optimal()], leader="measured"), rounds=1)
-    found = []
-    for effect in CATALOGUE.of("traffic"):
+
+    def has_estimate(effect: type[Effect]) -> bool:
         if issubclass(effect, IndividualEffect):
-            found.append(estimate_individual(engine, fit, effect) is not None)
-        else:
-            found.append(bool(traces(engine, fit, effect)))
-    looked_for = [e.name for e, there in zip(CATALOGUE.of("traffic"), found, strict=True) if there]
-    assert {"speed_zone", "relative_speed", "driver_heterogeneity"} <= set(looked_for)
-    # these modify a law of the gap, and there is none
-    assert not {"reaction_delay", "inertia", "multi_anticipation", "time_gap"} & set(looked_for)
+            return estimate_individual(engine, fit, effect) is not None
+        return bool(traces(engine, fit, effect))
+
+    names = {effect.name for effect in CATALOGUE.of("traffic") if has_estimate(effect)}
+    assert names >= {"speed_zone", "relative_speed", "driver_heterogeneity"}
+    # these modify a law of the gap
+    assert not names & {"reaction_delay", "inertia", "multi_anticipation", "time_gap"}
 
 
-def test_an_effect_on_a_law_that_is_missing_says_so(platoon_engine: TrafficEngine) -> None:
+def test_effect_without_its_law_is_an_error(platoon_engine: TrafficEngine) -> None:
     system = Traffic([Optimal(), Inertia()], leader="measured")
     with pytest.raises(ConfigError, match=r"needs a model with one; derive .*FollowTheLeader"):
         platoon_engine.residuals(system, ParameterVector(system).row[None])
 
 
-class Moody(IndividualEffect):
-    """Every driver reacts late, and by a number of his own."""
+class IndividualMemory(IndividualEffect):
+    """Every driver reacts late, with an individual strength."""
 
-    name = "moody"
+    name = "individual_memory"
     domain = "traffic"
     source = "this test"
     rules: ClassVar = {
@@ -152,10 +153,10 @@ class Moody(IndividualEffect):
     strengths: ClassVar = {"sigma": ANY}
 
 
-class Fickle(Haste):
-    """As Haste, with two amounts for everybody."""
+class TwoAmounts(Haste):
+    """The same effect with two amounts for every driver."""
 
-    name = "fickle"
+    name = "two_amounts"
 
     @classmethod
     def directions(cls, options: dict[str, Any]) -> list[tuple[dict[str, Any], float]]:
@@ -163,30 +164,29 @@ class Fickle(Haste):
 
 
 @pytest.mark.parametrize(
-    ("effect", "words"),
+    ("effect", "message"),
     [
-        (Moody, "lanes cannot look for moody: it has a memory"),
-        (Fickle, "lanes cannot look for fickle: it has 2 amounts for every driver"),
+        (IndividualMemory, "lanes cannot look for individual_memory: it has a memory"),
+        (TwoAmounts, "lanes cannot look for two_amounts: it has 2 amounts for every driver"),
     ],
-    ids=["memory and numbers", "two numbers"],
 )
-def test_what_no_engine_can_look_for_is_refused_before_any_work(
-    effect: type[Effect], words: str, monkeypatch: pytest.MonkeyPatch
+def test_effects_that_no_engine_can_estimate(
+    effect: type[Effect], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(CATALOGUE.effects, effect.name, effect)
     advice = rf"discover\.exclude=\[{effect.name}\]"
-    with pytest.raises(ConfigError, match=f"{words}.*{advice}"):
+    with pytest.raises(ConfigError, match=f"{message}.*{advice}"):
         check_options(DiscoverOptions(), effect.domain)
-    left = check_options(DiscoverOptions(exclude=[effect.name]), effect.domain)
-    assert effect.name not in left
+    names = check_options(DiscoverOptions(exclude=[effect.name]), effect.domain)
+    assert effect.name not in names
 
 
-def test_every_effect_of_the_catalogue_can_be_looked_for() -> None:
+def test_all_effects_of_catalogue_can_be_estimated() -> None:
     for effect in CATALOGUE.effects.values():
         check_effect(effect)
 
 
-def test_models_that_no_engine_can_simulate_are_refused() -> None:
+def test_models_that_no_engine_can_simulate() -> None:
     with pytest.raises(ConfigError, match="effect speed_zone twice"):
         check_model(Traffic([Optimal(), SpeedZone(), SpeedZone(a=200.0, b=300.0)]))
     with pytest.raises(ConfigError, match="no parameter that is calibrated"):
@@ -210,22 +210,22 @@ FORCES = ("anticipation", "field_of_view", "evasive_rotation")
         *[(name, "gcfm", {}, "no force between people") for name in FORCES],
     ],
 )
-def test_what_is_offered_depends_on_the_model(
+def test_offered_effects_depend_on_model(
     name: str, model: str, options: dict[str, str], reason: str
 ) -> None:
     system = build_model({**model_options(model, "measured"), **options})
-    found = not_offered(CATALOGUE.effects[name], system)
-    assert reason in found
-    assert bool(found) == bool(reason)
-    if name in FORCES:  # the comparison of laws leaves such an effect out
+    message = not_offered(CATALOGUE.effects[name], system)
+    assert reason in message
+    assert bool(message) == bool(reason)
+    if name in FORCES:  # the comparison of laws does not add such an effect either
         (added,) = with_effects({model: system}, [CATALOGUE.effects[name]()]).values()
         assert len(effects_of(added)) == (not reason)
 
 
-def test_what_is_offered_depends_on_drivers_and_on_the_law_s_order() -> None:
+def test_offered_effects_depend_on_drivers_and_order() -> None:
     leader_speed, law = CATALOGUE.effects["leader_speed"], Traffic([make_law("lin")])
     assert "leaders" in not_offered(leader_speed, law, differ=True)
     assert not not_offered(leader_speed, law)
     assert not not_offered(SpeedZone, law, differ=True)
-    assert "memory" not in [one.name for one in CATALOGUE.of("traffic")]
-    assert "memory" in [one.name for one in CATALOGUE.of("traffic", 2)]
+    names = [{effect.name for effect in CATALOGUE.of("traffic", order)} for order in (1, 2)]
+    assert ["memory" in offered for offered in names] == [False, True]

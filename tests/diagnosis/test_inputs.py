@@ -1,9 +1,10 @@
-"""What a diagnosis is given, and what it does without."""
+"""Inputs of a diagnosis and the exclusion of faulty sequences."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -17,9 +18,9 @@ from nnode.errors import DataError, FaultError, NNodeError
 from tests.diagnosis.recorded import lane
 
 
-def table(tmp_path: Path, **more: object) -> tuple[pd.DataFrame, TableOptions]:
+def table(tmp_path: Path, **more: Any) -> tuple[pd.DataFrame, TableOptions]:
     path = lane(tmp_path / "lane.csv", sequences=5, seconds=4.0, cars=3)
-    options = TableOptions(domain="traffic", path=str(path), **more)  # type: ignore[arg-type]
+    options = TableOptions(domain="traffic", path=str(path), **more)
     return pd.read_csv(path), options
 
 
@@ -38,11 +39,11 @@ def spoilt(frame: pd.DataFrame) -> pd.DataFrame:
     return exchanged(frame[~gone], 1)
 
 
-def test_faulty_sequences_are_named_and_left_out(tmp_path: Path) -> None:
+def test_faulty_sequences_are_excluded(tmp_path: Path) -> None:
     frame, options = table(tmp_path)
     spoilt(frame).to_csv(options.path, index=False)
     inputs = read_inputs(options, tmp_path / "data")
-    # of the other one the first seconds are left
+    # the first seconds of sequence 2 remain
     assert [s.name for s in inputs.sequences] == ["lane/0", "lane/2", "lane/3", "lane/4"]
     assert [s.name for s in inputs.faulty] == ["lane/1"]
     swap = next(f for f in inputs.data_faults if f.kind == "identity_swap")
@@ -52,16 +53,16 @@ def test_faulty_sequences_are_named_and_left_out(tmp_path: Path) -> None:
     assert inputs.faults["lane/1"][0].agents == (0, 1)
 
 
-def test_prepared_data_give_the_same(tmp_path: Path) -> None:
+def test_prepared_data_give_same_inputs(tmp_path: Path) -> None:
     frame, options = table(tmp_path)
     spoilt(frame).to_csv(options.path, index=False)
     fresh = read_inputs(options, tmp_path / "data")
     prepare(options, tmp_path / "prepared")
     options.prepared = str(tmp_path / "prepared")
-    again = read_inputs(options, tmp_path / "nowhere")
+    prepared = read_inputs(options, tmp_path / "nowhere")
     assert not (tmp_path / "nowhere").exists()
-    assert again.data_faults == fresh.data_faults
-    assert [s.name for s in again.sequences] == [s.name for s in fresh.sequences]
+    assert prepared.data_faults == fresh.data_faults
+    assert [s.name for s in prepared.sequences] == [s.name for s in fresh.sequences]
 
 
 @pytest.mark.parametrize(
@@ -88,7 +89,7 @@ def test_prepared_data_give_the_same(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_unusable_data_are_refused(
+def test_unusable_data(
     tmp_path: Path,
     faults: Faults,
     change: Callable[[pd.DataFrame], pd.DataFrame],
@@ -102,13 +103,12 @@ def test_unusable_data_are_refused(
 
 
 @pytest.mark.real
-def test_identity_swaps_of_a_real_recording_are_named(real_data: Path, tmp_path: Path) -> None:
+def test_identity_swaps_of_real_recording(real_data: Path, tmp_path: Path) -> None:
     options = EsimasOptions(source=str(real_data), recording="1-1_1")
     inputs = read_inputs(options, tmp_path)
-    swaps = {f.sequence for f in inputs.data_faults if f.kind == "identity_swap"}
-    assert len(swaps) == 6
+    swaps = [fault for fault in inputs.data_faults if fault.kind == "identity_swap"]
+    assert len({fault.sequence for fault in swaps}) == 6
     assert len(inputs.sequences) == 22
     assert len(inputs.faulty) == 12
-    first = next(f for f in inputs.data_faults if f.kind == "identity_swap")
     # the source has no identifiers: agents are numbered
-    assert all(agent.isdigit() for agent in first.agents)
+    assert all(agent.isdigit() for agent in swaps[0].agents)

@@ -1,25 +1,37 @@
-"""What is added without a score that shows it, and what is given up again."""
+"""The search for effects: acceptance, hints, and the ends of periods."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+import nnode
+from benchmarks import drivers
+from nnode.app.python.inputs import model_options
 from nnode.calibrate.parameters import ParameterVector
-from nnode.diagnosis import search as searching
-from nnode.diagnosis import thresholds
+from nnode.diagnosis import candidate, thresholds
+from nnode.diagnosis import search as module
 from nnode.diagnosis.lanes.engine import TrafficEngine
-from nnode.diagnosis.residuals.fit import Fit
-from nnode.diagnosis.search import converged_fit, search
+from nnode.diagnosis.lanes.followers import FollowersEngine
+from nnode.diagnosis.residuals.fit import Fit, refine
+from nnode.diagnosis.search import _hinted, _with_best_ends, converged_fit, search
 from nnode.diagnosis.statistics.score import Score, Screen, Trace
+from nnode.errors import SimulationError
+from nnode.model import System, Traffic, build_model, make_law
 from nnode.model.effects import CATALOGUE
+from nnode.model.effects.lane import SpeedPeriod
 from nnode.model.extend import effects_of
+from tests.diagnosis.agreement import residuals
 from tests.diagnosis.platoons import lin, platoons, relative_speed
 
 EFFECTS = [CATALOGUE.effects[name] for name in ("relative_speed", "inertia")]
+ZONE = {"name": "speed_zone", "alpha": 0.5, "a": 10.0, "b": 90.0}
+DELAY = {"name": "reaction_delay", "T": 0.7}
 
 
 @cache
@@ -30,32 +42,109 @@ def fitted(strength: float) -> tuple[TrafficEngine, Fit]:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("strength", "names"), [(0.5, ["relative_speed"]), (0.0, [])])
-def test_held_out_clusters_may_be_sure_of_what_no_score_shows(
+def test_effect_is_accepted_by_held_out_clusters_alone(
     monkeypatch: pytest.MonkeyPatch, strength: float, names: list[str]
 ) -> None:
-    scored = Screen.scores
+    scores = Screen.scores
 
-    def blind(screen: Screen, look: list[Trace]) -> list[Score]:
-        return [replace(score, p_value=1.0) for score in scored(screen, look)]
+    def insignificant(screen: Screen, columns: list[Trace]) -> list[Score]:
+        return [replace(score, p_value=1.0) for score in scores(screen, columns)]
 
-    monkeypatch.setattr(Screen, "scores", blind)
+    monkeypatch.setattr(Screen, "scores", insignificant)
     engine, fit = fitted(strength)
-    found = search(engine, fit, EFFECTS)
-    assert [step.chosen.name for step in found.steps] == names
-    assert all(step.chosen.score.p_value <= thresholds.STRICT for step in found.steps)
+    result = search(engine, fit, EFFECTS)
+    assert [step.chosen.name for step in result.steps] == names
+    assert all(step.chosen.score.p_value <= thresholds.STRICT for step in result.steps)
 
 
-def test_what_a_curve_outdoes_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_effect_is_removed_if_curve_predicts_better(monkeypatch: pytest.MonkeyPatch) -> None:
     engine, fit = fitted(0.5)
-    asked: list[bool] = []
-    monkeypatch.setattr(searching, "_curve_predicts_better", lambda *_: asked.append(True) or True)
-    found = search(engine, fit, EFFECTS)
-    assert asked  # an effect passed, and was doubted
-    assert not found.steps
-    assert not effects_of(found.fit.system)
-    system = found.fit.system
-    now = engine.residuals(system, ParameterVector(system).row[None])[0].numpy()
-    np.testing.assert_allclose(found.fit.residual, now, atol=1e-9)
-    assert found.screen is not None
-    assert found.screen.fit is found.fit
-    assert {score.effect.name for score in found.scores} == {"relative_speed", "inertia"}
+    calls: list[bool] = []
+    monkeypatch.setattr(module, "_curve_predicts_better", lambda *_: calls.append(True) or True)
+    result = search(engine, fit, EFFECTS)
+    assert calls
+    assert not result.steps
+    system = result.fit.system
+    assert not effects_of(system)
+    np.testing.assert_allclose(result.fit.residual, residuals(engine, system).numpy(), atol=1e-9)
+    assert result.screen is not None
+    assert result.screen.fit is result.fit
+    assert {score.effect.name for score in result.scores} == {"relative_speed", "inertia"}
+
+
+def law(*effects: dict[str, Any]) -> System:
+    return build_model({**model_options("lin", "measured"), "effects": list(effects)}, 0)
+
+
+@pytest.mark.parametrize(
+    ("hints", "effects", "name", "expected"),
+    [
+        ([[ZONE, DELAY], [DELAY]], [], "speed_zone", [{"speed_zone"}]),
+        ([[ZONE, DELAY]], [DELAY], "speed_zone", [{"speed_zone", "reaction_delay"}]),
+        ([[ZONE, DELAY], [DELAY]], [], "reaction_delay", 2 * [{"reaction_delay"}]),
+        ([[ZONE, DELAY]], [], "inertia", []),
+        ([[ZONE, DELAY]], [{"name": "inertia", "tau_v": 0.5}], "speed_zone", []),
+        ([], [], "speed_zone", []),
+    ],
+)
+def test_hints_have_effects_of_model_and_one_more(
+    hints: list[list[dict[str, Any]]],
+    effects: list[dict[str, Any]],
+    name: str,
+    expected: list[set[str]],
+) -> None:
+    def names(models: list[System]) -> list[set[str]]:
+        return [{effect.name for effect in effects_of(model)} for model in models]
+
+    models = [law(*hint) for hint in hints]
+    assert names(_hinted(models, law(*effects), name)) == expected
+    assert names(models) == [{effect["name"] for effect in hint} for hint in hints]
+
+
+@pytest.mark.parametrize(
+    ("default", "hinted", "best"),
+    [
+        (9.0, 4.0, 4.0),
+        (3.0, 4.0, 3.0),
+        (None, 4.0, 4.0),
+        (3.0, None, 3.0),
+        (None, None, None),  # None: the simulation from this start diverges
+    ],
+)
+def test_calibration_uses_better_start(
+    monkeypatch: pytest.MonkeyPatch, default: float | None, hinted: float | None, best: float | None
+) -> None:
+    hint = law(DELAY)
+
+    def refine(engine: Any, system: System, **options: Any) -> Any:
+        cost = hinted if system is hint else default
+        if cost is None:
+            raise SimulationError("it blows up")
+        return SimpleNamespace(cost=cost)
+
+    def calibrated() -> Any:
+        score: Any = SimpleNamespace(effect=CATALOGUE.effects["reaction_delay"], options={})
+        before: Any = SimpleNamespace(system=law())
+        engine: Any = None
+        return candidate.calibrated(engine, before, score, 0.0, [hint])
+
+    monkeypatch.setattr(candidate, "refine", refine)
+    if best is None:
+        with pytest.raises(SimulationError, match="reaction_delay blows up on these data"):
+            calibrated()
+    else:
+        assert calibrated().cost == best
+
+
+def test_end_of_period_moves_into_sequence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drivers, "PERIOD", (250.0, 518.0))
+    monkeypatch.setitem(drivers.HIDDEN["lin"], "speed_period", 0.7)
+    table = drivers.platoons("lin", "speed_period", 0.15, 5, number=9, vehicles=4)
+    engine = FollowersEngine(list(nnode.sequences(table)))
+    period = SpeedPeriod(alpha=0.7, a=250.0, b=465.0)
+    system = Traffic([make_law("lin"), period], leader="measured").double()
+    engine.fit_whitening(system, ParameterVector(system).row)
+    fit = refine(engine, system)
+    end = fit.names.index("terms.1.b")
+    assert not 500 < fit.row[end] < 530  # drivers of the platoon at 500 s are estimated as slow
+    assert _with_best_ends(engine, fit, SpeedPeriod).row[end] == pytest.approx(518, abs=5)

@@ -1,4 +1,4 @@
-"""Hints: the form that made a curve is the one that is told, with its numbers."""
+"""Closed forms of curves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Form = Callable[[np.ndarray], np.ndarray]
 
 
 @pytest.mark.parametrize(
-    ("form", "words"),
+    ("form", "text"),
     [
         (lambda u: 0 * u + 1.5, "1.5, whatever the gap"),
         (lambda u: 1 + 2 * u, "1 +2 z with z = (gap - 10) / 40"),
@@ -29,27 +29,25 @@ Form = Callable[[np.ndarray], np.ndarray]
         ),
     ],
 )
-def test_the_form_that_made_a_curve_is_found(form: Form, words: str) -> None:
+def test_true_form_is_selected(form: Form, text: str) -> None:
     u = np.linspace(0, 1, 12)
-    found = symbolic("gap", 10 + 40 * u, form(u), np.full(12, 0.05))
-    assert found.startswith(words)
+    assert symbolic("gap", 10 + 40 * u, form(u), np.full(12, 0.05)).startswith(text)
 
 
-def test_what_lies_within_the_errors_is_a_constant() -> None:
+def test_changes_within_errors_are_ignored() -> None:
     u = np.linspace(0, 1, 12)
-    rng = np.random.default_rng(1)
-    found = symbolic("speed", u, 2 + 0.1 * u + 0.3 * rng.normal(size=12), np.full(12, 0.3))
-    assert found.endswith("whatever the speed")
+    heights = 2 + 0.1 * u + 0.3 * np.random.default_rng(1).normal(size=12)
+    assert symbolic("speed", u, heights, np.full(12, 0.3)).endswith("whatever the speed")
 
 
-def test_knots_of_small_error_decide() -> None:
-    # a line through all knots but the last, of which nothing is known
+def test_knots_are_weighted_by_errors() -> None:
+    # a line through all knots but the last, whose error is large
     at = np.arange(8.0)
     heights = np.append(at[:-1], 100.0)
-    found = symbolic("gap", at, heights, np.append(np.full(7, 0.01), 1e6))
-    assert "+7 z with z = (gap - 0) / 7" in found
+    text = symbolic("gap", at, heights, np.append(np.full(7, 0.01), 1e6))
+    assert "+7 z with z = (gap - 0) / 7" in text
 
 
-def test_a_negative_beginning_is_added() -> None:
-    found = symbolic("speed difference", np.arange(-4.0, 4.0), np.arange(8.0), np.full(8, 0.01))
-    assert "z = (speed difference + 4) / 7" in found
+def test_sign_of_negative_start() -> None:
+    text = symbolic("speed difference", np.arange(-4.0, 4.0), np.arange(8.0), np.full(8, 0.01))
+    assert "z = (speed difference + 4) / 7" in text

@@ -1,5 +1,7 @@
-"""Small crowds with known accelerations, by Runge and Kutta's method at a fifth of the sampling
-interval, written without the package's models; and the package's model of them."""
+"""Small crowds with known accelerations, simulated without the package, and their model.
+
+The simulation is Runge and Kutta's method at a fifth of the sampling interval.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +20,19 @@ WIDTH, HALF = 4.5, 8.0
 WALLS = np.array([[-HALF, 0.0, HALF, 0.0], [HALF, WIDTH, -HALF, WIDTH]])
 DT, SUBSTEPS = 0.1, 5
 
-#: Of positions and velocities ``(S, N, 2)`` and the time since the start: m/s².
+#: Accelerations as a function of positions and velocities ``(S, N, 2)`` and time.
 Extra = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
 
-def model(*effects: Term, force: type[InteractionForce] = InteractionForce, **given: Any) -> Crowd:
-    """The law that they walk by, with effects.
+def model(
+    *effects: Term, force: type[InteractionForce] = InteractionForce, **options: Any
+) -> Crowd:
+    """The law of the people, with effects.
 
     Args:
-        force: the class of the force. given: its options.
+        force: the class of the force. options: of the force.
     """
-    options = {"A": A, "k": 0.0, "kappa": 0.0, "B": B, **given}
-    law = force(entry="social_force", **options)
+    law = force(entry="social_force", **{"A": A, "k": 0.0, "kappa": 0.0, "B": B, **options})
     return Crowd([make_law("relaxation", tau=TAU), law, *effects])
 
 
@@ -63,7 +66,7 @@ def crowd(
     """People who walk both ways through a corridor of 4.5 m."""
     draw = np.random.default_rng(seed)
     way = np.where(np.arange(people) % 2, 1.0, -1.0)
-    # nobody meets anybody quite head on, and so they bump into each other lightly at most
+    # people on different lanes collide lightly at most
     lanes = draw.permuted(np.tile(np.linspace(0.9, WIDTH - 0.9, people), (sequences, 1)), axis=1)
     y = lanes + draw.uniform(-0.05, 0.05, lanes.shape)
     x = np.stack([-way * draw.uniform(1.5, 4.0, (sequences, people)), y], -1)
@@ -102,5 +105,5 @@ def crowd(
 
 
 def wind(a_x: float, a_y: float) -> Extra:
-    """Everybody is accelerated the same way, m/s²."""
+    """A constant acceleration, m/s²."""
     return lambda x, v, t: np.broadcast_to([a_x, a_y], x.shape)

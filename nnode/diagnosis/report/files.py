@@ -28,7 +28,7 @@ CHECKPOINT = Path("checkpoints", "best.pt")
 
 #: Version of ``report.json``, raised when a key changes its name or meaning. 2: the base model's
 #: parameters are named by term and name, ``lin.v0``.
-SCHEMA = 3
+SCHEMA = 4
 
 #: The counters of a training that has not started.
 UNTRAINED: dict[str, float] = {

@@ -161,10 +161,7 @@ def agents_table(d: Diagnosis) -> TableBlock:
                 "strength": f"{amount(a.strength, 2)} [{amount(a.low, 2)}, {amount(a.high, 2)}]",
                 "unit": _unit(a.unit),
                 "p": amount(a.p_value, 2),
-                **{
-                    "transient" if part == "mood" else part: _percent(a.share.get(part))
-                    for part in parts
-                },
+                **{part: _percent(a.share.get(part)) for part in parts},
                 "p, confirmation": amount(a.confirmed, 2),
                 "separable from (s)": amount(a.lasts, 2),
                 "named": "yes" if a.named else f"no: {a.reason}",

@@ -47,7 +47,7 @@ class IndividualEstimate:
         error: its standard error, by the jackknife over clusters.
         p_value: one-sided, Student's t by cluster, corrected for the number of settings.
         share: variance components as shares: ``recording`` (None if there is only one),
-            ``sequence``, ``agent`` and ``mood`` (the transient deviation).
+            ``sequence``, ``agent`` and ``transient``.
         lags: s; ``common``: the autocovariance at each lag.
         lasts: s, the longest time constant of a transient deviation that is separable from a
             constant difference.
@@ -165,7 +165,7 @@ def _with_transient_variance(
     number = gram.shape[1]
     size = np.trace(gram, axis1=1, axis2=2)[:, None, None] / number
     information = gram + (1e-9 * size + 1e-12) * np.eye(number)
-    # (gram^-1 + mood)^-1 = (1 + gram mood)^-1 gram
+    # (gram^-1 + transient)^-1 = (1 + gram transient)^-1 gram
     shrink = np.linalg.inv(np.eye(number) + transient * information)
     return shrink @ information, np.einsum("uij,uj->ui", shrink, score)
 

@@ -276,7 +276,7 @@ def shares(
         "recording": max(recording, 0.0),
         "sequence": max(shared - max(recording, 0.0), 0.0),
         "agent": max(agent_variance, 0.0),
-        "mood": max(transient_variance, 0.0) + max(transient_common, 0.0),
+        "transient": max(transient_variance, 0.0) + max(transient_common, 0.0),
     }
     total_variance = sum(components.values())
     share: dict[str, float | None] = {

@@ -1,4 +1,4 @@
-"""Calibrations without what simulations of the calibrated crowd are off by."""
+"""Bias correction of calibrated crowds by simulation."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from tests.diagnosis import walkers
 C, SPEED = 0.8, 1.3
 
 
-def hurried(seed: int, sequences: int = 12, people: int = 6) -> walkers.Extra:
-    """A preferred speed, and disturbances that last for some tenths of a second."""
+def hurried(seed: int, sequences: int, people: int = 6) -> walkers.Extra:
+    """A preferred speed and disturbances that last for some tenths of a second."""
     draw = np.random.default_rng(100 + seed)
     size = draw.normal(0, 0.12, (8, 2, sequences, people, 2))
     rates = draw.uniform(0.5, 4.0, (8, 1, 1, 1))
@@ -35,11 +35,8 @@ def hurried(seed: int, sequences: int = 12, people: int = 6) -> walkers.Extra:
     return extra
 
 
-def calibrated(
-    seed: int, noise: float, sequences: int = 12
-) -> tuple[Fit, list[Sequence], CrowdEngine]:
-    extra = hurried(seed, sequences)
-    data = walkers.crowd(extra, seed=seed, sequences=sequences, noise=noise)
+def calibrated(seed: int, sequences: int = 12) -> tuple[Fit, list[Sequence], CrowdEngine]:
+    data = walkers.crowd(hurried(seed, sequences), seed=seed, sequences=sequences, noise=0.01)
     system = walkers.model(PreferredSpeed(c=C, v_pref=SPEED))
     engine = CrowdEngine(data)
     engine.fit_whitening(system, ParameterVector(system).row)
@@ -47,40 +44,40 @@ def calibrated(
 
 
 @pytest.mark.thorough
-def test_a_bias_by_disturbances_is_taken_out() -> None:
+def test_bias_by_disturbances_is_removed() -> None:
     before, after = [], []
     for seed in range(3):
-        fit, data, engine = calibrated(seed, 0.01)
-        found = bias_corrected(fit, data)
+        fit, data, engine = calibrated(seed)
+        corrected = bias_corrected(fit, data)
         place = fit.names.index("terms.2.c")
         before.append(abs(fit.row[place] - C))
-        after.append(abs(found.row[place] - C))
-        assert np.array_equal(ParameterVector(found.system).row.numpy(), found.row)
-        assert np.array_equal(ParameterVector(fit.system).row.numpy(), fit.row)
-        # what the simulations leave uncertain is part of the errors
-        wider = found.errors(engine.sequence)[fit.free] >= fit.errors(engine.sequence)[fit.free]
-        assert wider.all()
+        after.append(abs(corrected.row[place] - C))
+        for result in (corrected, fit):
+            assert np.array_equal(ParameterVector(result.system).row.numpy(), result.row)
+        # the error of the simulations is part of the standard errors
+        errors, original = (f.errors(engine.sequence)[fit.free] for f in (corrected, fit))
+        assert (errors >= original).all()
     assert sum(after) < 0.5 * sum(before)
 
 
 @pytest.mark.thorough
-def test_the_same_seed_gives_the_same_numbers_and_bounds_hold() -> None:
-    fit, data, _ = calibrated(1, 0.01, sequences=5)
-    held = np.array([name == "terms.1.A" for name in fit.names])
-    assert held.sum() == 1
-    fit = replace(fit, free=fit.free & ~held)  # as at a bound
-    found = bias_corrected(fit, data, seed=7)
-    assert np.array_equal(found.row, bias_corrected(fit, data, seed=7).row)
-    assert not np.array_equal(found.row, bias_corrected(fit, data, seed=8).row)
-    assert np.array_equal(found.row[held], fit.row[held])
-    assert (found.row[fit.free] != fit.row[fit.free]).any()
+def test_correction_depends_on_seed_and_keeps_parameters_at_bounds() -> None:
+    fit, data, _ = calibrated(1, sequences=5)
+    at_bound = np.array([name == "terms.1.A" for name in fit.names])
+    assert at_bound.sum() == 1
+    fit = replace(fit, free=fit.free & ~at_bound)
+    first, second, other = (bias_corrected(fit, data, seed=seed).row for seed in (7, 7, 8))
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, other)
+    assert np.array_equal(first[at_bound], fit.row[at_bound])
+    assert (first[fit.free] != fit.row[fit.free]).any()
 
 
 @pytest.mark.thorough
-def test_crowds_that_cannot_be_calibrated_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*given: Any, **more: Any) -> Fit:
+def test_failed_calibrations_leave_fit_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*arguments: Any, **options: Any) -> Fit:
         raise SimulationError("it blows up")
 
-    fit, data, _ = calibrated(1, 0.01, sequences=5)
+    fit, data, _ = calibrated(1, sequences=5)
     monkeypatch.setattr(module, "refine", fails)
     assert bias_corrected(fit, data) is fit

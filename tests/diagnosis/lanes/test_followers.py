@@ -1,8 +1,9 @@
-"""Followers behind measured leaders: derivatives of residuals are differences of simulations."""
+"""Residuals and derivatives of followers behind measured leaders."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,69 +27,67 @@ from nnode.model.effects.lane import (
     VehicleClass,
 )
 from nnode.model.extend import extended
+from tests.diagnosis.agreement import distance, residuals
 
 
-def estimated(memory: Effect) -> tuple[FollowersEngine, System]:
-    """Followers, and their law with a memory, calibrated."""
-    table = platoons("lin", "inertia", 0.15, 77, number=6, vehicles=4)
-    engine = FollowersEngine(list(nnode.sequences(table)))
-    system = Traffic([make_law("lin"), memory], leader="measured").double()
+def engine_of(*arguments: Any, **options: Any) -> FollowersEngine:
+    return FollowersEngine(list(nnode.sequences(platoons(*arguments, vehicles=4, **options))))
+
+
+def estimated(engine: FollowersEngine, law: str, *effects: Effect) -> System:
+    """A law and effects, with the estimated parameters of the engine's drivers."""
+    system = Traffic([make_law(law), *effects], leader="measured").double()
     engine.fit_whitening(system, ParameterVector(system).row)
     assert engine.population is not None
-    return engine, engine.population.system
+    return engine.population.system
+
+
+def with_memory(memory: Effect) -> tuple[FollowersEngine, System]:
+    engine = engine_of("lin", "inertia", 0.15, 77, number=6)
+    return engine, estimated(engine, "lin", memory)
+
+
+def column_error(engine: FollowersEngine, system: System, effect: Effect, size: float) -> float:
+    """The distance of an effect's column from the difference that the effect makes."""
+    probe = effect.probes(engine.batch, system)[0]
+    row = ParameterVector(system).row
+    (column,) = engine.screen_columns(system, row, type(effect), probe)
+    changed, _ = extended(system, effect.double())
+    change = residuals(engine, changed) - residuals(engine, system)
+    return distance(column, change / size)
 
 
 @pytest.mark.parametrize("memory", [Inertia(tau_v=0.3), ReactionDelay(T=0.5)])
-def test_derivatives_beside_a_memory_are_differences(memory: Effect) -> None:
-    engine, system = estimated(memory)
-    row = ParameterVector(system).row
-    probe = MultiAnticipation.probes(engine.batch, system)[0]
-    (column,) = engine.screen_columns(system, row, MultiAnticipation, probe)
-    size = 1e-3
-    larger, _ = extended(system, MultiAnticipation(c=size).double())
-    before, after = (
-        engine.residuals(model, ParameterVector(model).row[None])[0] for model in (system, larger)
-    )
-    difference = (after - before) / size
-    assert float((column - difference).norm()) < 0.05 * float(difference.norm())
+def test_effect_column_with_memory_is_finite_difference(memory: Effect) -> None:
+    assert column_error(*with_memory(memory), MultiAnticipation(c=1e-3), 1e-3) < 0.05
 
 
-def test_the_change_by_a_class_is_exact_where_drivers_differ() -> None:
-    """Almost all of it is what drivers of another T would do, which the whitening removes."""
-    table = platoons("idm", "vehicle_class", 0.3, 78, number=6, vehicles=4, error=0.02)
-    engine = FollowersEngine(list(nnode.sequences(table)))
-    law = Traffic([make_law("idm")], leader="measured").double()
-    engine.fit_whitening(law, ParameterVector(law).row)
+def test_class_column_is_finite_difference_with_drivers_who_differ() -> None:
+    """Drivers with another T would explain most of the change; the whitening removes this part."""
+    engine = engine_of("idm", "vehicle_class", 0.3, 78, number=6, error=0.02)
+    system = estimated(engine, "idm")
     assert engine.population is not None
     assert "idm.T" in engine.population.random
-    system = engine.population.system
     (probe,) = VehicleClass.probes(engine.batch, system)
-    row = ParameterVector(system).row
-    (column,) = engine.screen_columns(system, row, VehicleClass, probe)
-    size = 1e-4
-    longer, _ = extended(system, VehicleClass(**probe.options, phi=1 + size).double())
-    before, after = (
-        engine.residuals(model, ParameterVector(model).row[None])[0] for model in (system, longer)
-    )
-    difference = (after - before) / size
-    assert float((column - difference).norm()) < 0.01 * float(difference.norm())
+    effect = VehicleClass(**probe.options, phi=1 + 1e-4)
+    assert column_error(engine, system, effect, 1e-4) < 0.01
 
 
 @pytest.mark.parametrize("memory", [Inertia(tau_v=0.3), ReactionDelay(T=0.3)])
-def test_a_period_of_the_whole_record_is_another_desired_speed(memory: Effect) -> None:
-    engine, system = estimated(memory)
+def test_period_of_whole_record_changes_desired_speed_only(memory: Effect) -> None:
+    engine, system = with_memory(memory)
     row = ParameterVector(system).row
     first = SpeedPeriod.probes(engine.batch, system)[0]
     always = replace(first, options={"a": -1e4, "b": 1e4})
     (column,) = engine.screen_columns(system, row, SpeedPeriod, always)
     tangents = torch.stack(list(engine.tangents(system, row)), 1)
     basis, _ = torch.linalg.qr(tangents)
-    # not by another start of the memory, which is unknown
+    # the unknown start of the memory does not change
     assert float((column - basis @ (basis.T @ column)).norm()) < 0.2 * float(column.norm())
 
 
-def test_differences_between_drivers_are_corrected_if_the_estimation_converged() -> None:
-    engine, _ = estimated(Inertia(tau_v=0.3))
+def test_population_is_corrected_for_bias_if_estimation_converged() -> None:
+    engine, _ = with_memory(Inertia(tau_v=0.3))
     population = engine.population
     assert population is not None
     corrected = engine.drivers(0)
@@ -99,19 +98,19 @@ def test_differences_between_drivers_are_corrected_if_the_estimation_converged()
 
 
 @pytest.mark.parametrize(("c", "relevant"), [(0.0005, False), (0.2, True)])
-def test_effects_that_hardly_move_the_paths_are_not_relevant(c: float, relevant: bool) -> None:
-    engine, system = estimated(Inertia(tau_v=0.3))
-    larger, _ = extended(system, MultiAnticipation(c=c).double())
-    assert engine.relevant(system, larger, 1.0) is relevant
+def test_relevance_of_effect_depends_on_change_of_paths(c: float, relevant: bool) -> None:
+    engine, system = with_memory(Inertia(tau_v=0.3))
+    changed, _ = extended(system, MultiAnticipation(c=c).double())
+    assert engine.relevant(system, changed, 1.0) is relevant
     before, after = (
         engine._simulated(model, ParameterVector(model).row[None])[1][:, 0, 0]
-        for model in (system, larger)
+        for model in (system, changed)
     )
     assert (np.sqrt(np.mean((after - before) ** 2)) >= ERROR) is np.bool_(relevant)
 
 
-def test_the_squares_of_paths_that_diverge_are_infinite(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine, system = estimated(Inertia(tau_v=0.3))
+def test_squares_of_diverging_paths_are_infinite(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine, system = with_memory(Inertia(tau_v=0.3))
     row, pseudo_residuals = ParameterVector(system).row, engine._pseudo_residuals
     finite = engine.squares(system, row).means()
 
@@ -126,25 +125,23 @@ def test_the_squares_of_paths_that_diverge_are_infinite(monkeypatch: pytest.Monk
     np.testing.assert_allclose(means[1:], finite[1:])
 
 
-def test_an_effect_does_not_carry_a_parameter_beyond_its_bound() -> None:
+def test_column_of_effect_that_equals_parameter_at_bound() -> None:
     """The response of ``helly`` to the speed difference is that of ``relative_speed``."""
-    table = platoons("idm", "none", 0.0, 77, number=6, vehicles=4)
-    engine = FollowersEngine(list(nnode.sequences(table)))
+    engine = engine_of("idm", "none", 0.0, 77, number=6)
     system = Traffic([make_law("helly")], leader="measured").double()
     engine.fit_whitening(system, ParameterVector(system).row)
     fit = evaluated(engine, system)
     free = np.array([not name.endswith("c_v") for name in fit.names])
     fit = replace(fit, free=free)  # as at a bound
     (trace,) = traces(engine, fit, RelativeSpeed)
-    left = Screen(fit, engine.cluster).adjusted(trace.columns)
-    # all of it would be left beside the free parameters; 4 % are errors of the linear response
-    assert np.linalg.norm(left) < 0.1 * np.linalg.norm(trace.columns)
+    remainder = Screen(fit, engine.cluster).adjusted(trace.columns)
+    # free parameters alone would leave the whole column; 4 % are errors of the linear response
+    assert np.linalg.norm(remainder) < 0.1 * np.linalg.norm(trace.columns)
 
 
-def test_a_zone_is_located_where_a_law_does_not_reach_its_desired_speed() -> None:
+def test_zone_is_located_with_law_that_does_not_reach_desired_speed() -> None:
     """Speeds of a map from step to step do not depend on a desired speed that none reaches."""
-    table = platoons("idm", "speed_zone", 0.1, 79, number=8, vehicles=4)
-    engine = FollowersEngine(list(nnode.sequences(table)))
+    engine = engine_of("idm", "speed_zone", 0.1, 79, number=8)
     law = Traffic([make_law("krauss", v0=40.0)], leader="measured").double()
     usual = engine.with_usual_variances(law)
     fit = refine(usual, law)
@@ -152,3 +149,21 @@ def test_a_zone_is_located_where_a_law_does_not_reach_its_desired_speed() -> Non
     low, high = ZONE
     assert low < (score.options["a"] + score.options["b"]) / 2 < high
     assert score.options["alpha"] < 1
+
+
+@pytest.mark.parametrize(("law", "simulated"), [("idm", False), ("krauss", True)])
+def test_columns_of_zones_are_simulated_for_maps_only(
+    law: str, simulated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = engine_of("idm", "none", 0.0, 77, number=6)
+    system = Traffic([make_law(law)], leader="measured").double()
+    engine.fit_whitening(system, ParameterVector(system).row)
+    calls, displacement = list[object](), engine._displacement
+
+    def counted(*arguments: object) -> np.ndarray:
+        calls.append(arguments)
+        return displacement(*arguments)
+
+    monkeypatch.setattr(engine, "_displacement", counted)
+    traces(engine, evaluated(engine, system), SpeedZone)
+    assert bool(calls) is simulated

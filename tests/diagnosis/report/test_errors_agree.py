@@ -1,5 +1,4 @@
-"""One definition of the error: headline, tables, figures, player and JSON state the same numbers,
-which follow from the simulations that are shown."""
+"""Headline, tables, figures, player and JSON state the same errors of the shown simulations."""
 
 from __future__ import annotations
 
@@ -30,9 +29,9 @@ from tests.pages.test_replay import unpacked
 
 @dataclass
 class Run:
-    """A diagnosis and what was written of it."""
+    """A diagnosis and the folder of its report."""
 
-    found: DiagnosisOutcome
+    outcome: DiagnosisOutcome
     sequences: list[Sequence]
     folder: Path
 
@@ -42,81 +41,76 @@ class Run:
 
     @property
     def report(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads((self.folder / "report.json").read_text())
-        return found
+        report: dict[str, Any] = json.loads((self.folder / "report.json").read_text())
+        return report
 
 
 @pytest.fixture(scope="module", params=["traffic", "crowd"])
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = tmp_path_factory.mktemp(request.param)
     if request.param == "traffic":
-        sequences, options, found = request.getfixturevalue("hidden_reaction")
-        found = deepcopy(found)
+        sequences, options, outcome = request.getfixturevalue("hidden_reaction")
+        outcome = deepcopy(outcome)
     else:
         sequences = walkers.crowd(walkers.wind(0.0, 0.35), sequences=17, samples=40)
         options = DiscoverOptions(effects=["side_preference"], structure=False)
         model = {"term": "social_force", "A": walkers.A, "B": walkers.B}
-        found = diagnose_law(build_model(model_options(model, "measured")), sequences, options)
-    found.diagnosis.model = "base"
+        outcome = diagnose_law(build_model(model_options(model, "measured")), sequences, options)
+    outcome.diagnosis.model = "base"
     inputs = Inputs(
         domain=request.param, sequences=sequences, faulty=[], faults={}, data_faults=[], manifest={}
     )
-    draw(inputs, found, options, CONFIG, [], folder)()
-    write_report(plain_report(found.diagnosis), folder / "report.json")
-    return Run(found, sequences, folder)
+    draw(inputs, outcome, options, CONFIG, [], folder)()
+    write_report(plain_report(outcome.diagnosis), folder / "report.json")
+    return Run(outcome, sequences, folder)
 
 
 @pytest.mark.thorough
-def test_errors_are_those_of_the_simulations_that_are_shown(run: Run) -> None:
-    rows = run.found.diagnosis.confirmation_errors
-    assert len(rows) == len(run.found.simulated) > 3
-    for row, pair in zip(rows, run.found.simulated, strict=True):
-        for key, one in zip(("before", "after"), pair, strict=True):
-            assert one is not None
-            away = (one.sequence.x - one.x)[one.skip :]
-            if one.x.shape[2] == 1:
-                assert np.isnan(away[:, -1]).all()  # the leader is given
-                away = away[:, :-1]
-            assert np.mean((away**2).sum(-1)) == pytest.approx(row[key], rel=1e-9)
-            measured = next(s for s in run.sequences if s.name == one.sequence.name)
-            at = np.searchsorted(measured.time, one.sequence.time - 1e-6)
-            np.testing.assert_array_equal(measured.x[at], one.sequence.x)
+def test_errors_of_shown_simulations(run: Run) -> None:
+    rows = run.outcome.diagnosis.confirmation_errors
+    assert len(rows) == len(run.outcome.simulated) > 3
+    for row, pair in zip(rows, run.outcome.simulated, strict=True):
+        for key, simulation in zip(("before", "after"), pair, strict=True):
+            assert simulation is not None
+            sequence = simulation.sequence
+            error = (sequence.x - simulation.x)[simulation.skip :]
+            if error.shape[2] == 1:
+                assert np.isnan(error[:, -1]).all()  # the leader is an input
+                error = error[:, :-1]
+            assert np.mean((error**2).sum(-1)) == pytest.approx(row[key], rel=1e-9)
+            measured = next(s for s in run.sequences if s.name == sequence.name)
+            at = np.searchsorted(measured.time, sequence.time - 1e-6)
+            np.testing.assert_array_equal(measured.x[at], sequence.x)
 
 
-def test_headline_tables_and_json_state_the_same_errors(run: Run) -> None:
-    d, report = run.found.diagnosis, run.report
-    before, after = (
-        np.mean([row[key] for row in report["confirmation_errors"]]) for key in ("before", "after")
-    )
-    assert report["gap"]["before"] == pytest.approx(before)
-    assert report["gap"]["after"] == pytest.approx(after)
-    words = [amount(before), amount(after)]
+def test_errors_of_headline_tables_and_json(run: Run) -> None:
+    d, report = run.outcome.diagnosis, run.report
+    rows, table = report["confirmation_errors"], pd.read_csv(run.folder / "confirmation.csv")
+    words = []
+    for key in ("before", "after"):
+        errors = [row[key] for row in rows]
+        assert report["gap"][key] == pytest.approx(np.mean(errors))
+        assert list(table[key]) == pytest.approx(errors)
+        words.append(amount(np.mean(errors)))
     if d.verdict == "named":
         assert f"from {words[0]} to {words[1]} m²" in verdict(d)
     assert verdict(d) in run.page.replace("&#39;", "'")
-    table = pd.read_csv(run.folder / "gap.csv", dtype=str)
-    shown = table[table.iloc[:, 0].isin(["base", "base with effects"])]
+    gap = pd.read_csv(run.folder / "gap.csv", dtype=str)
+    shown = gap[gap.iloc[:, 0].isin(["base", "base with effects"])]
     assert list(shown.iloc[:, 1]) == (words if d.effects else words[:1])
-    each = pd.read_csv(run.folder / "confirmation.csv")
-    assert list(each["before"]) == pytest.approx(
-        [row["before"] for row in report["confirmation_errors"]]
-    )
-    assert list(each["after"]) == pytest.approx(
-        [row["after"] for row in report["confirmation_errors"]]
-    )
 
 
-def test_the_definition_stands_once_on_the_page_and_in_the_report(run: Run) -> None:
-    told = run.report["gap"]["definition"]
-    assert told.startswith("The error is the mean square distance")
+def test_definition_of_error_is_stated_once(run: Run) -> None:
+    definition = run.report["gap"]["definition"]
+    assert definition.startswith("The error is the mean square distance")
     page = run.page.replace("&#39;", "'")
-    assert page.count(told) == 1
+    assert page.count(definition) == 1
     # no other root mean square of positions is stated
     assert not re.search(r"\d m rms", page)
-    assert ("the last 40 %" in told) == any(a.named for a in run.found.diagnosis.agents)
+    assert ("the last 40 %" in definition) == any(a.named for a in run.outcome.diagnosis.agents)
 
 
-def test_player_and_paths_show_the_errors_of_the_table(run: Run) -> None:
+def test_errors_of_player_and_paths(run: Run) -> None:
     rows = {row["name"]: row for row in run.report["confirmation_errors"]}
     (text,) = re.findall(r'<script type="application/json">(.*?)</script>', run.page, re.S)
     player = json.loads(text)
@@ -124,13 +118,13 @@ def test_player_and_paths_show_the_errors_of_the_table(run: Run) -> None:
     assert len(scenes) > 3
     keys = ["before", "after"][: len(scenes[0]["simulated"])]
     for scene in scenes:
-        row, real = rows[scene["name"]], unpacked(scene["measured"])
-        for key, one in zip(keys, scene["simulated"], strict=True):
-            assert one["note"] == f"error {amount(row[key])} m²"
-            away = real - unpacked(one["x"])
+        row, measured = rows[scene["name"]], unpacked(scene["measured"])
+        for key, simulated in zip(keys, scene["simulated"], strict=True):
+            assert simulated["note"] == f"error {amount(row[key])} m²"
+            error = measured - unpacked(simulated["x"])
             if scene["dims"] == 1:
-                away = away[1:]
-            square = np.nanmean(away**2) * scene["dims"]
+                error = error[1:]
+            square = np.nanmean(error**2) * scene["dims"]
             # positions are rounded to the centimetre
             assert np.sqrt(square) == pytest.approx(np.sqrt(row[key]), abs=0.008)
     first = rows[scenes[player["first"]]["name"]]

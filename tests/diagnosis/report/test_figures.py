@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: what they show, not how they look."""
+"""Contents of a diagnosis's figures."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from tests.builders import lane
 
 
 def lane_map(scale: float) -> Deviation:
-    """Vehicles everywhere; between 400 and 600 m they are slower than simulated."""
+    """Vehicles everywhere, with a deviation between 400 and 600 m."""
     time, place = (c.ravel() for c in np.meshgrid(np.arange(0.0, 100), np.arange(0.0, 1000, 10)))
     value = -scale * ((place > 400) & (place < 600))[:, None]
-    beside = np.full((len(time), 2), 20.0)
-    return Deviation(time, place[:, None], value, value, beside)
+    neighbour = np.full((len(time), 2), 20.0)
+    return Deviation(time, place[:, None], value, value, neighbour)
 
 
-def test_a_map_shows_the_zone_on_the_scale_before() -> None:
+def test_maps_share_the_scale_of_before() -> None:
     figure = time_space_maps({"before": lane_map(6.0), "after": lane_map(0.5)})
     first, second = (
         next(c for c in ax.collections if isinstance(c, QuadMesh)) for ax in figure.axes[:2]
@@ -36,20 +36,20 @@ def test_a_map_shows_the_zone_on_the_scale_before() -> None:
     assert (shown[(middle < 380) | (middle > 620)] == 0.0).all()
 
 
-def test_maps_of_arrows_need_no_data_everywhere() -> None:
+def test_arrow_maps_with_missing_data() -> None:
     rng = np.random.default_rng(0)
     place = rng.uniform(0, 4, (300, 2))
     value = np.tile([0.0, 0.3], (300, 1))
     walls = np.array([[0.0, 0.0, 4.0, 0.0]])
-    beside = np.where(rng.uniform(size=(300, 1)) < 0.1, np.nan, place - 2)
-    given = Deviation(np.zeros(300), place, value, value, beside)
-    for figure in (plane_maps({"before": given}, walls), neighbour_maps({"before": given})):
+    neighbour = np.where(rng.uniform(size=(300, 1)) < 0.1, np.nan, place - 2)
+    before = Deviation(np.zeros(300), place, value, value, neighbour)
+    for figure in (plane_maps({"before": before}, walls), neighbour_maps({"before": before})):
         quiver = figure.axes[0].collections[0]
         shown = np.asarray(quiver.get_array(), float)
         assert shown[np.isfinite(shown)] == pytest.approx(0.3)
 
 
-def test_sealed_costs_are_paired_in_the_order_of_before() -> None:
+def test_confirmation_costs_are_sorted_by_before() -> None:
     figure = confirmation_costs(["a", "b", "c"], [1.0, 4.0, 2.0], [0.5, 1.0, 2.5], 0.1)
     ax = figure.axes[0]
     lines = {line.get_marker(): np.asarray(line.get_ydata()) for line in ax.lines}
@@ -58,11 +58,11 @@ def test_sealed_costs_are_paired_in_the_order_of_before() -> None:
     assert [label.get_text() for label in ax.get_xticklabels()] == ["b", "c", "a"]
 
 
-def test_trajectories_show_what_is_simulated_minus_what_was_measured() -> None:
+def test_trajectories_show_simulated_minus_measured() -> None:
     time = 0.2 * np.arange(21)
     s = lane(15 * time[:, None] + np.array([0.0, 20.0, 45.0]))
-    late = s.x - 0.5 * time[:, None, None]
-    figure = trajectories(s, as_drawn(Scene(s, {"without": late, "with": s.x})))
-    for ax, wanted in zip(figure.axes[2:], (-0.5 * time, 0 * time), strict=True):
+    slow = s.x - 0.5 * time[:, None, None]
+    figure = trajectories(s, as_drawn(Scene(s, {"without": slow, "with": s.x})))
+    for ax, expected in zip(figure.axes[2:], (-0.5 * time, 0 * time), strict=True):
         shown = [np.asarray(line.get_ydata()) for line in ax.lines[1:]]
-        np.testing.assert_allclose(shown, np.tile(wanted, (3, 1)), atol=1e-12)
+        np.testing.assert_allclose(shown, np.tile(expected, (3, 1)), atol=1e-12)

@@ -1,4 +1,4 @@
-"""The report in plain types, and the extended model as options and as a checkpoint."""
+"""The report in plain types, and the extended model as options and checkpoint."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from nnode.diagnosis.result import (
     Gap,
 )
 from nnode.diagnosis.single_law import _shift
-from nnode.model import build_model
+from nnode.model import System, build_model
 from nnode.model.build import add_effects
 from nnode.model.effects.lane import SpeedZone
 from nnode.model.extend import effects_of, extended
 from tests.diagnosis.conftest import Case
 
 
-def test_the_report_holds_what_programs_rely_on(traffic: Case, tmp_path: Path) -> None:
+def test_fields_of_report(traffic: Case, tmp_path: Path) -> None:
     d = replace(traffic.found.diagnosis, gap=Gap(np.float64(2.0), 1.0, float("nan"), float("inf")))
     path = write_report(plain_report(d), tmp_path / "report.json")
 
@@ -55,8 +55,8 @@ def test_the_report_holds_what_programs_rely_on(traffic: Case, tmp_path: Path) -
     page = (Path(__file__).parents[3] / "docs" / "discovery.md").read_text(encoding="utf-8")
     assert f"now {SCHEMA};" in page
     assert report["verdict"] == "named"
-    known = {"before": 2.0, "after": 1.0, "noise_floor": None, "closed": None}
-    assert report["gap"] == {**known, "plain": None, "plain_after": None, "definition": ""}
+    numbers = {"before": 2.0, "after": 1.0, "noise_floor": None, "closed": None}
+    assert report["gap"] == {**numbers, "plain": None, "plain_after": None, "definition": ""}
     (effect,) = report["effects"]
     assert effect["name"] == "speed_zone"
     assert set(effect) >= {"coefficients", "where", "alternatives", "formula", "source", "p_value"}
@@ -67,7 +67,7 @@ def test_the_report_holds_what_programs_rely_on(traffic: Case, tmp_path: Path) -
     assert set(report["screen"]) >= {"p_value", "clusters", "floor", "strongest"}
     assert report["confirmation"]["confirmed"] is True
     (drivers,) = report["agents"]
-    assert drivers["share"] == {"recording": None, "sequence": 0.2, "agent": 0.5, "mood": 0.3}
+    assert drivers["share"] == {"recording": None, "sequence": 0.2, "agent": 0.5, "transient": 0.3}
     assert {"name", "before", "after"} == set(report["confirmation_errors"][0])
 
 
@@ -75,11 +75,11 @@ def test_the_report_holds_what_programs_rely_on(traffic: Case, tmp_path: Path) -
     ("value", "text"),
     [(2035.19, "2040"), (-0.06123, "−0.0612"), (float("nan"), "–"), (None, "–"), (0.5, "0.5")],
 )
-def test_amounts_in_words(value: float | None, text: str) -> None:
+def test_amount(value: float | None, text: str) -> None:
     assert amount(value) == text
 
 
-def test_coefficients_in_words(traffic: Case) -> None:
+def test_interval(traffic: Case) -> None:
     (effect,) = traffic.found.diagnosis.effects
     assert interval(effect).startswith("alpha = 0.650 [0.627, 0.680], a = 400.0 [392.0, 400.0] m")
 
@@ -93,7 +93,7 @@ def test_coefficients_in_words(traffic: Case) -> None:
         (float("nan"), 0.12345, float("nan"), ("0.1235", "–", "–")),
     ],
 )
-def test_an_estimate_has_the_digits_that_its_interval_leaves(
+def test_digits_of_estimate_depend_on_interval(
     low: float, value: float, high: float, words: tuple[str, str, str]
 ) -> None:
     assert estimate(Coefficient(value, low, high, "m")) == words
@@ -122,9 +122,7 @@ JUMPS = [DataFault("jump", f"lane/{i}", ["v1"], 3.0) for i in (1, 1, 2)]
         ({"data_faults": JUMPS}, "lacks speed_zone | 2 sequences with 3 faults "),
     ],
 )
-def test_the_sentence_has_the_facts_of_a_verdict(
-    traffic: Case, changes: dict[str, Any], facts: str
-) -> None:
+def test_sentence_has_facts_of_verdict(traffic: Case, changes: dict[str, Any], facts: str) -> None:
     d = traffic.found.diagnosis
     (effect,) = d.effects
     effect = replace(effect, alternatives=[Alternative("inertia", 1.0, 0.5)])
@@ -134,23 +132,26 @@ def test_the_sentence_has_the_facts_of_a_verdict(
         changes["clusters"] = replace(d.clusters, least_exploration=least)
     if "hypotheses" in changes:
         changes["hypotheses"] = [replace(effect, name="inertia")]
-    no = Confirmation(0.4, 5, False, "no better")
-    said = sentence(replace(d, confirmation=no, gap=Gap(5.0, 1.0, 0.5, 8 / 9), **changes))
-    assert said.endswith(".")
+    confirmation = Confirmation(0.4, 5, False, "no better")
+    gap = Gap(5.0, 1.0, 0.5, 8 / 9)
+    text = sentence(replace(d, confirmation=confirmation, gap=gap, **changes))
+    assert text.endswith(".")
     for fact in facts.split(" | "):
-        assert fact in said
+        assert fact in text
+
+
+def assert_equal(actual: System, expected: System) -> None:
+    states = actual.state_dict(), expected.state_dict()
+    assert set(states[0]) == set(states[1])
+    for key, value in states[1].items():
+        torch.testing.assert_close(states[0][key], value, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("name", ["traffic", "crowd"])
-def test_the_options_give_the_extended_model(name: str, request: pytest.FixtureRequest) -> None:
+def test_options_of_extended_model(name: str, request: pytest.FixtureRequest) -> None:
     case: Case = request.getfixturevalue(name)
     options = extended_options(case.model, case.found.extended)
-    model = build_model(options)
-    expected = case.found.extended.state_dict()
-    found = model.state_dict()
-    assert set(found) == set(expected)
-    for key, value in expected.items():
-        torch.testing.assert_close(found[key], value, rtol=0, atol=0)
+    assert_equal(build_model(options), case.found.extended)
     text = model_yaml(options, False)
     read = yaml.safe_load(text)
     assert read.pop("defaults") == [f"{case.model['term']}_schema", "_self_"]
@@ -158,46 +159,42 @@ def test_the_options_give_the_extended_model(name: str, request: pytest.FixtureR
     assert options["name"] in text.splitlines()[0]
 
 
-def test_effects_find_their_parameters_in_any_order(traffic: Case) -> None:
+def test_rebuilt_model_keeps_parameters_of_effects_in_any_order(traffic: Case) -> None:
     system = build_model(traffic.model)
     add_effects(system, [{"name": "relative_speed", "kappa": 0.2}])
     add_effects(system, [{"name": "speed_zone", "alpha": 0.5, "a": 1.0, "b": 2.0}])
     assert [e.name for e in effects_of(system)] == ["relative_speed", "speed_zone"]
-    again = rebuilt(extended_options(traffic.model, system), system)
-    assert again.physical() == system.physical()
+    copy = rebuilt(extended_options(traffic.model, system), system)
+    assert copy.physical() == system.physical()
 
 
-def test_a_network_keeps_its_weights_in_the_checkpoint(traffic: Case) -> None:
+def test_rebuilt_network_keeps_weights(traffic: Case) -> None:
     options = {"name": "n2", "term": "network_speed", "hidden": 2, "v0": 30.0, "box": None}
     system = build_model({**options, "leader": "measured"}, seed=3)
     assert has_network(system)
     assert not has_network(traffic.found.base)
-    again = rebuilt({**options, "leader": "measured", "effects": []}, system)
-    for key, value in system.state_dict().items():
-        torch.testing.assert_close(again.state_dict()[key], value, rtol=0, atol=0)
+    assert_equal(rebuilt({**options, "leader": "measured", "effects": []}, system), system)
     assert "these would be new" in model_yaml(options, True)
 
 
-def test_the_checkpoint_has_the_diagnosis_own_parts(traffic: Case) -> None:
-    model = extended_options(traffic.model, traffic.found.extended)
+def test_checkpoint(traffic: Case) -> None:
+    outcome = traffic.found
+    model = extended_options(traffic.model, outcome.extended)
     config = {"model": model, "seed": 0, "trainer": {**vars(TrainerOptions()), "dtype": "float64"}}
-    checkpoint = checkpoint_of(
-        traffic.found, traffic.inputs.sequences, config, {}, AdadeltaOptions()
-    )
-    assert checkpoint.split["heldout"] == traffic.found.diagnosis.split["confirmation"]
-    assert checkpoint.split["train"] == traffic.found.diagnosis.split["exploration"]
-    # cars behind a leader at 14 to 22 m/s
+    checkpoint = checkpoint_of(outcome, traffic.inputs.sequences, config, {}, AdadeltaOptions())
+    assert checkpoint.split["heldout"] == outcome.diagnosis.split["confirmation"]
+    assert checkpoint.split["train"] == outcome.diagnosis.split["exploration"]
+    # the leaders' speeds are 14 to 22 m/s
     assert checkpoint.free_speed is not None
     assert 5 < checkpoint.free_speed < 27
-    assert checkpoint.build().physical() == traffic.found.extended.physical()
+    assert checkpoint.build().physical() == outcome.extended.physical()
 
 
-def test_a_parameter_is_compared_with_itself_whatever_joins_the_model(traffic: Case) -> None:
+def test_shift_of_parameters_of_same_name(traffic: Case) -> None:
     before = build_model(traffic.model)
     add_effects(before, [{"name": "speed_period", "alpha": 0.7}])
-    # the zone stands before the period in the sum, and its parameters have the same names
+    # the zone precedes the period, and its parameters have the same names
     after, _ = extended(before, SpeedZone(alpha=0.9))
     shift = _shift(before, after)
-    period = {"before": 0.7, "after": 0.7, "unit": "1"}
-    assert shift["speed_period.alpha"] == period
+    assert shift["speed_period.alpha"] == {"before": 0.7, "after": 0.7, "unit": "1"}
     assert [name for name in shift if name.endswith("alpha")] == ["speed_period.alpha"]

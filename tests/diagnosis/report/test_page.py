@@ -1,4 +1,4 @@
-"""The page and the events of a diagnosis, with results made by hand."""
+"""The page and the events of a diagnosis with made results."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CONFIG = {"data": {"name": "table"}, "model": {"name": "lin_with_speed_zone"}}
 
 
 def with_faults(case: Case) -> Inputs:
-    """The case's inputs beside a sequence in which a vehicle jumps."""
+    """The case's inputs and an excluded sequence in which a vehicle jumps."""
     first = case.inputs.sequences[0]
     x = first.x.copy()
     x[20:, 1] += 50.0
@@ -50,21 +50,19 @@ def with_faults(case: Case) -> Inputs:
 def written(traffic: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page")
     inputs = with_faults(traffic)
-    found = deepcopy(traffic.found)
-    found.diagnosis.data_faults = inputs.data_faults
-    write = draw(inputs, found, traffic.options, CONFIG, ["nnode evaluate X"], folder)
-    assert list(folder.iterdir()) == []  # drawn is not written
+    outcome = deepcopy(traffic.found)
+    outcome.diagnosis.data_faults = inputs.data_faults
+    write = draw(inputs, outcome, traffic.options, CONFIG, ["nnode evaluate X"], folder)
+    assert list(folder.iterdir()) == []  # nothing is written yet
     paths = write()
     assert paths == {"page": folder / "report.html", "tensorboard": folder / "tensorboard"}
     return folder
 
 
-def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Case) -> None:
+def test_order_of_page(written: Path, traffic: Case) -> None:
     page = (written / "report.html").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
-    told = verdict(traffic.found.diagnosis)
-    assert page.index(told) < page.index("Where the model deviates from the data</h2>")
-    order = [
+    headings = [
         "Where the model deviates from the data",
         "Errors on confirmation sequences",
         "Coefficients",
@@ -79,14 +77,14 @@ def test_the_page_is_one_file_with_the_verdict_first(written: Path, traffic: Cas
         "Independent clusters",
         "How this page was made",
     ]
-    heads = re.findall(r"<h2[^>]*>([^<]*)</h2>", page)
-    assert heads == order
+    assert page.index(verdict(traffic.found.diagnosis)) < page.index(f"{headings[0]}</h2>")
+    assert re.findall(r"<h2[^>]*>([^<]*)</h2>", page) == headings
     folded = re.findall(r"<summary><h2[^>]*>([^<]*)</h2></summary>", page)
     assert folded == ["Independent clusters"]
-    assert "car 1 jumps" in page  # what is wrong with the excluded sequence
+    assert "car 1 jumps" in page  # the fault of the excluded sequence
 
 
-def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
+def test_figures_have_descriptions_and_tables_have_files(written: Path) -> None:
     names = {path.stem for path in (written / "figures").iterdir()}
     assert names == {
         "coefficients",
@@ -106,7 +104,7 @@ def test_every_figure_has_words_and_every_table_a_file(written: Path) -> None:
     assert list(pd.read_csv(written / "data_faults.csv")["sequence"]) == ["lane/bad"]
 
 
-def test_tensorboard_shows_before_and_after(written: Path, traffic: Case) -> None:
+def test_tensorboard_events(written: Path, traffic: Case) -> None:
     events = EventAccumulator(str(written / "tensorboard")).Reload()
     gap = traffic.found.diagnosis.gap
     assert [e.value for e in events.Scalars("gap/confirmation")] == pytest.approx(
@@ -117,16 +115,16 @@ def test_tensorboard_shows_before_and_after(written: Path, traffic: Case) -> Non
     assert "diagnosis/map" in events.Tags()["images"]
 
 
-def test_a_crowd_s_page(crowd: Case, tmp_path: Path) -> None:
-    still = replace(crowd.options, replay=False)
-    draw(crowd.inputs, crowd.found, still, CONFIG, [], tmp_path)()
+def test_page_of_crowd(crowd: Case, tmp_path: Path) -> None:
+    options = replace(crowd.options, replay=False)
+    draw(crowd.inputs, crowd.found, options, CONFIG, [], tmp_path)()
     page = (tmp_path / "report.html").read_text()
     assert "Mean of measured minus simulated acceleration by position" in page
     assert "made_up_wind" in page
 
 
 def words_of(case: Case, **changes: Any) -> list[str]:
-    """The words of a page without figures, and the names of its tables.
+    """Texts of a page without figures, and the names of its tables.
 
     Args:
         changes: of the diagnosis; ``base`` and ``extended`` are other models.
@@ -146,23 +144,28 @@ def words_of(case: Case, **changes: Any) -> list[str]:
 EMPTY = ("effects", "places", "absences", "not_testable", "confirmation_errors", "notes", "agents")
 
 
-def test_a_page_has_no_tables_of_what_was_not_found(traffic: Case) -> None:
-    nothing: dict[str, Any] = {name: [] for name in EMPTY}
-    words = words_of(traffic, verdict="none", unknown=None, **nothing)
+def test_page_without_findings(traffic: Case) -> None:
+    empty: dict[str, Any] = {name: [] for name in EMPTY}
+    words = words_of(traffic, verdict="none", unknown=None, **empty)
     assert words.count("No sequence has a fault.") == 1
     tables = {word for word in words if re.fullmatch("[a-z_]+", word)}
     assert tables == {"gap", "parameters", "screen", "clusters"}
 
 
-def test_hypotheses_are_listed_with_the_reason(traffic: Case) -> None:
+def test_hypotheses_on_page(traffic: Case) -> None:
     d = traffic.found.diagnosis
-    no = Confirmation(0.4, 5, False, "the errors do not fall")
-    words = words_of(traffic, effects=[], verdict="none", hypotheses=d.effects, confirmation=no)
+    changes = {
+        "effects": [],
+        "verdict": "none",
+        "hypotheses": d.effects,
+        "confirmation": Confirmation(0.4, 5, False, "the errors do not fall"),
+    }
+    words = words_of(traffic, **changes)
     assert words[words.index("hypotheses") - 1] == "Reason: the errors do not fall."
     assert "screen" in words_of(traffic, effects=[], verdict="not_testable")
 
 
-def test_compared_laws_are_listed_with_those_that_were_refused(traffic: Case) -> None:
+def test_compared_and_refused_laws_on_page(traffic: Case) -> None:
     best = ComparedLaw("idm", 5, 1.0, 0.0, 1.0, {"idm.T": (1.2, "s")})
     diagnosed = ComparedLaw("stand-in", 2, 2.0, 0.3, 0.001, {})
     laws = Laws([best, diagnosed], {"newell": "a map"}, 3, nearest="idm")
@@ -173,7 +176,7 @@ def test_compared_laws_are_listed_with_those_that_were_refused(traffic: Case) ->
     assert "newell (a map)" in words[place + 1]
 
 
-def test_limits_of_a_model_are_explained(traffic: Case) -> None:
+def test_limits_of_model_on_page(traffic: Case) -> None:
     options = {"name": "n2", "term": "network_speed", "hidden": 2, "v0": 30.0, "box": None}
     network = build_model({**options, "leader": "measured"})
     differ = deepcopy(traffic.found.extended)
@@ -185,22 +188,19 @@ def test_limits_of_a_model_are_explained(traffic: Case) -> None:
     assert "driver_heterogeneity acts only on agents of the exploration sequences" in words
 
 
-def test_the_player_opens_on_the_sequence_with_the_median_error(traffic: Case) -> None:
-    found = deepcopy(traffic.found)
-    ((simulation, _), *_) = found.simulated
+def test_player_opens_on_median_error(traffic: Case) -> None:
+    outcome = deepcopy(traffic.found)
+    ((simulation, _), *_) = outcome.simulated
     assert simulation is not None
-    errors = [4.0, 9.0, 1.0, float("inf"), 16.0]  # a simulation that diverged is not shown
-    sequences = [replace(simulation.sequence, name=f"s{error:g}") for error in errors]
-    moved = [
-        replace(simulation, sequence=s, x=s.x + np.sqrt(error))
-        for s, error in zip(sequences, errors, strict=True)
-    ]
-    found.simulated = [(one, one) for one in moved]
-    rows = [
-        {"name": s.name, "before": e, "after": e} for s, e in zip(sequences, errors, strict=True)
-    ]
-    found.diagnosis = replace(found.diagnosis, confirmation_errors=rows)
-    shown = scenes(found)
+    errors = [4.0, 9.0, 1.0, float("inf"), 16.0]  # diverged simulations are not shown
+    outcome.simulated, rows = [], []
+    for error in errors:
+        sequence = replace(simulation.sequence, name=f"s{error:g}")
+        moved = replace(simulation, sequence=sequence, x=sequence.x + np.sqrt(error))
+        outcome.simulated.append((moved, moved))
+        rows.append({"name": sequence.name, "before": error, "after": error})
+    outcome.diagnosis = replace(outcome.diagnosis, confirmation_errors=rows)
+    shown = scenes(outcome)
     assert [scene.sequence.name for scene in shown] == ["s16", "s9", "s4", "s1"]
     assert shown[typical(shown)].sequence.name == "s4"
 
@@ -217,7 +217,7 @@ def coefficients(unit: str, **values: float) -> dict[str, Coefficient]:
         (coefficients("m", A_o=1.0, B_o=0.6, x_o=-1.0, y_o=2.0), {"circle": (-1.0, 2.0, 0.6)}),
     ],
 )
-def test_the_named_place_is_shaded(
+def test_place_of_effect_is_shaded(
     traffic: Case, place: dict[str, Coefficient], shaded: dict[str, Any]
 ) -> None:
     d = traffic.found.diagnosis
@@ -226,7 +226,7 @@ def test_the_named_place_is_shaded(
     assert zone == Zone("speed_zone", **shaded)
 
 
-def test_the_largest_deviation_is_shaded_where_no_effect_has_a_place(traffic: Case) -> None:
+def test_largest_deviation_is_shaded_without_effect(traffic: Case) -> None:
     d = traffic.found.diagnosis
     assert zones(replace(d, effects=[])) == [Zone("largest deviation", x=ZONE)]
     assert zones(replace(d, effects=[], places=[])) == []

@@ -1,4 +1,4 @@
-"""The correction of parameters for their bias, compared with calibrations to simulated paths."""
+"""Bias correction of calibrated parameters."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from nnode.diagnosis.statistics.bias import corrected_for_bias
 from nnode.model.build import build_model
 from nnode.population.followers import PAIRS
 
-#: Pairs of simulations: with :data:`PAIRS` of them, chance is as large as the tolerance.
+#: Pairs of simulations; with :data:`PAIRS`, the random error is as large as the tolerance.
 DRAWS = 4 * PAIRS
 
 
 @pytest.mark.thorough
-def test_bias_is_that_of_calibrations_to_paths_simulated_by_the_model() -> None:
+def test_bias_is_that_of_calibrations_to_simulated_paths() -> None:
     table = platoons("lin", "multi_anticipation", 0.15, 4, number=20)
     engine = FollowersEngine(list(nnode.sequences(table)))
     effects = [{"name": "multi_anticipation", "c": 0.2}]

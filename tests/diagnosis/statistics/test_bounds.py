@@ -16,31 +16,34 @@ CLUSTER = np.repeat(np.arange(CLUSTERS), SIZE)
 
 
 def at_a_bound(seed: int, beyond: float, side: int = 1) -> Fit:
-    """A regression on two correlated columns, whose second parameter is held at a bound, although
-    its true value is ``beyond`` it. ``side`` is the sign of values that are not admissible."""
+    """A regression on two correlated columns whose second parameter is held at a bound.
+
+    Args:
+        beyond: distance of its true value from the bound.
+        side: sign of the values that are not admissible.
+    """
     rng = np.random.default_rng(seed)
     jacobian = rng.normal(size=(CLUSTERS * SIZE, 2))
     jacobian[:, 1] += 0.5 * jacobian[:, 0]
     measured = rng.normal(size=len(jacobian)) - side * beyond * jacobian[:, 1]
     free = jacobian[:, :1]
     residual = measured - free @ np.linalg.lstsq(free, measured, rcond=None)[0]
-    if (jacobian[:, 1] @ residual) * side > 0:  # the best value is admissible
-        return Fit(lin(), NAMES, np.zeros(2), residual, jacobian, np.array([True, True]))
-    return Fit(lin(), NAMES, np.zeros(2), residual, jacobian, np.array([True, False]))
+    admissible = (jacobian[:, 1] @ residual) * side > 0  # of the best value
+    return Fit(lin(), NAMES, np.zeros(2), residual, jacobian, np.array([True, admissible]))
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_value_beyond_the_bound_is_required(side: int) -> None:
+def test_true_value_beyond_bound_is_detected(side: int) -> None:
     assert required_beyond_bounds(at_a_bound(0, 0.3, side), CLUSTER) == {"lin.L"}
 
 
-def test_a_true_value_at_the_bound_is_rejected_in_one_case_of_a_hundred() -> None:
-    """The p-value is one-sided, and half of the estimates are admissible."""
+def test_level_for_true_value_at_bound() -> None:
+    """The level is 1 %: the p-value is one-sided, and half of the estimates are admissible."""
     rejected = [bool(required_beyond_bounds(at_a_bound(k, 0.0), CLUSTER)) for k in range(400)]
     assert 1 <= sum(rejected) <= 10
 
 
-def test_effects_and_free_parameters_do_not_count() -> None:
+def test_effects_and_free_parameters_are_ignored() -> None:
     fit = at_a_bound(0, 0.3)
     fit.names = ["terms.0.v0", "terms.1.kappa"]
     assert required_beyond_bounds(fit, CLUSTER) == set()
@@ -48,7 +51,7 @@ def test_effects_and_free_parameters_do_not_count() -> None:
     assert required_beyond_bounds(fit, CLUSTER) == set()
 
 
-def test_bounds_that_are_reached_only_with_effects() -> None:
+def test_bounds_reached_with_effects_only() -> None:
     fit = at_a_bound(0, -0.3)
     assert parameters_at_bounds(fit.system, fit, CLUSTER) == set()
     base, people = lin(), lin()

@@ -1,4 +1,4 @@
-"""Where the edges of a period may lie, when nothing was measured for a while."""
+"""Intervals of the edges of a period."""
 
 from __future__ import annotations
 
@@ -29,46 +29,46 @@ def fitted(engine: TrafficEngine, a: float, b: float) -> Fit:
     return converged_fit(engine, system)
 
 
-def test_an_edge_may_lie_anywhere_between_two_sequences(engine: TrafficEngine) -> None:
+def test_interval_of_edge_covers_time_between_sequences(engine: TrafficEngine) -> None:
     fit = fitted(engine, 250.0, 450.0)
     (low, high), (first, last) = intervals(engine, fit, "speed_period").values()
-    # 220 to 300 and 420 to 500 s were not measured
+    # nothing was measured from 220 to 300 s and from 420 to 500 s
     assert 215 < low <= 222
     assert 299 <= high < 305
     assert 415 < first <= 421
     assert 498 <= last < 505
 
 
-def test_an_edge_within_a_sequence_is_known_better(engine: TrafficEngine) -> None:
+def test_profile_is_flat_between_sequences_only(engine: TrafficEngine) -> None:
     fit = fitted(engine, 250.0, 450.0)
-    for one in profiles(engine, fit, "speed_period").values():
-        assert one.bounds == (0.0, 720.0)
-        inside = np.abs(one.at % 100 - 10) < 9
-        between = (one.at % 100 > 25) & (np.abs(one.at - one.value) < 29)
-        assert one.rise[inside].min() > 20
-        assert np.abs(one.rise[between]).max() < 1e-6
+    for profile in profiles(engine, fit, "speed_period").values():
+        assert profile.bounds == (0.0, 720.0)
+        inside = np.abs(profile.at % 100 - 10) < 9
+        between = (profile.at % 100 > 25) & (np.abs(profile.at - profile.value) < 29)
+        assert profile.rise[inside].min() > 20
+        assert np.abs(profile.rise[between]).max() < 1e-6
 
 
-def test_an_edge_leaves_a_wrong_place(engine: TrafficEngine) -> None:
+def test_refined_edges_leave_wrong_place(engine: TrafficEngine) -> None:
     wrong = fitted(engine, 307.0, 560.0)
-    found = refined_edges(engine, wrong, "speed_period")
-    assert found.cost < wrong.cost
-    names = [name.rsplit(".", 1)[1] for name in found.names]
-    row = dict(zip(names, found.row, strict=True))
+    refined = refined_edges(engine, wrong, "speed_period")
+    assert refined.cost < wrong.cost
+    names = [name.rsplit(".", 1)[1] for name in refined.names]
+    row = dict(zip(names, refined.row, strict=True))
     assert row["alpha"] == pytest.approx(SLOW, abs=0.02)
     assert 219 < row["a"] < 302
     assert 419 < row["b"] < 502
 
 
-def test_the_ends_are_where_the_cost_has_risen() -> None:
+def test_interval_ends_at_rise_of_cost() -> None:
     at, rise = np.array([1.0, 2.0, 4.0, 6.0]), np.array([np.inf, 0.0, 1.0, 3.0])
-    one = Profile(0, 3.0, at, rise, (0.0, 9.0))
-    assert one.interval(2.0) == (1.0, 5.0)
-    assert one.interval(4.0) == (1.0, 9.0)
+    profile = Profile(0, 3.0, at, rise, (0.0, 9.0))
+    assert profile.interval(2.0) == (1.0, 5.0)
+    assert profile.interval(4.0) == (1.0, 9.0)
 
 
-def test_a_fit_in_the_best_place_stays(engine: TrafficEngine) -> None:
+def test_refined_edges_keep_best_place(engine: TrafficEngine) -> None:
     fit = fitted(engine, 250.0, 450.0)
     assert refined_edges(engine, fit, "speed_period").cost <= fit.cost
-    again = refine(engine, copy.deepcopy(fit.system))
-    assert again.cost == pytest.approx(fit.cost, rel=1e-3)
+    refitted = refine(engine, copy.deepcopy(fit.system))
+    assert refitted.cost == pytest.approx(fit.cost, rel=1e-3)

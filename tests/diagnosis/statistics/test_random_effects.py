@@ -1,4 +1,4 @@
-"""Agents who differ: what of a number is one's own, what is a mood, and what all have in common."""
+"""Differences between agents, transient deviations, and common changes."""
 
 from __future__ import annotations
 
@@ -24,44 +24,42 @@ from nnode.model.effects.lane import DriverHeterogeneity
 from tests.diagnosis.platoons import DT, lin, platoons, streams
 
 
-def paced(own: np.ndarray) -> list[Sequence]:
-    """Sequences whose drivers have the paces ``(S, 4)``."""
-    return platoons(lambda x, law, lead: law * (1 + own), number=len(own))
+def paced(pace: np.ndarray) -> list[Sequence]:
+    """Sequences whose drivers have relative deviations ``(S, 4)`` of their speeds."""
+    return platoons(lambda x, law, lead: law * (1 + pace), number=len(pace))
 
 
-def who_differs(sequences: list[Sequence]) -> tuple[TrafficEngine, Fit, IndividualEstimate]:
-    """What is found of different drivers."""
+def estimated(sequences: list[Sequence]) -> tuple[TrafficEngine, Fit, IndividualEstimate]:
     engine = TrafficEngine(sequences, clusters=clusters(index_of(sequences)))
     fit = converged_fit(engine, lin(), rounds=1)
-    found = estimate_individual(engine, fit, DriverHeterogeneity)
-    assert found is not None
-    return engine, fit, found
+    estimate = estimate_individual(engine, fit, DriverHeterogeneity)
+    assert estimate is not None
+    return engine, fit, estimate
 
 
-def test_drivers_who_differ_are_recognised() -> None:
+def test_different_drivers_are_detected() -> None:
     pace = np.random.default_rng(5).normal(0, 0.1, (12, 4))
-    engine, fit, found = who_differs(paced(pace))
-    assert found.p_value < 0.01
-    low, high = found.interval()
+    engine, fit, estimate = estimated(paced(pace))
+    assert estimate.p_value < 0.01
+    low, high = estimate.interval()
     assert 0.04 < low < pace.std(ddof=1) < high
-    own = agent_parameters(engine, fit.system, found)
-    got = np.array([own[f"r/{s}"][:4] for s in range(12)])
-    assert np.corrcoef(got.ravel(), pace.ravel())[0, 1] > 0.95
-    # one number for all of a sequence is the mean of theirs
-    shared = agent_parameters(engine, fit.system, found, common=True)
+    individual = agent_parameters(engine, fit.system, estimate)
+    values = np.array([individual[f"r/{s}"][:4] for s in range(12)])
+    assert np.corrcoef(values.ravel(), pace.ravel())[0, 1] > 0.95
+    # agents of a sequence share one value
+    shared = agent_parameters(engine, fit.system, estimate, common=True)
     assert all(len(set(shared[f"r/{s}"][:4])) == 1 for s in range(12))
 
 
-@pytest.mark.parametrize("what", ["the hour", "the place in the platoon"])
+@pytest.mark.parametrize("shape", [(8, 1), (1, 4)], ids=["sequence", "place in the platoon"])
 @pytest.mark.thorough
-def test_what_all_have_in_common_is_no_difference_between_drivers(what: str) -> None:
+def test_common_changes_are_no_difference_between_drivers(shape: tuple[int, int]) -> None:
     alarms = 0
     for seed in range(6, 12):
-        rng = np.random.default_rng(seed)
-        common = rng.normal(0, 0.1, (8, 1) if what == "the hour" else (1, 4))
-        *_, found = who_differs(paced(np.broadcast_to(common, (8, 4))))
-        alarms += found.p_value <= 0.05
-    # one of twenty is expected; two of six would be a chance of 3 %
+        common = np.random.default_rng(seed).normal(0, 0.1, shape)
+        *_, estimate = estimated(paced(np.broadcast_to(common, (8, 4))))
+        alarms += estimate.p_value <= 0.05
+    # one of twenty is expected; two of six have a probability of 3 %
     assert alarms <= 1
 
 
@@ -69,71 +67,75 @@ CASES = 6
 
 
 @pytest.mark.thorough
-def test_a_mood_is_no_number_of_one_s_own() -> None:
-    """Disturbances of 6 s in windows of 10 s that keep names: both halves of a window are in one
-    mood, but windows of an agent that are far from each other are not."""
+def test_transient_deviations_are_no_difference_between_drivers() -> None:
+    """Disturbances of 6 s in windows of 10 s: both halves of a window have the same deviation, but
+    distant windows of an agent do not."""
     alarms = 0
     for seed in range(CASES):
-        *_, found = who_differs(streams(seconds=60.0, driver=0.3, lasts=6.0, seed=seed))
-        alarms += found.p_value <= 0.05
-        assert found.transient[0] > max(found.variance, 0.0)
-        assert (found.share["mood"] or 0.0) > 0.5
+        *_, estimate = estimated(streams(seconds=60.0, driver=0.3, lasts=6.0, seed=seed))
+        alarms += estimate.p_value <= 0.05
+        assert estimate.transient[0] > max(estimate.variance, 0.0)
+        assert (estimate.share["transient"] or 0.0) > 0.5
     assert alarms <= stats.binom.ppf(0.975, CASES, 0.05)
 
 
 @pytest.mark.thorough
-def test_true_paces_are_found_among_moods() -> None:
+def test_different_drivers_are_detected_despite_transient_deviations() -> None:
     pace, inside = 0.05, 0
     for seed in range(CASES):
-        *_, found = who_differs(streams(seconds=60.0, pace=pace, driver=0.3, lasts=6.0, seed=seed))
-        assert found.p_value < 0.05
-        low, high = found.interval()
+        sequences = streams(seconds=60.0, pace=pace, driver=0.3, lasts=6.0, seed=seed)
+        *_, estimate = estimated(sequences)
+        assert estimate.p_value < 0.05
+        low, high = estimate.interval()
         inside += low <= pace <= high
-        # what parts at every lag have in common, up to the whole minute
-        assert found.lags[-1] > 45.0
-        assert found.lasts == pytest.approx(found.lags[-1] / 3)
-    # the least number that an interval of 95 % leaves to chance at 2.5 %
+        # lags reach up to the whole minute
+        assert estimate.lags[-1] > 45.0
+        assert estimate.lasts == pytest.approx(estimate.lags[-1] / 3)
+    # an interval of 95 % covers fewer with a probability of 2.5 %
     assert inside >= stats.binom.ppf(0.025, CASES, 0.95)
 
 
 @cache
 def held_out(pace: float, variance: float | None = None) -> tuple[HeldOutErrors, list[Sequence]]:
-    """Half of the streams are open, the others are divided in time; ``variance`` is taken in
-    place of the one that was found."""
+    """Errors in the last part of eight sequences, with a variance estimated on eight others.
+
+    Args:
+        variance: replaces the estimate.
+    """
     sequences = streams(number=16, seconds=40.0, window=40.0, pace=pace, driver=0.3, seed=3)
-    _, fit, one = who_differs(sequences[:8])
+    _, fit, estimate = estimated(sequences[:8])
     if variance is not None:
-        one = replace(one, variance=variance)
-    found = held_out_errors("traffic", lin(), fit.system, one, sequences[8:], np.arange(8))
-    assert found is not None
-    return found, sequences[8:]
+        estimate = replace(estimate, variance=variance)
+    errors = held_out_errors("traffic", lin(), fit.system, estimate, sequences[8:], np.arange(8))
+    assert errors is not None
+    return errors, sequences[8:]
 
 
-def test_numbers_of_the_first_part_predict_the_last() -> None:
-    found, _ = held_out(0.05)
-    plain, own, shared = (found.costs[name].mean() for name in MODELS)
-    assert own < 0.6 * plain
-    assert own < 0.7 * shared
-    assert max(better(found.score_toward[name]) for name in (MODELS[0], MODELS[2])) <= 0.05
-    # near the noise and the moods that nobody can know; by far nearer than without any law
-    assert found.floor < own < 0.1 * found.costs["constant velocity"].mean()
+def test_parameters_of_first_part_predict_the_last() -> None:
+    errors, _ = held_out(0.05)
+    plain, individual, shared = (errors.costs[name].mean() for name in MODELS)
+    assert individual < 0.6 * plain
+    assert individual < 0.7 * shared
+    assert max(better(errors.score_toward[name]) for name in (MODELS[0], MODELS[2])) <= 0.05
+    # noise and transient deviations are unpredictable
+    assert errors.floor < individual < 0.1 * errors.costs["constant velocity"].mean()
 
 
-def test_moods_of_the_first_part_predict_nothing() -> None:
-    found, _ = held_out(0.0, variance=0.05**2)
-    assert found.costs[MODELS[1]].mean() > 0.9 * found.costs[MODELS[0]].mean()
-    assert better(found.score_toward[MODELS[0]]) > 0.05
+def test_transient_deviations_of_first_part_predict_nothing() -> None:
+    errors, _ = held_out(0.0, variance=0.05**2)
+    assert errors.costs[MODELS[1]].mean() > 0.9 * errors.costs[MODELS[0]].mean()
+    assert better(errors.score_toward[MODELS[0]]) > 0.05
 
 
-def test_who_knows_no_law_gets_the_same_first_part() -> None:
-    found, sequences = held_out(0.05)
-    assert set(found.costs) == {*MODELS, "base", "own mean velocity", "constant velocity"}
-    assert found.used == list(range(8))
+def test_predictions_without_law() -> None:
+    errors, sequences = held_out(0.05)
+    assert set(errors.costs) == {*MODELS, "base", "own mean velocity", "constant velocity"}
+    assert errors.used == list(range(8))
     for i, s in enumerate(sequences):
         x = s.x[:, :-1, 0]
         # 40 s in samples of 0.2 s: the first part ends at 16 s, the last begins at 24 s
         time = DT * np.arange(1, 81)[:, None]
         for name, first in (("own mean velocity", 0), ("constant velocity", 75)):
             speed = (x[80] - x[first]) / (DT * (80 - first))
-            away = x[121:] - x[120] - speed * time
-            assert found.costs[name][i] == pytest.approx((away**2).mean(), rel=1e-6)
+            error = x[121:] - x[120] - speed * time
+            assert errors.costs[name][i] == pytest.approx((error**2).mean(), rel=1e-6)

@@ -1,4 +1,4 @@
-"""Agents who are there at one time: alike by chance, or by something that acts on them all."""
+"""The test whether residuals of simultaneous clusters are correlated."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from nnode.diagnosis.statistics.simultaneous import Simultaneous, simultaneous
 SECONDS, LATER, RATE = 40, 15, 2
 
 
-def lasting(rng: np.random.Generator, length: int, tau: float) -> np.ndarray:
-    """An autoregression, whose correlation lasts for ``tau`` samples."""
-    keep, found = np.exp(-1 / tau), [rng.normal()]
+def autoregression(rng: np.random.Generator, length: int, tau: float) -> np.ndarray:
+    """Values with a correlation time of ``tau`` samples."""
+    keep, values = np.exp(-1 / tau), [rng.normal()]
     for _ in range(length - 1):
-        found.append(keep * found[-1] + np.sqrt(1 - keep**2) * rng.normal())
-    return np.array(found)
+        values.append(keep * values[-1] + np.sqrt(1 - keep**2) * rng.normal())
+    return np.array(values)
 
 
-def judged(
+def result_of(
     seed: int,
     *,
     clusters: int = 5,
@@ -34,22 +34,28 @@ def judged(
     recordings: int = 1,
     kinds: int = 1,
 ) -> Simultaneous:
-    """Clusters of two agents that begin 15 s after each other and last for 40 s, whose residuals
-    last for 6 s; ``shock`` is the size of what they have in common at one time."""
+    """Clusters of two agents that start every 15 s and last 40 s.
+
+    Args:
+        shock: standard deviation of their common residuals at one time.
+        tau: correlation time of residuals, in samples.
+        apart: additional time between the starts, s.
+        kinds: number of components; the sign of common residuals depends on it.
+    """
     rng = np.random.default_rng(seed)
-    whole = lasting(rng, RATE * (SECONDS + LATER * clusters), tau)
+    common = autoregression(rng, RATE * (SECONDS + LATER * clusters), tau)
     clock, cluster, component, residual, sequences = [], [], [], [], []
     for c in range(clusters):
         first = RATE * LATER * c
-        own = shock * whole[first : first + RATE * SECONDS]
+        shared = shock * common[first : first + RATE * SECONDS]
         time = (first + np.arange(RATE * SECONDS)) / RATE + apart * c
         for kind in range(kinds):
             for _ in range(2):
                 clock.append(time)
-                # what is common changes its sign with the component
-                residual.append((-1) ** (kind * c) * own + lasting(rng, len(own), tau))
-                cluster.append(np.full(len(own), c))
-                component.append(np.full(len(own), kind))
+                own = autoregression(rng, len(time), tau)
+                residual.append((-1) ** (kind * c) * shared + own)
+                cluster.append(np.full(len(time), c))
+                component.append(np.full(len(time), kind))
         x = np.zeros((len(time), 2, 1)) + np.arange(2)[:, None]
         name = f"r{c % recordings}"
         sequences.append(Sequence(name=f"{name}/{c}", recording=name, time=time, x=x))
@@ -66,42 +72,41 @@ def judged(
 
 
 @pytest.mark.thorough
-def test_independent_agents_give_every_p_value_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_p_values_of_independent_clusters_are_uniform(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "SHIFTS", 199)  # the level is exact with any number
-    # of more than a few clusters, as what all have in common since their start is taken out
-    found = np.array([judged(seed, clusters=10).p_value for seed in range(60)])
-    assert stats.kstest(found, "uniform").pvalue > 0.05
-    # 3 expected; above 7 would be a chance of 1 %
-    assert (found <= 0.05).sum() <= 7
-    # single seconds may not be exchanged: what lasts for 6 s would be taken for something common
+    # ten clusters, because the mean course since the start is subtracted
+    p_values = np.array([result_of(seed, clusters=10).p_value for seed in range(60)])
+    assert stats.kstest(p_values, "uniform").pvalue > 0.05
+    # 3 are expected; more than 7 have a probability of 1 %
+    assert (p_values <= 0.05).sum() <= 7
+    # permutations of single seconds would ignore the autocorrelation
     draw = np.random.default_rng(0)
     with monkeypatch.context() as context:
-        context.setattr(np, "roll", lambda one, by, axis: draw.permutation(one, axis))
-        wrong = np.array([judged(seed, clusters=10).p_value for seed in range(40)])
+        context.setattr(np, "roll", lambda series, by, axis: draw.permutation(series, axis))
+        wrong = np.array([result_of(seed, clusters=10).p_value for seed in range(40)])
     assert stats.kstest(wrong, "uniform").pvalue < 1e-3
 
 
 @pytest.mark.thorough
-def test_a_shock_in_common_is_seen() -> None:
-    found = [judged(seed, shock=1.0, clusters=10) for seed in range(8)]
-    assert all(one.p_value <= 0.01 and one.together for one in found)
-    # half of each agent's variance is common, and of the mean of two agents two thirds
-    assert np.mean([one.correlation for one in found]) == pytest.approx(2 / 3, abs=0.1)
-    assert found[0].pairs == 9 + 8
-    assert "treated as one cluster" in found[0].plain()
-    assert f"p = {found[0].p_value:.3f}" in found[0].plain()
-    assert "treated as independent" in judged(0).plain()
+def test_common_shock_is_detected() -> None:
+    results = [result_of(seed, shock=1.0, clusters=10) for seed in range(8)]
+    assert all(result.p_value <= 0.01 and result.together for result in results)
+    # half of each agent's variance is common, two thirds of the variance of the mean of two agents
+    assert np.mean([result.correlation for result in results]) == pytest.approx(2 / 3, abs=0.1)
+    assert results[0].pairs == 9 + 8
+    assert "treated as one cluster" in results[0].plain()
+    assert f"p = {results[0].p_value:.3f}" in results[0].plain()
+    assert "treated as independent" in result_of(0).plain()
 
 
-def test_only_clusters_of_a_recording_that_meet_are_compared() -> None:
-    for alone in (judged(0, apart=100.0), judged(0, shock=1.0, recordings=5)):
-        assert (alone.pairs, alone.p_value, alone.together) == (0, 1.0, False)
-        assert "overlap in time" in alone.plain()
-    # every second of five begins 30 s after the one before it, and they last for 40 s
-    assert judged(0, recordings=2).pairs == 3
+def test_pairs_are_simultaneous_clusters_of_one_recording() -> None:
+    for result in (result_of(0, apart=100.0), result_of(0, shock=1.0, recordings=5)):
+        assert (result.pairs, result.p_value, result.together) == (0, 1.0, False)
+        assert "overlap in time" in result.plain()
+    # clusters of a recording start every 30 s and last 40 s
+    assert result_of(0, recordings=2).pairs == 3
 
 
-def test_what_means_different_things_is_not_added_up() -> None:
-    # what pushes to one side here pushes to the other there
-    assert judged(0, shock=1.0, kinds=2, clusters=10).correlation < 0.2
-    assert judged(0, shock=1.0, kinds=1, clusters=10).correlation > 0.4
+def test_components_are_compared_separately() -> None:
+    assert result_of(0, shock=1.0, kinds=2, clusters=10).correlation < 0.2
+    assert result_of(0, shock=1.0, kinds=1, clusters=10).correlation > 0.4
