@@ -1,4 +1,4 @@
-"""Tables that tests make up, as files, what the readers make of them, and entries of an index."""
+"""Generated tables as files, the readers' results, and entries of a store's index."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nnode.data.prepare import FORMATS
 
 
 def entry(start: float, end: float, *agents: str, recording: str = "r") -> dict[str, Any]:
-    """What clusters and splits know of a sequence."""
+    """An entry of a store's index, as clusters and splits use it."""
     return {
         "name": f"{recording}/{start:g}",
         "recording": recording,
@@ -30,7 +30,7 @@ def entry(start: float, end: float, *agents: str, recording: str = "r") -> dict[
 def tidy(
     samples: int, agents: int, sequences: Iterable[str] = "s", step: float = 1.0
 ) -> pd.DataFrame:
-    """Agents 30 m apart who move ``step`` m in each 0.1 s, by sequence, agent and time."""
+    """Agents 30 m apart who move ``step`` m in each 0.1 s, sorted by sequence, agent and time."""
     parts = [
         pd.DataFrame(
             {
@@ -47,7 +47,7 @@ def tidy(
 
 
 def saved(path: Path, *tables: pd.DataFrame) -> Path:
-    """Tables one below the other, as Parquet where the file's name says so, else as CSV."""
+    """Write the concatenated tables as Parquet or CSV, by the suffix of the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     table = pd.concat(tables)
     if path.suffix == ".parquet":
@@ -58,7 +58,7 @@ def saved(path: Path, *tables: pd.DataFrame) -> Path:
 
 
 def esimas(path: Path, *platoons: tuple[np.ndarray, np.ndarray], packed: bool = False) -> Path:
-    """Positions ``(cars, K)`` and times ``(K,)`` of platoons, in the layout of ESIMAS."""
+    """Write positions ``(cars, K)`` and times ``(K,)`` of platoons in the layout of ESIMAS."""
     cells = np.empty((len(platoons), 1), dtype=object)
     for i, (x, time) in enumerate(platoons):
         cells[i, 0] = {"Xarr": x, "Tarr": time}
@@ -67,15 +67,15 @@ def esimas(path: Path, *platoons: tuple[np.ndarray, np.ndarray], packed: bool = 
 
 
 def read(kind: type[DataOptions], path: Path, /, **options: object) -> Reading:
-    """The sequences that the reader of some options makes of a file."""
-    made = kind(path=str(path), **options)  # type: ignore[call-arg, arg-type]
-    return FORMATS[kind].sequences(FORMATS[kind].files(made), made)
+    """Read a file by the reader that belongs to a class of options."""
+    reader_options = kind(path=str(path), **options)  # type: ignore[call-arg, arg-type]
+    return FORMATS[kind].sequences(FORMATS[kind].files(reader_options), reader_options)
 
 
-def damaged(data: st.DataObject, sound: bytes, start: int, most: int) -> bytes:
-    """A file of which up to ``most`` bytes behind ``start`` are others, and whose end may lack."""
-    whole = bytearray(sound)
-    at = data.draw(st.integers(start, len(whole) - 1))
-    size = data.draw(st.integers(0, most))
-    whole[at : at + size] = data.draw(st.binary(min_size=size, max_size=size))
-    return bytes(whole[: data.draw(st.integers(at, len(whole)))])
+def damaged(data: st.DataObject, content: bytes, start: int, max_size: int) -> bytes:
+    """Content with up to ``max_size`` bytes from ``start`` on replaced, and possibly cut short."""
+    result = bytearray(content)
+    at = data.draw(st.integers(start, len(result) - 1))
+    size = data.draw(st.integers(0, max_size))
+    result[at : at + size] = data.draw(st.binary(min_size=size, max_size=size))
+    return bytes(result[: data.draw(st.integers(at, len(result)))])

@@ -1,8 +1,6 @@
-"""Streaming and the order of mini-batches."""
+"""Streaming of sequences and the order of mini-batches."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,20 +8,20 @@ import torch
 
 from nnode.data.dataset import EpochSampler, SequenceDataset, make_loader
 from nnode.data.options import LoaderOptions
-from nnode.data.sequence import Sequence, collate
+from nnode.data.sequence import collate
 from nnode.data.store import Store, write_store
 from nnode.errors import ConfigError, DataError
+from tests.builders import lane
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     rng = np.random.default_rng(0)
     items = [
-        Sequence(
+        lane(
+            np.cumsum(rng.uniform(5, 9, (3 + i % 3, 2 + i % 2)), axis=1),
+            start=10.0 * i,
             name=f"r/{i}",
-            recording="r",
-            time=10.0 * i + 0.2 * np.arange(3 + i % 3),
-            x=np.cumsum(rng.uniform(5, 9, (3 + i % 3, 2 + i % 2, 1)), axis=1),
         )
         for i in range(11)
     ]
@@ -36,7 +34,7 @@ def epoch(sampler: EpochSampler, number: int, start: int = 0) -> list[list[int]]
     return list(sampler)
 
 
-def test_every_epoch_takes_every_sequence_once_in_an_order_of_its_own() -> None:
+def test_each_epoch_has_all_sequences_in_its_order() -> None:
     sampler = EpochSampler(11, 4, seed=3)
     first, second = epoch(sampler, 0), epoch(sampler, 1)
     assert [len(batch) for batch in first] == [4, 4, 3]
@@ -47,44 +45,49 @@ def test_every_epoch_takes_every_sequence_once_in_an_order_of_its_own() -> None:
     assert epoch(EpochSampler(11, 4, seed=4), 0) != first
 
 
-def test_an_epoch_depends_on_nothing_but_seed_and_number() -> None:
-    walked = EpochSampler(11, 4, seed=3)
+def test_epoch_depends_only_on_seed_and_number() -> None:
+    sampler = EpochSampler(11, 4, seed=3)
     for number in range(5):
-        expected = epoch(walked, number)
+        expected = epoch(sampler, number)
     torch.manual_seed(99)
     np.random.seed(99)
     assert epoch(EpochSampler(11, 4, seed=3), 4) == expected
 
 
 @pytest.mark.parametrize("start", [0, 1, 2, 3])
-def test_an_epoch_resumes_at_any_mini_batch(start: int) -> None:
-    whole = epoch(EpochSampler(11, 4, seed=3), 7)
+def test_epoch_resumes_at_any_mini_batch(start: int) -> None:
+    complete = epoch(EpochSampler(11, 4, seed=3), 7)
     sampler = EpochSampler(11, 4, seed=3)
-    assert epoch(sampler, 7, start) == whole[start:]
+    assert epoch(sampler, 7, start) == complete[start:]
     assert len(sampler) == 3 - start
     sampler.set_epoch(8)
     assert len(sampler) == 3
 
 
-def test_batch_size_zero_takes_all_and_no_shuffling_keeps_the_order() -> None:
+def test_batch_size_zero_and_no_shuffling() -> None:
     assert epoch(EpochSampler(5, 0, seed=0, shuffle=False), 3) == [[0, 1, 2, 3, 4]]
     assert epoch(EpochSampler(5, 2, seed=0, shuffle=False), 3) == [[0, 1], [2, 3], [4]]
     assert sorted(epoch(EpochSampler(5, 0, seed=0), 3)[0]) == [0, 1, 2, 3, 4]
 
 
-def test_the_sampler_refuses_nonsense() -> None:
-    with pytest.raises(ConfigError, match="batch_size=-1"):
-        EpochSampler(5, -1, seed=0)
-    with pytest.raises(ConfigError, match="seed=-2"):
-        EpochSampler(5, 1, seed=-2)
+@pytest.mark.parametrize(
+    ("batch_size", "seed", "message"), [(-1, 0, "batch_size=-1"), (1, -2, "seed=-2")]
+)
+def test_invalid_sampler_options(batch_size: int, seed: int, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        EpochSampler(5, batch_size, seed=seed)
+
+
+def test_invalid_epochs_and_starts() -> None:
+    sampler = EpochSampler(5, 2, seed=0)
     with pytest.raises(ValueError, match="counted from 0"):
-        EpochSampler(5, 1, seed=0).set_epoch(-1)
+        sampler.set_epoch(-1)
     with pytest.raises(ValueError, match="mini-batches 0 to 3"):
-        EpochSampler(5, 2, seed=0).set_start(4)
+        sampler.set_start(4)
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_the_loader_streams_the_sequences_of_the_sampler(store: Store, workers: int) -> None:
+def test_loader_streams_the_sequences_of_the_sampler(store: Store, workers: int) -> None:
     chosen = [0, 2, 3, 5, 7, 8, 10]
     options = LoaderOptions(batch_size=3, workers=workers)
     loader = make_loader(SequenceDataset(store, chosen), options, seed=1)
@@ -101,7 +104,7 @@ def test_the_loader_streams_the_sequences_of_the_sampler(store: Store, workers: 
         assert torch.equal(loaded[0].valid, expected_batch.valid)
 
 
-def test_the_loader_leaves_the_global_generator_alone(store: Store) -> None:
+def test_loader_does_not_change_the_global_generator(store: Store) -> None:
     loader = make_loader(SequenceDataset(store), LoaderOptions(batch_size=4), seed=1)
     torch.manual_seed(5)
     before = torch.get_rng_state()
@@ -109,9 +112,7 @@ def test_the_loader_leaves_the_global_generator_alone(store: Store) -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_nothing_is_read_before_it_is_asked_for(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sequences_are_read_on_demand(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[int] = []
     original = Store.__getitem__
     monkeypatch.setattr(
@@ -125,7 +126,7 @@ def test_nothing_is_read_before_it_is_asked_for(
     assert read == [0, 1]
 
 
-def test_positions_that_the_store_has_not_are_refused(store: Store, tmp_path: Path) -> None:
+def test_invalid_positions_and_workers(store: Store) -> None:
     for positions in ([11], [-1]):
         with pytest.raises(DataError, match="sequences 0 to 10, asked for number"):
             SequenceDataset(store, positions)

@@ -1,4 +1,4 @@
-"""Who is who: identifiers that start again, that go on, and that are given away anew."""
+"""Identifiers of agents: restarted, continued, and reused for other agents."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from nnode.data.identity import given_anew, identify
 from nnode.data.limits import LIMITS
 from nnode.data.options import Agents, Faults, SplitOptions
 from nnode.data.prepare import prepare
+from nnode.data.readers.juelich import JuelichOptions
 from nnode.data.readers.table import TableOptions
+from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.data.sequence import Sequence
 from nnode.data.split import split
 from tests.builders import people
@@ -24,21 +26,21 @@ DT = 0.1
 
 
 def world(domain: str, seed: int, seconds: float = 12.0, agents: int = 4) -> np.ndarray:
-    """Positions (K, N, D) of agents who follow each other, or who walk about a room of 8 m."""
-    draw = np.random.default_rng(seed)
+    """Positions (K, N, D) of agents who follow each other, or who walk in a room of 8 m."""
+    rng = np.random.default_rng(seed)
     time = np.arange(round(seconds / DT) + 1) * DT
     if domain == "traffic":
-        pace = draw.uniform(8, 14) + draw.uniform(-1, 1, agents)
-        start = np.cumsum(draw.uniform(20, 40, agents))
-        return (start + time[:, None] * pace)[:, :, None]
-    phase = draw.uniform(0, 2 * np.pi, (agents, 2))
+        speed = rng.uniform(8, 14) + rng.uniform(-1, 1, agents)
+        start = np.cumsum(rng.uniform(20, 40, agents))
+        return (start + time[:, None] * speed)[:, :, None]
+    phase = rng.uniform(0, 2 * np.pi, (agents, 2))
     return 4 + 4 * np.sin(0.25 * time[:, None, None] + phase)
 
 
 def cut(
     x: np.ndarray, name: str, first: int = 0, samples: int | None = None, clock: float = 0.0
 ) -> Sequence:
-    """Samples ``first`` and on of a world whose clock starts at ``clock``, agents 0, 1, 2, ..."""
+    """Samples from ``first`` on of a world that starts at ``clock``; the agents are 0, 1, 2, ..."""
     part = x[first:] if samples is None else x[first : first + samples]
     agents = tuple(map(str, range(x.shape[1])))
     return people(part, DT, start=clock + DT * first, name=f"run/{name}", agents=agents)
@@ -46,7 +48,7 @@ def cut(
 
 def groups(sequences: list[Sequence], domain: str, mode: str = "auto") -> int:
     """Number of groups of sequences that share an agent."""
-    named, _ = identify(sequences, domain, Agents[mode])  # type: ignore[arg-type]
+    named, _ = identify(sequences, domain, Agents[mode])
     unique = (replace(s, agents=names) for s, names in zip(sequences, named, strict=True))
     return int(clusters(index_of(unique), 0.0).max()) + 1
 
@@ -55,9 +57,9 @@ domains = pytest.mark.parametrize("domain", ["traffic", "crowd"])
 
 
 @domains
-def test_clocks_and_identifiers_that_start_again(domain: str) -> None:
+def test_restarted_clocks_and_identifiers(domain: str) -> None:
     sequences = [cut(world(domain, i, 6 + i % 3), str(i)) for i in range(8)]
-    named, (note,) = identify(sequences, domain, Agents.auto)  # type: ignore[arg-type]
+    named, (note,) = identify(sequences, domain, Agents.auto)
     assert named[0] == ("0", "1", "2", "3")
     assert named[3] == ("0#4", "1#4", "2#4", "3#4")
     assert note.startswith("run: identifiers belong to their sequence, because run/")
@@ -68,10 +70,10 @@ def test_clocks_and_identifiers_that_start_again(domain: str) -> None:
 @domains
 @pytest.mark.parametrize(("step", "samples"), [(20, 21), (20, 20), (10, 21), (25, 15)])
 def test_windows_of_one_recording_keep_their_agents(domain: str, step: int, samples: int) -> None:
-    """Windows that share a sample, that follow at once, that overlap, and with pauses between."""
+    """Windows that share a sample, are adjacent, overlap, or are separated by pauses."""
     x = world(domain, 1)
     sequences = [cut(x, str(k), k * step, samples) for k in range(4)]
-    named, notes = identify(sequences, domain, Agents.auto)  # type: ignore[arg-type]
+    named, notes = identify(sequences, domain, Agents.auto)
     assert named == [s.agents for s in sequences]
     assert not notes
     assert groups(sequences, domain, "sequence") == 4
@@ -86,31 +88,30 @@ def test_windows_of_several_runs_in_one_recording(domain: str, samples: int, ord
     if order == "times":
         places.sort(key=lambda place: place[1])
     sequences = [cut(runs[run], f"{run}-{k}", 20 * k, samples) for run, k in places]
-    named, (note,) = identify(sequences, domain, Agents.auto)  # type: ignore[arg-type]
+    named, (note,) = identify(sequences, domain, Agents.auto)
     assert "one of 3 runs of sequences that carry on" in note
     assert groups(sequences, domain) == 3
     assert len(set(named)) == 3
 
 
 @domains
-def test_an_agent_who_does_the_same_in_all_runs_makes_them_no_one_world(domain: str) -> None:
-    """Such as a leader on a prescribed course, or somebody who stands still."""
+def test_same_path_in_all_runs_does_not_join_them(domain: str) -> None:
+    """Such as a leader with a prescribed speed, or a person who stands still."""
     x = [world(domain, seed, agents=3) for seed in range(4)]
     for other in x[1:]:
         other[:, 2] = x[0][:, 2]
     assert groups([cut(path, str(i)) for i, path in enumerate(x)], domain) == 4
 
 
-def test_positions_may_differ_by_their_error() -> None:
+@pytest.mark.parametrize(("factor", "expected"), [(0.99, 1), (1.01, 2)])
+def test_positions_may_differ_by_the_noise(factor: float, expected: int) -> None:
     x = world("traffic", 0)
-    off = [cut(x, "a", 0, 41), cut(x + LIMITS["traffic"].noise * 0.99, "b", 20, 41)]
-    assert groups(off, "traffic") == 1
-    off[1] = cut(x + LIMITS["traffic"].noise * 1.01, "b", 20, 41)
-    assert groups(off, "traffic") == 2
+    windows = [cut(x, "a", 0, 41), cut(x + LIMITS["traffic"].noise * factor, "b", 20, 41)]
+    assert groups(windows, "traffic") == expected
 
 
-def test_one_fault_does_not_part_windows() -> None:
-    """Two cars that exchange their names in one window are a fault; its other cars go on."""
+def test_single_swap_does_not_separate_windows() -> None:
+    """Two cars exchange their names in one window, which is a fault; the other cars continue."""
     x = world("traffic", 2)
     wrong = x[:, [1, 0, 2, 3]]
     sequences = [cut(wrong if k == 2 else x, str(k), 20 * k, 21) for k in range(5)]
@@ -121,19 +122,19 @@ def test_one_fault_does_not_part_windows() -> None:
 
 @domains
 @pytest.mark.parametrize("pause", [0.1, 0.5])
-def test_identifiers_that_start_again_on_a_clock_that_does_not(domain: str, pause: float) -> None:
+def test_restarted_identifiers_on_a_continued_clock(domain: str, pause: float) -> None:
     sequences, clock = [], 0.0
     for i in range(6):
         sequences.append(cut(world(domain, i, 6.0, agents=6), str(i), clock=clock))
         clock = sequences[-1].time[-1] + pause
     assert groups(sequences, domain) == 6
-    _, (note,) = identify(sequences, domain, Agents.auto)  # type: ignore[arg-type]
+    _, (note,) = identify(sequences, domain, Agents.auto)
     assert "6 identifiers are used again for another agent" in note
 
 
-def test_an_identifier_that_is_given_to_another_vehicle_later() -> None:
+def test_reused_identifier() -> None:
     x = world("traffic", 3, agents=5)
-    x[61:, 4] = x[61:, 0] - 30  # car 4 has left; the next one that bears its name enters behind
+    x[61:, 4] = x[61:, 0] - 30  # car 4 has left; another car with its name enters at the rear
     early, late = cut(x, "early", 0, 61), cut(x, "late", 70, 40)
     named, (note,) = identify([early, late], "traffic", Agents.auto)
     assert named == [early.agents, ("0", "1", "2", "3", "4#2")]
@@ -146,15 +147,15 @@ def test_an_identifier_that_is_given_to_another_vehicle_later() -> None:
 @pytest.mark.parametrize(
     ("gap", "end", "another"),
     [
-        (2.0, 120.0, False),  # 10 m/s on
-        (2.0, 96.0, False),  # further back, but within the reach of a path
+        (2.0, 120.0, False),  # continues at 10 m/s
+        (2.0, 96.0, False),  # behind, but a possible path
         (2.0, 94.0, True),
         (2.0, 226.0, True),  # faster than 60 m/s
         (9.9, 200.0, False),
-        (10.1, 200.0, True),  # nobody is in view for more than 10 s
+        (10.1, 200.0, True),  # the limit is 10 s
     ],
 )
-def test_holes_in_a_vehicle_s_record(gap: float, end: float, another: bool) -> None:
+def test_holes_in_a_record(gap: float, end: float, another: bool) -> None:
     time = np.array([0.0, 5.0, 5.0 + gap, 6.0 + gap, 0.0, 10.0])
     x = np.array([50.0, 100.0, end, end + 10, 0.0, 100.0])
     other, hole = np.zeros((2, 5), dtype=bool)
@@ -162,26 +163,25 @@ def test_holes_in_a_vehicle_s_record(gap: float, end: float, another: bool) -> N
     assert given_anew(time, x, other, hole).tolist() == [False, another, False, False, False]
 
 
-def test_a_number_that_is_a_name_already_is_not_given() -> None:
+def test_new_identifiers_are_unique() -> None:
     sequences = [cut(world("traffic", i), str(i)) for i in range(2)]
-    odd = Sequence(**{**vars(sequences[0]), "agents": ("0", "0#2", "2", "3")})
-    named, _ = identify([odd, sequences[1]], "traffic", Agents.sequence)
+    sequences[0] = replace(sequences[0], agents=("0", "0#2", "2", "3"))
+    named, _ = identify(sequences, "traffic", Agents.sequence)
     assert named[1] == ("0#2#", "1", "2#2", "3#2")
 
 
-def test_odd_sequences_are_left_alone() -> None:
-    """Faults are not judged here: they must not raise either."""
-    nobody = np.full((3, 2, 1), np.nan)
-    single = cut(world("traffic", 0), "one", 0, 1)
-    odd = [cut(nobody, "nobody"), single, cut(nobody, "again"), cut(world("traffic", 1), "sound")]
-    named, _ = identify(odd, "traffic", Agents.auto)
+def test_faulty_sequences_are_accepted() -> None:
+    absent = np.full((3, 2, 1), np.nan)
+    short, valid = cut(world("traffic", 0), "b", 0, 1), cut(world("traffic", 1), "d")
+    sequences = [cut(absent, "a"), short, cut(absent, "c"), valid]
+    named, _ = identify(sequences, "traffic", Agents.auto)
     assert [len(names) for names in named] == [2, 4, 2, 4]
     nameless = Sequence(name="n", recording="run", time=np.arange(3.0), x=np.zeros((3, 2, 1)))
     assert identify([nameless], "traffic", Agents.sequence)[0] == [()]
 
 
 def table(path: Path, domain: str, sequences: int = 10, restart: bool = True) -> TableOptions:
-    """The tidy table that people write first: agents and times from 0 in every sequence."""
+    """Write a tidy table; agents, and times with ``restart``, start at 0 in every sequence."""
     rows = []
     for i in range(sequences):
         x = world(domain, i, 3.0)
@@ -195,14 +195,16 @@ def table(path: Path, domain: str, sequences: int = 10, restart: bool = True) ->
 
 @domains
 @pytest.mark.parametrize("restart", [True, False])
-def test_a_table_of_numbered_agents_can_be_split(
+def test_table_of_numbered_agents_can_be_split(
     tmp_path: Path, domain: str, restart: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     options = table(tmp_path / "t.csv", domain, restart=restart)
     with caplog.at_level(logging.INFO):
         store = prepare(options, tmp_path / "out")
-    told = [r.getMessage() for r in caplog.records if "data.agents decides by hand" in r.message]
-    assert len(told) == 1
+    messages = [
+        r.getMessage() for r in caplog.records if "data.agents decides by hand" in r.message
+    ]
+    assert len(messages) == 1
     parts = split(store, SplitOptions())
     assert (len(parts.train), len(parts.heldout), parts.dropped) == (8, 2, [])
     assert store[1].agents == tuple(store.index[1]["agents"]) == ("0#2", "1#2", "2#2", "3#2")
@@ -213,7 +215,7 @@ def test_a_table_of_numbered_agents_can_be_split(
     assert store.manifest["identifiers"] == []
 
 
-def test_faults_are_told_with_the_source_s_identifiers(tmp_path: Path) -> None:
+def test_faults_name_the_identifiers_of_the_source(tmp_path: Path) -> None:
     options = table(tmp_path / "t.csv", "traffic")
     frame = pd.read_csv(options.path)
     frame.loc[(frame.sequence == 4) & (frame.agent == 2) & (frame.time > 1), "x"] += 40
@@ -226,10 +228,7 @@ def test_faults_are_told_with_the_source_s_identifiers(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_real_recordings_keep_their_identifiers(real_data: Path, tmp_path: Path) -> None:
-    from nnode.data.readers.juelich import JuelichOptions
-    from nnode.data.readers.vehicles import VehicleTableOptions
-
+def test_identifiers_of_real_recordings(real_data: Path, tmp_path: Path) -> None:
     corridor = JuelichOptions(source=str(real_data), walls={"*": [0.0, 4.0]}, t_seq=3.0)
     road = VehicleTableOptions(
         source=str(real_data),

@@ -1,4 +1,4 @@
-"""Files that once led to crashes, endless work or foreign errors."""
+"""Files that formerly caused crashes, long run times or errors of other packages."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from tests.data.tables import esimas
 PLATOONS = [(np.arange(6.0).reshape(2, 3) + i, np.arange(3)[None]) for i in range(2)]
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_matlab_values_of_all_kinds(tmp_path: Path, packed: bool) -> None:
+@pytest.mark.parametrize("compressed", [False, True])
+def test_matlab_values_of_all_kinds(tmp_path: Path, compressed: bool) -> None:
     cells = np.empty((1, 2), dtype=object)
     cells[0] = [{"x": x, "time": time} for x, time in PLATOONS]
     values = {
@@ -40,7 +40,7 @@ def test_matlab_values_of_all_kinds(tmp_path: Path, packed: bool) -> None:
         "many": np.array([(1.0,), (2.0,)], dtype=[("a", "f8")]),
         "empty": np.zeros((0, 3)),
     }
-    savemat(tmp_path / "a.mat", values, do_compression=packed)
+    savemat(tmp_path / "a.mat", values, do_compression=compressed)
     result = read_matlab(tmp_path / "a.mat")
     for cell, (x, time) in zip(result["cells"], PLATOONS, strict=True):
         np.testing.assert_array_equal(cell["x"], x, strict=True)
@@ -54,13 +54,15 @@ def test_matlab_values_of_all_kinds(tmp_path: Path, packed: bool) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("packed", [False, True])
-def test_single_bits_of_a_matlab_file_is_read_or_refused(tmp_path: Path, packed: bool) -> None:
+@pytest.mark.parametrize("compressed", [False, True])
+def test_matlab_file_with_a_flipped_bit_is_read_or_refused(
+    tmp_path: Path, compressed: bool
+) -> None:
     path = tmp_path / "sequence_datax.mat"
-    sound = esimas(path, *PLATOONS, packed=packed).read_bytes()
+    content = esimas(path, *PLATOONS, packed=compressed).read_bytes()
     refused = 0
-    for bit in range(8 * 124, 8 * len(sound), 1 if packed else 7):  # 7: in every byte
-        data = bytearray(sound)
+    for bit in range(8 * 124, 8 * len(content), 1 if compressed else 7):  # 7: in every byte
+        data = bytearray(content)
         data[bit // 8] ^= 1 << bit % 8
         path.write_bytes(data)
         try:
@@ -70,14 +72,14 @@ def test_single_bits_of_a_matlab_file_is_read_or_refused(tmp_path: Path, packed:
     assert refused > 100
 
 
-def test_a_matlab_file_that_swells_is_refused(
+def test_large_decompressed_matlab_file_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(matlab, "MOST_BYTES", 1 << 20)
     path = tmp_path / "sequence_datax.mat"
-    head = esimas(path, *PLATOONS).read_bytes()[:128]
+    header = esimas(path, *PLATOONS).read_bytes()[:128]
     bomb = zlib.compress(bytes(1 << 24))
-    path.write_bytes(head + struct.pack("<II", 15, len(bomb)) + bomb)
+    path.write_bytes(header + struct.pack("<II", 15, len(bomb)) + bomb)
     with pytest.raises(DataError, match="truncated, or has more than 1048576 bytes"):
         read_esimas(path)
 
@@ -94,7 +96,7 @@ def read(path: Path, options: DataOptions, text: str) -> Reading:
 @pytest.mark.parametrize(
     ("options", "text", "message"),
     [
-        # a frame far away takes no memory
+        # a distant frame needs no memory
         (
             JuelichOptions(unit="m"),
             "# framerate: 16\n1 1 0 0 0\n1 2 1 0 0\n2 4000000000000 1 0 0\n",
@@ -113,45 +115,43 @@ def read(path: Path, options: DataOptions, text: str) -> Reading:
             TIDY + "".join(f"s,{k},a,{k},9\n" for k in range(3)),
             "more cells in its rows than names",
         ),
-        # times that no step counts
+        # times too large for the step
         *(
             (VehicleTableOptions(), f"{PLATOON}1,{time},0\n", r"line 11: the time .* cannot count")
             for time in ("1e308", "-1e300", "1e17")
         ),
     ],
 )
-def test_one_clear_error(tmp_path: Path, options: DataOptions, text: str, message: str) -> None:
+def test_invalid_files(tmp_path: Path, options: DataOptions, text: str, message: str) -> None:
     with pytest.raises(NNodeError, match=message):
         read(tmp_path / "file.txt", options, text)
 
 
-def test_times_and_agents_of_a_sequence_are_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_size_of_a_sequence_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nnode.data.cut.MOST_CELLS", 100)
     text = TIDY + "".join(f"s,{k},a{k},{k}\n" for k in range(11))
     with pytest.raises(DataError, match="11 times and 11 agents in 11 rows, expected at most"):
         read(tmp_path / "t.csv", TableOptions(domain="traffic"), text)
 
 
-def test_windows_between_two_stays_far_apart_take_no_time(tmp_path: Path) -> None:
-    near = 0.2 * np.arange(5)
-    times = [*near, *(1e9 + near)]
+def test_windows_of_intervals_far_apart(tmp_path: Path) -> None:
+    start = 0.2 * np.arange(5)
+    times = [*start, *(1e9 + start)]
     text = CARS + "".join(f"{n},{t},{20 * n + 10 * t}\n" for n in (1, 2, 3) for t in times)
     result = read(tmp_path / "c.csv", VehicleTableOptions(window=0.4), text)
     assert [s.n_samples for s in result] == [3, 3, 3, 3]
     assert result[-1].time[-1] == pytest.approx(1e9 + 0.8)
 
 
-def test_huge_whole_numbers_are_names(tmp_path: Path) -> None:
+def test_large_numbers_as_names(tmp_path: Path) -> None:
     text = PLATOON + "".join(f"1e300,{t},{90 + t}\n" for t in (0, 0.2, 0.4))
     assert "1e+300" in read(tmp_path / "c.csv", VehicleTableOptions(), text)[0].agents
 
 
-def test_damaged_notes_of_pandas_in_parquet_are_refused(tmp_path: Path) -> None:
+def test_invalid_pandas_metadata_in_parquet(tmp_path: Path) -> None:
     table = pa.table({"sequence": ["s"], "time": [0.0], "agent": ["a"], "x": [1.0]})
-    notes = b'{"columns": [{"name": "x", "pandas_type": "float64"}], "index_columns": []}'
+    metadata = b'{"columns": [{"name": "x", "pandas_type": "float64"}], "index_columns": []}'
     path = tmp_path / "t.parquet"
-    pq.write_table(table.replace_schema_metadata({b"pandas": notes}), path)
+    pq.write_table(table.replace_schema_metadata({b"pandas": metadata}), path)
     with pytest.raises(DataError, match="cannot be read as a Parquet table"):
         read_table(path, TableOptions(domain="traffic"))

@@ -1,4 +1,4 @@
-"""Preparation: policy, manifest, interruption, and opening what was prepared."""
+"""Preparation: policy for faults, manifest, interruption, and opening prepared data."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import nnode.data.prepare as module
@@ -32,10 +33,18 @@ INFINITE = np.where(CLEAN[1, 2] == CLEAN, np.inf, CLEAN)
 def raw(
     folder: Path, *positions: np.ndarray, recording: str = "demo", time: np.ndarray = TIME
 ) -> EsimasOptions:
+    """Write platoons in the layout of ESIMAS; the options that read them."""
     folder.mkdir(exist_ok=True)
     platoons = ((x, time[: x.shape[1]]) for x in positions)
     esimas(folder / f"sequence_data{recording}.mat", *platoons)
     return EsimasOptions(source=str(folder))
+
+
+def prepared_table(folder: Path, table: pd.DataFrame, **options: Any) -> Store:
+    """The store of a tidy table of traffic, or of another domain."""
+    path = saved(folder / "t.csv", table)
+    options = {"domain": "traffic", "path": str(path), **options}
+    return prepare(TableOptions(**options), folder / "out")
 
 
 @pytest.fixture
@@ -43,33 +52,26 @@ def options(tmp_path: Path) -> EsimasOptions:
     return raw(tmp_path / "raw", CLEAN, JUMP, INFINITE, CLEAN[:, :4])
 
 
-def test_drop(tmp_path: Path, options: EsimasOptions) -> None:
+def test_faulty_sequences_are_dropped(tmp_path: Path, options: EsimasOptions) -> None:
     store = prepare(options, tmp_path / "out", draw=plot_faults)
     assert [s.name for s in store] == ["demo/000", "demo/003"]
     np.testing.assert_array_equal(store[0].x[:, :, 0].T, CLEAN)
-    m = store.manifest
-    assert m["counts"] == {"read": 4, "kept": 2, "dropped": 2}
-    assert m["recordings"]["demo"] == {
-        "read": 4,
-        "kept": 2,
-        "dropped": 2,
-        "faulty": {"jump": 1, "non_finite": 1},
-    }
-    reasons = {d["sequence"]: [r["kind"] for r in d["reasons"]] for d in m["dropped"]}
+    manifest, counts = store.manifest, {"read": 4, "kept": 2, "dropped": 2}
+    assert manifest["counts"] == counts
+    faulty = {"jump": 1, "non_finite": 1}
+    assert manifest["recordings"]["demo"] == {**counts, "faulty": faulty}
+    reasons = {d["sequence"]: [r["kind"] for r in d["reasons"]] for d in manifest["dropped"]}
     assert reasons == {"demo/001": ["jump"], "demo/002": ["non_finite"]}
-    assert m["dt"] == 0.2
-    assert m["domain"] == "traffic"
-    file = Path(options.source or "") / "sequence_datademo.mat"
-    assert m["files"]["demo"] == {
-        "name": file.name,
-        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-    }
-    assert m["options"]["faults"] == "drop"
-    assert m["options"]["split"]["heldout"] == SplitOptions().heldout
+    assert (manifest["dt"], manifest["domain"]) == (0.2, "traffic")
+    file = tmp_path / "raw" / "sequence_datademo.mat"
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    assert manifest["files"]["demo"] == {"name": file.name, "sha256": digest}
+    assert manifest["options"]["faults"] == "drop"
+    assert manifest["options"]["split"]["heldout"] == SplitOptions().heldout
     assert (tmp_path / "out" / "faults" / "demo.png").is_file()
 
 
-def test_keep_keeps_what_can_be_simulated(tmp_path: Path, options: EsimasOptions) -> None:
+def test_faulty_sequences_are_kept_if_finite(tmp_path: Path, options: EsimasOptions) -> None:
     options.faults = Faults.keep
     store = prepare(options, tmp_path / "out")
     assert [s.name for s in store] == ["demo/000", "demo/001", "demo/003"]
@@ -77,39 +79,46 @@ def test_keep_keeps_what_can_be_simulated(tmp_path: Path, options: EsimasOptions
     assert not (tmp_path / "out" / "faults").exists()
 
 
-def test_error_refuses_and_leaves_the_folder_alone(tmp_path: Path, options: EsimasOptions) -> None:
+def test_faults_are_refused_without_changing_the_folder(
+    tmp_path: Path, options: EsimasOptions
+) -> None:
+    def content() -> dict[Path, bytes]:
+        return {p: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()}
+
     prepare(options, tmp_path / "out")
-    before = {p: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()}
+    before = content()
     options.faults = Faults.error
     with pytest.raises(FaultError, match=r"2 of 4 sequences hold faults \(jump in 1, non_fin"):
         prepare(options, tmp_path / "out")
-    assert before == {p: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()}
-    options = raw(tmp_path / "sound", CLEAN)
-    options.faults = Faults.error
-    assert len(prepare(options, tmp_path / "sound_out")) == 1
+    assert before == content()
+    clean = replace(raw(tmp_path / "clean", CLEAN), faults=Faults.error)
+    assert len(prepare(clean, tmp_path / "clean_out")) == 1
 
 
-def test_a_fault_message_lists_the_first_few(tmp_path: Path) -> None:
-    options = raw(tmp_path / "raw", *[JUMP] * 9)
-    options.faults = Faults.error
-    with pytest.raises(
-        FaultError, match=r"(?s)demo/000: jump: car 2 goes from .*\.\.\. and 4 more"
-    ) as e:
+def test_fault_message_lists_the_first_faults(tmp_path: Path) -> None:
+    options = replace(raw(tmp_path / "raw", *[JUMP] * 9), faults=Faults.error)
+    message = r"(?s)demo/000: jump: car 2 goes from .*\.\.\. and 4 more"
+    with pytest.raises(FaultError, match=message) as error:
         prepare(options, tmp_path / "out")
-    assert str(e.value).count("demo/") == LISTED
+    assert str(error.value).count("demo/") == LISTED
 
 
-def test_nothing_left(tmp_path: Path) -> None:
-    options = raw(tmp_path / "raw", JUMP, INFINITE)
-    with pytest.raises(DataError, match=r"nothing is left of 2 sequences: jump in 1, non_finite"):
-        prepare(options, tmp_path / "out")
-    options = raw(tmp_path / "raw", CLEAN[:1])
-    with pytest.raises(DataError, match="nothing is left of 1 sequences: too_short in 1"):
-        prepare(options, tmp_path / "out")
+@pytest.mark.parametrize(
+    ("positions", "message"),
+    [
+        ([JUMP, INFINITE], "nothing is left of 2 sequences: jump in 1, non_finite"),
+        ([CLEAN[:1]], "nothing is left of 1 sequences: too_short in 1"),
+    ],
+)
+def test_no_sequence_without_faults(
+    tmp_path: Path, positions: list[np.ndarray], message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        prepare(raw(tmp_path / "raw", *positions), tmp_path / "out")
 
 
 @pytest.mark.parametrize("place", ["write_store", "plot"])
-def test_interrupted_preparation_starts_clean(
+def test_interrupted_preparation_leaves_a_valid_store(
     tmp_path: Path, options: EsimasOptions, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
     out = tmp_path / "out"
@@ -141,14 +150,14 @@ def test_interrupted_preparation_starts_clean(
     ]
 
 
-def test_same_data_same_files(tmp_path: Path, options: EsimasOptions) -> None:
+def test_same_data_give_the_same_files(tmp_path: Path, options: EsimasOptions) -> None:
     for name in ("a", "b"):
         prepare(options, tmp_path / name, draw=plot_faults)
     for file in ("manifest.json", "sequences.parquet", "faults/demo.png"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-def test_open_prepared(tmp_path: Path, options: EsimasOptions) -> None:
+def test_open_prepared_data(tmp_path: Path, options: EsimasOptions) -> None:
     prepare(options, tmp_path / "out")
     options.prepared = str(tmp_path / "out")
     options.source, options.download = "elsewhere", "elsewhere"
@@ -168,7 +177,7 @@ def test_open_prepared(tmp_path: Path, options: EsimasOptions) -> None:
         open_data(options, tmp_path / "unused")
 
 
-def test_the_folder_is_enough(tmp_path: Path, options: EsimasOptions) -> None:
+def test_prepared_folder_is_the_only_option_needed(tmp_path: Path, options: EsimasOptions) -> None:
     options.faults, options.recording = Faults.keep, ["demo"]
     prepare(options, tmp_path / "out")
     assert len(open_data(EsimasOptions(prepared=str(tmp_path / "out")), tmp_path / "unused")) == 3
@@ -177,7 +186,7 @@ def test_the_folder_is_enough(tmp_path: Path, options: EsimasOptions) -> None:
         open_data(other, tmp_path / "unused")
 
 
-def test_a_folder_that_does_not_tell_its_reader(tmp_path: Path, options: EsimasOptions) -> None:
+def test_folder_without_the_name_of_its_reader(tmp_path: Path, options: EsimasOptions) -> None:
     prepare(options, tmp_path / "out")
     manifest = tmp_path / "out" / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"reader"', '"earlier"'))
@@ -185,28 +194,25 @@ def test_a_folder_that_does_not_tell_its_reader(tmp_path: Path, options: EsimasO
         open_data(EsimasOptions(prepared=str(tmp_path / "out")), tmp_path / "unused")
 
 
-def test_open_prepares_on_the_fly(tmp_path: Path, options: EsimasOptions) -> None:
+def test_open_data_prepares_raw_data(tmp_path: Path, options: EsimasOptions) -> None:
     store = open_data(options, tmp_path / "out")
     assert len(store) == 2
     assert not (tmp_path / "out" / "faults").exists()
 
 
-def test_a_moved_table_is_the_same_table(tmp_path: Path) -> None:
-    path = saved(tmp_path / "t.csv", tidy(4, 2))
-    options = TableOptions(domain="traffic", path=str(path))
-    prepare(options, tmp_path / "out")
-    options.path, options.prepared = "far/away/t.csv", str(tmp_path / "out")
+def test_moved_table_is_the_same_table(tmp_path: Path) -> None:
+    store = prepared_table(tmp_path, tidy(4, 2))
+    options = TableOptions(domain="traffic", path="far/away/t.csv", prepared=str(store.folder))
     assert len(open_data(options, tmp_path / "unused")) == 1
     options.path = "other.csv"
     with pytest.raises(ConfigError, match=r"data\.path=t\.csv then, other\.csv now"):
         open_data(options, tmp_path / "unused")
 
 
-def test_people_absent_for_a_while_are_left_out(tmp_path: Path) -> None:
+def test_people_with_missing_samples_are_left_out(tmp_path: Path) -> None:
     table = tidy(5, 3, step=0.1).assign(y=0.0)
-    path = saved(tmp_path / "t.csv", table[(table.agent != 1) | (table.time > 0)])
-    options = TableOptions(domain="crowd", path=str(path))
-    store = prepare(options, tmp_path / "out")
+    present = table[(table.agent != 1) | (table.time > 0)]
+    store = prepared_table(tmp_path, present, domain="crowd")
     assert store[0].agents == ("0", "2")
     (absent,) = store.manifest["dropped_agents"]
     assert absent == {"sequence": "t/s", "agent": "1", "why": "absent at 1 of 5 samples"}
@@ -215,72 +221,64 @@ def test_people_absent_for_a_while_are_left_out(tmp_path: Path) -> None:
 def test_absent_vehicle_makes_the_sequence_faulty(tmp_path: Path) -> None:
     table = tidy(5, 3, "ab")
     absent = (table.sequence == "b") & (table.agent == 1) & (table.time > 0.15)
-    path = saved(tmp_path / "t.csv", table[~absent])
-    options = TableOptions(domain="traffic", path=str(path), faults=Faults.keep, fill=0.1)
-    store = prepare(options, tmp_path / "out")
+    store = prepared_table(tmp_path, table[~absent], faults=Faults.keep, fill=0.1)
     assert [s.name for s in store] == ["t/a"]
     assert store.manifest["recordings"]["t"]["faulty"] == {"gap_in_time": 1}
 
 
-def test_two_percent_of_missing_samples_cost_no_platoon(tmp_path: Path) -> None:
+def test_missing_samples_are_filled(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     rows = tidy(100, 4, "01234567", step=1.5)
     rows["x"] += 6 * np.sin(0.5 * rows.time + rows.sequence.astype(int))
-    path = saved(tmp_path / "t.csv", rows[rng.random(len(rows)) > 0.02])
-    store = prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
+    store = prepared_table(tmp_path, rows[rng.random(len(rows)) > 0.02])
     assert len(store) == 8
-    told = store.manifest["filled"]
-    assert sum(entry["samples"] for entry in told) == pytest.approx(0.02 * len(rows), rel=0.3)
-    assert {entry["sequence"] for entry in told} <= {s.name for s in store}
-    # what is longer is not filled: it cuts a platoon in two, and that is said
-    gone = rows[~(rows.time.between(3, 5) & (rows.agent == 1))]
-    gone.to_csv(path, index=False)
-    store = prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
+    filled = store.manifest["filled"]
+    assert sum(entry["samples"] for entry in filled) == pytest.approx(0.02 * len(rows), rel=0.3)
+    assert {entry["sequence"] for entry in filled} <= {s.name for s in store}
+    # a long hole is not filled and divides the platoon
+    store = prepared_table(tmp_path, rows[~(rows.time.between(3, 5) & (rows.agent == 1))])
     assert len(store) == 16
     assert store.manifest["filled"] == []
     assert "cut into 2 sequences" in store.manifest["notes"][0]
     assert store.manifest["notes"][3] == "and 5 more such sequences"
 
 
-def test_vehicles_that_never_meet_are_refused_with_what_to_do(tmp_path: Path) -> None:
-    table = tidy(30, 3)
-    path = saved(tmp_path / "t.csv", table.assign(time=table.time + 3 * table.agent))
+def test_vehicles_that_are_never_present_together_are_refused(tmp_path: Path) -> None:
+    """The message suggests an option that helps."""
+    table = tidy(30, 3).assign(time=lambda t: t.time + 3 * t.agent)
     with pytest.raises(DataError, match=r"data\.fill=SECONDS") as error:
-        prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "out")
+        prepared_table(tmp_path, table)
     assert "faults=keep" not in str(error.value)
 
 
-def test_a_folder_of_an_earlier_version_opens_under_its_names_of_options(tmp_path: Path) -> None:
-    path = saved(tmp_path / "t.csv", tidy(30, 3))
-    options = TableOptions(domain="traffic", path=str(path), fill=0.3)
-    store = prepare(options, tmp_path / "out")
-    manifest = tmp_path / "out" / "manifest.json"
+def test_renamed_option_of_an_earlier_version(tmp_path: Path) -> None:
+    store = prepared_table(tmp_path, tidy(30, 3), fill=0.3)
+    manifest = store.folder / "manifest.json"
+    assert '"fill": 0.3' in manifest.read_text()
     manifest.write_text(manifest.read_text().replace('"fill": 0.3', '"max_hole": 0.3'))
-    assert "max_hole" in manifest.read_text()
-    asked = replace(options, prepared=str(store.folder))
-    assert len(open_data(asked, tmp_path / "new")) == 1
+    options = TableOptions(
+        domain="traffic", path=str(tmp_path / "t.csv"), fill=0.3, prepared=str(store.folder)
+    )
+    assert len(open_data(options, tmp_path / "new")) == 1
     with pytest.raises(ConfigError, match=r"data\.fill=0\.3 then, 0\.1 now"):
-        open_data(replace(asked, fill=0.1), tmp_path / "new")
+        open_data(replace(options, fill=0.1), tmp_path / "new")
 
 
-def test_noise_stands_in_the_manifest_and_is_no_fault(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
+def test_noise_is_reported_and_is_not_a_fault(tmp_path: Path) -> None:
     rows = tidy(200, 3, "abcde", step=0.4)
-    rows["x"] += 0.3 * rng.normal(size=len(rows))
-    path = saved(tmp_path / "t.csv", rows)
-    options = TableOptions(domain="traffic", path=str(path))
-    store = prepare(options, tmp_path / "out")
-    # steps of -0.5 m are common where cars drive slowly: none of them is a fault
+    rows["x"] += 0.3 * np.random.default_rng(5).normal(size=len(rows))
+    store = prepared_table(tmp_path, rows)
+    # Noise makes steps of -0.5 m frequent at low speed.
     assert len(store) == 5
-    assert store.manifest["noise"]["position"] == pytest.approx(0.3, rel=0.1)
-    assert store.manifest["noise"]["start_speed"] == pytest.approx(0.3 * 2**0.5 / 0.1, rel=0.1)
-    options.smooth = 2.0
-    smooth = prepare(options, tmp_path / "smooth")
+    noise = store.manifest["noise"]
+    assert noise["position"] == pytest.approx(0.3, rel=0.1)
+    assert noise["start_speed"] == pytest.approx(0.3 * 2**0.5 / 0.1, rel=0.1)
+    smooth = prepared_table(tmp_path, rows, smooth=2.0)
     assert smooth.manifest["noise"]["start_speed"] < 0.2
     assert np.std(smooth[0].x[:, 0, 0] - 4 * smooth[0].time) < 0.15
 
 
-def test_one_data_set_has_one_sampling_interval(tmp_path: Path) -> None:
+def test_different_sampling_intervals_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "raw"
     raw(folder, CLEAN, recording="a")
     options = raw(folder, CLEAN, recording="b", time=2 * TIME)
@@ -288,17 +286,20 @@ def test_one_data_set_has_one_sampling_interval(tmp_path: Path) -> None:
         prepare(options, tmp_path / "out")
 
 
-def test_wrong_options(tmp_path: Path, options: EsimasOptions) -> None:
-    options.domain = "crowd"
-    with pytest.raises(ConfigError, match="domain=crowd needs 2-dimensional positions"):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (EsimasOptions(domain="crowd"), "domain=crowd needs 2-dimensional positions"),
+        (EsimasOptions(domain="sea"), "domain=sea: expected traffic or crowd"),
+        (DataOptions(), "no reader for DataOptions"),
+        (VehicleTableOptions(), "path is not set"),
+    ],
+)
+def test_invalid_options(tmp_path: Path, options: DataOptions, message: str) -> None:
+    if isinstance(options, EsimasOptions):
+        options = replace(raw(tmp_path / "raw", CLEAN), domain=options.domain)
+    with pytest.raises(ConfigError, match=message):
         prepare(options, tmp_path / "out")
-    options.domain = "sea"
-    with pytest.raises(ConfigError, match="domain=sea: expected traffic or crowd"):
-        prepare(options, tmp_path / "out")
-    with pytest.raises(ConfigError, match="no reader for DataOptions"):
-        prepare(DataOptions(), tmp_path / "out")
-    with pytest.raises(ConfigError, match=r"path is not set"):
-        prepare(VehicleTableOptions(), tmp_path / "out")
 
 
 def test_unwritable_folder(tmp_path: Path, options: EsimasOptions) -> None:
@@ -315,7 +316,7 @@ def test_published_recordings(tmp_path: Path, real_data: Path) -> None:
     assert len(store.manifest["recordings"]) == 10
     options.faults = Faults.drop
     clean = prepare(options, tmp_path / "drop")
-    for s in clean:  # judged without the checks: nobody goes back, leaps or overlaps
+    for s in clean:  # independent of the checks: no backward step, jump or overlap
         step, gap = np.diff(s.x, axis=0), np.diff(s.x, axis=1)
         assert step.min() > -0.5
         assert step.max() < 12.5

@@ -1,4 +1,4 @@
-"""Sequences and their padding to batches."""
+"""Sequences, and their padding to batches."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ import torch
 
 from nnode.data.sequence import PADDING_GAP, Sequence, collate
 from nnode.errors import DataError
+from tests.builders import lane, people
 
 
-def platoon(name: str, k: int, n: int, dt: float = 0.2, **further: object) -> Sequence:
-    time = 3.0 + dt * np.arange(k)
-    x = 10.0 * np.arange(n)[None, :, None] + 20.0 * (time - 3.0)[:, None, None]
-    return Sequence(name=name, recording="r", time=time, x=x, **further)  # type: ignore[arg-type]
+def platoon(name: str, k: int, n: int, dt: float = 0.2, **fields: object) -> Sequence:
+    """Vehicles 10 m apart at 20 m/s from 3 s on."""
+    x = 10.0 * np.arange(n) + 20.0 * dt * np.arange(k)[:, None]
+    return lane(x, dt, start=3.0, name=name, **fields)
 
 
-def test_sequence_knows_its_sizes_and_interval() -> None:
+def test_sizes_and_interval() -> None:
     item = platoon("a", 6, 3)
     assert (item.n_samples, item.n_agents) == (6, 3)
     assert item.dt == pytest.approx(0.2)
     assert np.isnan(platoon("one", 1, 2).dt)
 
 
-def test_velocity_is_the_stored_one_or_forward_differences() -> None:
+def test_velocity_is_stored_or_a_forward_difference() -> None:
     item = platoon("a", 6, 3)
-    np.testing.assert_allclose(item.velocity(), 20.0)
-    assert item.velocity().shape == item.x.shape
-    stored = platoon("b", 6, 3, v=np.full((6, 3, 1), 7.0))
+    np.testing.assert_allclose(item.velocity(), np.full_like(item.x, 20.0))
+    stored = platoon("b", 6, 3, v=7.0)
     np.testing.assert_array_equal(stored.velocity(), 7.0)
-    np.testing.assert_array_equal(platoon("one", 1, 2).velocity(), 0.0)
+    np.testing.assert_array_equal(platoon("c", 1, 2).velocity(), 0.0)
 
 
-def test_select_keeps_everything_of_the_chosen_agents() -> None:
+def test_select_keeps_all_fields() -> None:
     item = platoon(
         "a",
         4,
@@ -66,15 +66,10 @@ def test_select_keeps_everything_of_the_chosen_agents() -> None:
         ({"kind": ("car",)}, "kind must name 3 agents, got 1"),
     ],
 )
-def test_wrong_shapes_and_lengths_are_refused(change: dict[str, object], message: str) -> None:
-    fields: dict[str, object] = {
-        "name": "rec/7",
-        "recording": "rec",
-        "time": np.arange(4.0),
-        "x": np.zeros((4, 3, 1)),
-    }
+def test_invalid_shapes_and_lengths(change: dict[str, object], message: str) -> None:
+    fields = {"time": np.arange(4.0), "x": np.zeros((4, 3, 1)), **change}
     with pytest.raises(DataError, match=f"rec/7: {message}"):
-        Sequence(**{**fields, **change})  # type: ignore[arg-type]
+        Sequence(name="rec/7", recording="rec", **fields)
 
 
 def test_collate_pads_platoons_in_front_of_their_leader() -> None:
@@ -87,36 +82,33 @@ def test_collate_pads_platoons_in_front_of_their_leader() -> None:
     assert batch.agent.tolist() == [[True, True, False, False], [True] * 4]
     assert batch.valid.sum((0, 2)).tolist() == [5 * 2, 3 * 4]
     assert batch.valid[3:, 1].sum() == 0
-    # every vehicle, padding included, has a finite, positive gap in front of it, at every time
+    # every vehicle, padding included, has a finite and positive gap at every time
     gaps = batch.x[:, :, 1:, 0] - batch.x[:, :, :-1, 0]
     assert torch.isfinite(batch.x).all()
     assert (gaps > 0).all()
     padding = gaps[:, 0, 1:]
     assert (padding >= PADDING_GAP - 1e-9).all()
     assert (batch.v[~batch.valid] == 0).all()
-    # a sequence that has ended stands at its last position, which is its destination
+    # after its end a sequence stays at its last position, which is its destination
     assert torch.equal(batch.x[3, 1], batch.x[2, 1])
     assert torch.equal(batch.destination, batch.x[-1])
     assert batch.start.tolist() == [3.0, 3.0]
 
 
-def test_collate_pads_people_far_from_everyone() -> None:
+def test_collate_pads_people_at_a_distance() -> None:
     rng = np.random.default_rng(0)
     walls = np.array([[5.0, 4.0, -5.0, 4.0]])
-    items = [
-        Sequence(
-            name=str(n),
-            recording="r",
-            time=0.04 * np.arange(4),
-            x=rng.uniform(-5, 5, (4, n, 2)),
+    batch = collate(
+        people(
+            rng.uniform(-5, 5, (4, n, 2)),
+            0.04,
             destination=np.full((n, 2), 9.0),
             walls=walls if n == 3 else None,
         )
         for n in (1, 3)
-    ]
-    batch = collate(items)
-    apart = torch.cdist(batch.x[:, 0], batch.x[:, 0])[:, 0, 1:]
-    assert (apart >= PADDING_GAP).all()
+    )
+    distance = torch.cdist(batch.x[:, 0], batch.x[:, 0])[:, 0, 1:]
+    assert (distance >= PADDING_GAP).all()
     assert batch.walls.shape == (2, 1, 4)
     assert batch.walls[0].isnan().all()
     np.testing.assert_array_equal(batch.walls[1], walls)
@@ -131,7 +123,7 @@ def test_collate_keeps_unknown_lengths_unknown() -> None:
     assert batch.length[1].isnan().all()
 
 
-def test_batch_moves_to_another_precision() -> None:
+def test_batch_in_another_precision() -> None:
     batch = collate([platoon("a", 3, 2)]).to(dtype=torch.float32)
     assert batch.dtype == batch.v.dtype == batch.start.dtype == torch.float32
     assert batch.x.dtype == batch.destination.dtype == batch.walls.dtype == torch.float64
@@ -139,27 +131,33 @@ def test_batch_moves_to_another_precision() -> None:
     assert batch.names == ("a",)
 
 
-def test_collate_refuses_what_does_not_fit_together() -> None:
-    with pytest.raises(DataError, match="at least one sequence"):
-        collate([])
-    with pytest.raises(DataError, match=r"a has 0\.2 s, b 0\.1 s"):
-        collate([platoon("a", 3, 2), platoon("b", 3, 2, dt=0.1)])
-    flat = Sequence(name="c", recording="r", time=0.2 * np.arange(3), x=np.zeros((3, 2, 2)))
-    with pytest.raises(DataError, match="a and c differ in their number of dimensions"):
-        collate([platoon("a", 3, 2), flat])
+@pytest.mark.parametrize(
+    ("items", "message"),
+    [
+        ([], "at least one sequence"),
+        ([platoon("a", 3, 2), platoon("b", 3, 2, dt=0.1)], r"a has 0\.2 s, b 0\.1 s"),
+        (
+            [platoon("a", 3, 2), people(np.zeros((3, 2, 2)), 0.2, name="c")],
+            "a and c differ in their number of dimensions",
+        ),
+    ],
+)
+def test_collate_refuses_incompatible_sequences(items: list[Sequence], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        collate(items)
 
 
 @pytest.mark.parametrize("dims", [1, 2])
-def test_single_precision_keeps_the_places_of_a_map(dims: int) -> None:
-    """Numbers of float32 are 0.5 m apart at 7,000 km; a batch counts from its own origin."""
+def test_single_precision_at_map_coordinates(dims: int) -> None:
+    """Numbers of float32 are 0.5 m apart at 7,000 km; the positions of a batch have an origin."""
     x = 3.0 * np.random.default_rng(1).random((5, 3, dims)).cumsum(axis=0)
     walls = None if dims == 1 else np.array([[0.0, 0.0, 9.0, 0.0]])
-    here = Sequence(name="a", recording="a", time=0.1 * np.arange(5), x=x, walls=walls)
-    by = np.array([7e6, -3e6])[:dims]
-    moved = replace(here, x=x + by, walls=None if walls is None else walls + np.tile(by, 2))
+    item = people(x, 0.1, walls=walls)
+    shift = np.array([7e6, -3e6])[:dims]
+    moved = replace(item, x=x + shift, walls=None if walls is None else walls + np.tile(shift, 2))
     local, mapped = (
         batch.relative_to(batch.origins())
-        for batch in (collate([s]).to(dtype=torch.float32) for s in (here, moved))
+        for batch in (collate([s]).to(dtype=torch.float32) for s in (item, moved))
     )
     assert mapped.x.dtype == torch.float32
     for name in ("x", "destination", "walls"):

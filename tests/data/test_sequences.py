@@ -1,4 +1,4 @@
-"""Sequences in memory: what is read, how they are divided and shown."""
+"""Sequences in memory: reading, selection and display."""
 
 from __future__ import annotations
 
@@ -22,110 +22,112 @@ def tidy() -> pd.DataFrame:
     return table(platoons=4, seconds=3.0)
 
 
-def test_a_data_frame_is_read_as_its_file_is(tidy: pd.DataFrame, tmp_path: Path) -> None:
-    tidy.to_parquet(tmp_path / "table.parquet")
-    options = TableOptions(domain="traffic", path=str(tmp_path / "table.parquet"))
-    store = prepare(options, tmp_path / "store")
-    for result in (nnode.sequences(tidy), nnode.sequences(tmp_path / "table.parquet")):
+def test_data_frame_equals_file_and_store(tidy: pd.DataFrame, tmp_path: Path) -> None:
+    path = tmp_path / "table.parquet"
+    tidy.to_parquet(path)
+    store = prepare(TableOptions(domain="traffic", path=str(path)), tmp_path / "store")
+    for result in (nnode.sequences(tidy), nnode.sequences(path)):
         assert [s.name for s in result] == [entry["name"] for entry in store.index]
-        for ours, theirs in zip(result, store, strict=True):
-            assert np.array_equal(ours.x, theirs.x)
-            assert np.array_equal(ours.time, theirs.time)
-            assert ours.agents == theirs.agents
-            assert np.array_equal(ours.length, theirs.length)
+        for actual, expected in zip(result, store, strict=True):
+            for field in ("x", "time", "agents", "length"):
+                np.testing.assert_array_equal(getattr(actual, field), getattr(expected, field))
         assert result.manifest["counts"] == store.manifest["counts"]
         assert result.domain == "traffic"
 
 
-def test_the_format_shows_in_the_columns(tidy: pd.DataFrame) -> None:
+def test_format_follows_from_the_columns(tidy: pd.DataFrame) -> None:
     assert nnode.sequences(tidy).manifest["reader"] == TableOptions.__name__
-    two = nnode.sequences(pairs(number=2, seconds=3.0))
-    assert two.manifest["reader"] == PairOptions.__name__
-    assert [s.n_agents for s in two] == [2, 2]
-    assert two[0].v is not None
-    single = tidy[tidy.sequence == 0].rename(columns={"agent": "vehicle"}).drop(columns="sequence")
-    (cars,) = nnode.sequences(single, dt=0.1)
-    assert nnode.sequences(single).manifest["reader"] == VehicleTableOptions.__name__
-    assert cars.n_agents == 3
-    walk = tidy.assign(y=0.5 * tidy.agent)
-    assert nnode.sequences(walk, faults="keep").domain == "crowd"
+    read_pairs = nnode.sequences(pairs(number=2, seconds=3.0))
+    assert read_pairs.manifest["reader"] == PairOptions.__name__
+    assert [s.n_agents for s in read_pairs] == [2, 2]
+    assert read_pairs[0].v is not None
+    platoon = tidy[tidy.sequence == 0].rename(columns={"agent": "vehicle"}).drop(columns="sequence")
+    assert nnode.sequences(platoon).manifest["reader"] == VehicleTableOptions.__name__
+    assert [s.n_agents for s in nnode.sequences(platoon, dt=0.1)] == [3]
+    assert nnode.sequences(tidy.assign(y=0.5 * tidy.agent), faults="keep").domain == "crowd"
 
 
-def test_columns_of_other_names_and_units_are_told(tidy: pd.DataFrame) -> None:
+def test_columns_and_units_are_options(tidy: pd.DataFrame) -> None:
     feet = tidy[tidy.sequence == 0].assign(front=tidy.x / 0.3048)[["time", "agent", "front"]]
     columns = {"vehicle": "agent", "x": "front"}
     (single,) = nnode.sequences(feet, data="vehicles", columns=columns, position_unit="ft", dt=0.1)
     assert single.x[:, 0, 0] == pytest.approx(tidy[tidy.agent == 0].x.to_numpy(), abs=1e-6)
 
 
-def test_a_data_set_is_read_by_its_name(real_data: Path) -> None:
+def test_data_set_is_read_by_name(real_data: Path) -> None:
     result = nnode.sequences(data="esimas", recording="1-1_1", source=str(real_data))
     assert len(result) > 10
     assert {s.recording for s in result} == {"1-1_1"}
 
 
-def test_parts_are_sequences_again(tidy: pd.DataFrame) -> None:
-    every = nnode.sequences(tidy)
-    assert every[-1].name == "table/3"
-    names = [s.name for s in every]
+def test_selections_are_sequences(tidy: pd.DataFrame) -> None:
+    items = nnode.sequences(tidy)
+    assert items[-1].name == "table/3"
+    names = [s.name for s in items]
     for key, expected in (
         (slice(1, 3), names[1:3]),
         ([2, 0], [names[2], names[0]]),
         (np.array([3]), names[3:]),
         (np.array([True, False, False, True]), [names[0], names[3]]),
     ):
-        part = every[key]
+        part = items[key]
         assert isinstance(part, nnode.Sequences)
         assert [s.name for s in part] == expected
 
 
-def test_a_table_of_sequences_is_read_back_the_same(tidy: pd.DataFrame) -> None:
-    every = nnode.sequences(tidy)
-    told = every.to_dataframe()
+def test_round_trip_through_a_data_frame(tidy: pd.DataFrame) -> None:
+    items = nnode.sequences(tidy)
+    table = items.to_dataframe()
     keys = ["sequence", "time", "agent", "x", "length"]
-    pd.testing.assert_frame_equal(told[keys], tidy[keys], check_dtype=True)
-    assert nnode.sequences(told).score(every) == 0.0
+    pd.testing.assert_frame_equal(table[keys], tidy[keys], check_dtype=True)
+    assert nnode.sequences(table).score(items) == 0.0
 
 
-def test_the_score_is_minus_the_root_mean_square_distance(tidy: pd.DataFrame) -> None:
-    every = nnode.sequences(tidy)
-    # 3 m beside and 4 m above, in every sample but the first
+def test_score_is_the_negative_rms_distance(tidy: pd.DataFrame) -> None:
+    # 3 m along and 4 m across, in every sample except the first
     walk = tidy.assign(y=0.5 * tidy.agent, agent=tidy.agent.astype(str))
     later = walk.time > 0
     moved = walk.assign(x=walk.x + 3.0 * later, y=walk.y + 4.0 * later)
-    kept = nnode.sequences(walk, faults="keep")
-    assert nnode.sequences(moved, faults="keep").score(kept) == pytest.approx(-5.0)
+    expected, result = (nnode.sequences(table, faults="keep") for table in (walk, moved))
+    assert result.score(expected) == pytest.approx(-5.0)
     with pytest.raises(DataError, match="is not among the simulated ones"):
-        every[:1].score(tidy)
+        nnode.sequences(tidy)[:1].score(tidy)
 
 
-def test_sequences_are_shown_and_labelled(tidy: pd.DataFrame) -> None:
-    every = nnode.sequences(tidy)
-    assert repr(every).startswith("<nnode.Sequences: 4 sequences of vehicles in lanes, 4 clusters")
-    page = every._repr_html_()
+def test_repr_html_and_xarray(tidy: pd.DataFrame) -> None:
+    items = nnode.sequences(tidy)
+    assert repr(items).startswith("<nnode.Sequences: 4 sequences of vehicles in lanes, 4 clusters")
+    page = items._repr_html_()
     assert page.count("<tr>") == 4
     assert "<td>table/0</td>" in page
     pytest.importorskip("xarray")
-    told = every.to_xarray()
-    assert told.sizes == {"sequence": 4, "sample": 31, "place": 3}
-    first = told.x.sel(sequence="table/1").isel(place=0).to_numpy()
-    assert np.array_equal(first, every[1].x[:, 0, 0])
+    dataset = items.to_xarray()
+    assert dataset.sizes == {"sequence": 4, "sample": 31, "place": 3}
+    first = dataset.x.sel(sequence="table/1").isel(place=0).to_numpy()
+    assert np.array_equal(first, items[1].x[:, 0, 0])
 
 
-def test_what_holds_no_trajectories_is_refused(tidy: pd.DataFrame) -> None:
-    every = nnode.sequences(tidy)
-    for wrong, message in (
-        ([every[0], 3], "found an entry of type int"),
-        ([every[0], every[0]], "two sequences are named table/0"),
+def test_invalid_sequences(tidy: pd.DataFrame) -> None:
+    first = nnode.sequences(tidy)[0]
+    for items, message in (
+        ([first, 3], "found an entry of type int"),
+        ([first, first], "two sequences are named table/0"),
         ([], "found nothing"),
     ):
         with pytest.raises(DataError, match=message):
-            nnode.Sequences(wrong)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match=r"data=esima is unknown.*did you mean esimas"):
-        nnode.sequences(data="esima")
-    with pytest.raises(ConfigError, match=r"no option data.colums; .*did you mean data.columns"):
-        nnode.sequences(tidy, data="pairs", colums={})
-    with pytest.raises(ConfigError, match="no data frame; give their path"):
-        nnode.sequences(tidy, data="juelich")
-    with pytest.raises(ConfigError, match="there is no table"):
-        nnode.sequences()
+            nnode.Sequences(items)
+
+
+def test_invalid_arguments(tidy: pd.DataFrame) -> None:
+    for arguments, options, message in (
+        ((), {"data": "esima"}, r"data=esima is unknown.*did you mean esimas"),
+        (
+            (tidy,),
+            {"data": "pairs", "colums": {}},
+            r"no option data.colums; .*did you mean data.columns",
+        ),
+        ((tidy,), {"data": "juelich"}, "no data frame; give their path"),
+        ((), {}, "there is no table"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            nnode.sequences(*arguments, **options)

@@ -1,8 +1,9 @@
-"""Artificial recordings: the laws they claim, the formats they copy, the same bytes again."""
+"""Synthetic recordings: their laws, their formats, and reproducible files."""
 
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -31,7 +32,7 @@ def platoons(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(item["Xarr"][0, 0], item["Tarr"][0, 0]) for item in cell.ravel()]
 
 
-def test_the_last_gap_follows_its_solution(tmp_path: Path) -> None:
+def test_last_gap_has_its_analytic_solution(tmp_path: Path) -> None:
     # behind a leader at v0: g' = v0 L / g, so that g² = g0² + 2 v0 L t
     for x, t in platoons(traffic_recording(tmp_path / "a.mat", seed=0, v0=22.0, L=7.0)):
         gap = x[-1] - x[-2]
@@ -39,7 +40,7 @@ def test_the_last_gap_follows_its_solution(tmp_path: Path) -> None:
         np.testing.assert_allclose(x[-1], x[-1, 0] + 22.0 * (t - t[0, 0])[0])
 
 
-def test_every_car_drives_at_the_speed_of_its_gap(tmp_path: Path) -> None:
+def test_speed_follows_from_the_gap(tmp_path: Path) -> None:
     for x, _ in platoons(traffic_recording(tmp_path / "a.mat", seed=1, v0=20.0, L=5.0)):
         speed = 20.0 * (1 - 5.0 / np.diff(x, axis=0))
         # Simpson's rule over two intervals of 0.2 s
@@ -47,7 +48,7 @@ def test_every_car_drives_at_the_speed_of_its_gap(tmp_path: Path) -> None:
         np.testing.assert_allclose(x[:-1, 2:] - x[:-1, :-2], driven, atol=1e-3)
 
 
-def test_platoons_have_the_shape_of_the_published_ones(tmp_path: Path) -> None:
+def test_platoons_are_like_the_published_ones(tmp_path: Path) -> None:
     recorded = platoons(traffic_recording(tmp_path / "a.mat", seed=3))
     assert len(recorded) == 40
     assert {x.shape[0] for x, _ in recorded} == {3, 4, 5, 6}
@@ -64,15 +65,17 @@ def test_platoons_have_the_shape_of_the_published_ones(tmp_path: Path) -> None:
     assert min(pauses) == pytest.approx(10.0)
 
 
-def test_noise_is_as_strong_as_asked_for(tmp_path: Path) -> None:
-    clean = platoons(traffic_recording(tmp_path / "a.mat", seed=5))
-    noisy = platoons(traffic_recording(tmp_path / "b.mat", seed=5, noise=0.5))
-    error = noisy[0][0] - clean[0][0]
-    # 5 standard deviations of the sample's own standard deviation
+def test_standard_deviation_of_noise(tmp_path: Path) -> None:
+    clean, noisy = (
+        platoons(traffic_recording(tmp_path / "a.mat", seed=5, noise=noise))[0][0]
+        for noise in (0.0, 0.5)
+    )
+    error = noisy - clean
+    # 5 standard deviations of the sample's standard deviation
     assert error.std() == pytest.approx(0.5, abs=5 * 0.5 / math.sqrt(2 * error.size))
 
 
-# the paper's table of six settings: x_blue, x_red, v_blue, v_red, force on blue
+# the paper's table: positions and velocities of blue and red, force on blue
 SETTINGS = [
     ((0, 0.22), (0, -0.22), (0, -1), (0, 1), (0, 2.1118)),
     ((0, 0.22), (0, -0.22), (0, 1), (0, 1), (0, 2.1118)),
@@ -84,7 +87,7 @@ SETTINGS = [
 
 
 @pytest.mark.parametrize(("x_blue", "x_red", "v_blue", "v_red", "force"), SETTINGS)
-def test_the_pair_force_is_that_of_the_paper(
+def test_pair_force_of_the_paper(
     x_blue: Any, x_red: Any, v_blue: Any, v_red: Any, force: Any
 ) -> None:
     forces = Forces(A=0.0044, k=34.9539, kappa=9.8894)
@@ -95,17 +98,17 @@ def test_the_pair_force_is_that_of_the_paper(
     np.testing.assert_allclose(on_red, np.negative(force), atol=1e-4)
 
 
-def plain_acceleration(
+def paper_acceleration(
     x: np.ndarray, v: np.ndarray, goal: np.ndarray, wall: np.ndarray, p: Forces
 ) -> np.ndarray:
-    """The paper's equations written out person by person, wall point by wall point."""
+    """The paper's equations as sums over people and wall points."""
     result = np.zeros_like(x)
     for i in range(len(x)):
-        way = goal[i] - x[i]
-        desired = way / math.hypot(*way) * math.hypot(*v[i])
+        offset = goal[i] - x[i]
+        desired = offset / math.hypot(*offset) * math.hypot(*v[i])
         result[i] = (desired - v[i]) / p.tau
-        pairs = [(x[j], v[j] - v[i], 2 * p.r, len(x)) for j in range(len(x)) if j != i]
-        for other, slip, reach, count in pairs + [(w, v[i], p.r, len(wall)) for w in wall]:
+        partners = [(x[j], v[j] - v[i], 2 * p.r, len(x)) for j in range(len(x)) if j != i]
+        for other, slip, reach, count in partners + [(w, v[i], p.r, len(wall)) for w in wall]:
             d = math.dist(x[i], other)
             n = (x[i] - other) / d
             t = np.array([-n[1], n[0]])
@@ -116,13 +119,13 @@ def plain_acceleration(
 
 
 @pytest.mark.thorough
-def test_people_are_accelerated_as_the_paper_says(tmp_path: Path) -> None:
+def test_accelerations_follow_the_paper(tmp_path: Path) -> None:
     rate, width = 200.0, 1.2
-    p = Forces(A=3.0, B=0.2)  # forces that change little between two frames
+    forces = Forces(A=3.0, B=0.2)  # the force changes little between two frames
     path = crowd_recording(
         tmp_path / "c.txt",
         seed=3,
-        forces=p,
+        forces=forces,
         people=2,
         duration=7.0,
         length=6.0,
@@ -132,26 +135,25 @@ def test_people_are_accelerated_as_the_paper_says(tmp_path: Path) -> None:
         noise=0.0,
     )
     table = np.loadtxt(path)
-    first, two = (table[table[:, 0] == i] for i in (1, 2))
-    shared = np.intersect1d(first[:, 1], two[:, 1])
-    x = np.stack([s[np.isin(s[:, 1], shared)][:, 2:4] / 100 for s in (first, two)], axis=1)
-    lane = np.stack([first[0, 3], two[0, 3]]) / 100  # straight ahead from where each came in
+    first, second = people = [table[table[:, 0] == i] for i in (1, 2)]
+    shared = np.intersect1d(first[:, 1], second[:, 1])
+    x = np.stack([rows[np.isin(rows[:, 1], shared)][:, 2:4] / 100 for rows in people], axis=1)
     heading = np.sign(x[-1, :, 0] - x[0, :, 0])
-    goal = np.column_stack([heading * (3.0 + 1.0 + 5.0), lane])
-    along = np.linspace(-4.0, 4.0, 33)
-    wall = np.array([(a, b) for b in (0.0, width) for a in along])
+    # straight ahead of the position at which a person enters
+    goal = np.column_stack([heading * (3.0 + 1.0 + 5.0), [rows[0, 3] / 100 for rows in people]])
+    wall = np.array([(a, b) for b in (0.0, width) for a in np.linspace(-4.0, 4.0, 33)])
     step = 4  # positions have a resolution of 10 µm
     h = step / rate
     k = np.argmin(np.linalg.norm(x[:, 0] - x[:, 1], axis=1))
     assert math.dist(*x[k]) < 0.6
-    strongest = 0.0
+    largest = 0.0
     for i in range(k - 30, k + 30, 6):
         v = (x[i + step] - x[i - step]) / (2 * h)
         a = (x[i + step] - 2 * x[i] + x[i - step]) / h**2
-        expected = plain_acceleration(x[i], v, goal, wall, p)
+        expected = paper_acceleration(x[i], v, goal, wall, forces)
         np.testing.assert_allclose(a, expected, atol=0.08)
-        strongest = max(strongest, float(np.abs(expected).max()))
-    assert strongest > 5.0
+        largest = max(largest, float(np.abs(expected).max()))
+    assert largest > 5.0
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +162,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.thorough
-def test_the_demo_is_laid_out_like_the_real_data(demo: dict[str, Path]) -> None:
+def test_demo_has_the_layout_of_the_real_data(demo: dict[str, Path]) -> None:
     assert demo["esimas"].parts[-2:] == ("esimas", "sequence_datademo.mat")
     assert demo["juelich"].parts[-2:] == ("juelich", "demo_corridor.txt")
     header = demo["juelich"].read_text().splitlines()[:3]
@@ -170,29 +172,28 @@ def test_the_demo_is_laid_out_like_the_real_data(demo: dict[str, Path]) -> None:
 
 def test_people_cross_the_corridor_in_both_directions(demo: dict[str, Path]) -> None:
     table = np.loadtxt(demo["juelich"])
+    person, frame = table[:, 0], table[:, 1]
     x, y = table[:, 2] / 100, table[:, 3] / 100
     assert np.abs(x).max() <= 5.01
     assert y.min() > 0
     assert y.max() < 4
-    crossed = []
-    for person in np.unique(table[:, 0]):
-        frames = table[table[:, 0] == person, 1]
-        assert (np.diff(frames) == 1).all()
-        mine = x[table[:, 0] == person]
-        crossed.append(mine[-1] - mine[0])
-    assert len(crossed) == 45
-    assert sum(c > 9 for c in crossed) >= 15
-    assert sum(c < -9 for c in crossed) >= 15
-    present = np.bincount(table[:, 1].astype(int))
-    assert present.max() >= 10
-    assert 25 <= (table[:, 1].max() - table[:, 1].min()) / 25 <= 36
+    distances = []
+    for number in np.unique(person):
+        assert (np.diff(frame[person == number]) == 1).all()
+        path = x[person == number]
+        distances.append(path[-1] - path[0])
+    assert len(distances) == 45
+    assert sum(d > 9 for d in distances) >= 15
+    assert sum(d < -9 for d in distances) >= 15
+    assert np.bincount(frame.astype(int)).max() >= 10
+    assert 25 <= np.ptp(frame) / 25 <= 36
 
 
 @pytest.mark.thorough
-def test_the_same_seed_gives_the_same_bytes(
+def test_same_seed_gives_the_same_files(
     tmp_path: Path, demo: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # fewer people for a shorter time: what is random about them is the same
+    # fewer people for a shorter time draw the same kinds of random numbers
     few = partial(crowd_recording, people=6, duration=4.0)
     monkeypatch.setattr(
         nnode.data.synthetic, "crowd_recording", lambda path, seed, **_: few(path, seed=seed)
@@ -206,16 +207,15 @@ def test_the_same_seed_gives_the_same_bytes(
         assert other[name].read_bytes() != path.read_bytes()
 
 
-def test_a_header_holds_no_date(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import time
+def test_header_has_no_date(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    contents = set()
+    for date in ("Thu Jan  1 00:00:00 1970", "Fri Dec 31 23:59:59 1999"):
+        monkeypatch.setattr(time, "asctime", lambda *_, date=date: date)
+        contents.add(traffic_recording(tmp_path / "a.mat", seed=0).read_bytes())
+    assert len(contents) == 1
 
-    monkeypatch.setattr(time, "asctime", lambda *_: "Thu Jan  1 00:00:00 1970")
-    first = traffic_recording(tmp_path / "a.mat", seed=0).read_bytes()
-    monkeypatch.setattr(time, "asctime", lambda *_: "Fri Dec 31 23:59:59 1999")
-    assert traffic_recording(tmp_path / "b.mat", seed=0).read_bytes() == first
 
-
-def test_platoons_follow_the_law_of_the_table(tmp_path: Path) -> None:
+def test_platoons_follow_the_law(tmp_path: Path) -> None:
     truth = SlowZone(drivers=0.0, noise=0.0)
     table = pd.read_csv(platoon_table(tmp_path / "p.csv", seed=2, truth=truth, platoons=3, dt=0.02))
     assert list(table.columns) == ["sequence", "time", "agent", "x"]
@@ -227,7 +227,7 @@ def test_platoons_follow_the_law_of_the_table(tmp_path: Path) -> None:
         here, gap = place[1:-1, :-1], np.diff(place, axis=1)[1:-1]
         zone = (here >= truth.a) & (here <= truth.b)
         expected = np.where(zone, truth.alpha, 1.0) * truth.v0 * (1 - truth.L / gap)
-        # not within a step of the zone's ends, where speeds jump
+        # speeds change discontinuously at the ends of the zone
         clear = (np.abs(here - truth.a) > 1) & (np.abs(here - truth.b) > 1)
         # positions are written to the millimetre
         np.testing.assert_allclose(speed[clear], expected[clear], atol=0.06)
@@ -236,26 +236,27 @@ def test_platoons_follow_the_law_of_the_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_drivers_and_noise_of_platoons_are_as_asked_for(tmp_path: Path) -> None:
-    still = SlowZone(drivers=0.0, noise=0.0)
+def test_drivers_and_noise_of_platoons(tmp_path: Path) -> None:
+    exact = SlowZone(drivers=0.0, noise=0.0)
     clean, noisy = (
-        pd.read_csv(platoon_table(tmp_path / f"{n}.csv", seed=4, truth=truth, platoons=8))
-        for n, truth in (("a", still), ("b", replace(still, noise=0.1)))
+        pd.read_csv(platoon_table(tmp_path / "t.csv", seed=4, truth=truth, platoons=8))
+        for truth in (exact, replace(exact, noise=0.1))
     )
     error = noisy["x"] - clean["x"]
     assert error.std() == pytest.approx(0.1, abs=5 * 0.1 / math.sqrt(2 * len(error)))
-    assert clean["agent"].nunique() == 8 * 5  # nobody is in two platoons
-    same = [platoon_table(tmp_path / n, seed=4, platoons=2).read_bytes() for n in ("c", "d")]
-    assert same[0] == same[1]
+    assert clean["agent"].nunique() == 8 * 5  # no agent is in two platoons
+    tables = [platoon_table(tmp_path / n, seed=4, platoons=2).read_bytes() for n in ("c", "d")]
+    assert tables[0] == tables[1]
 
 
-def test_tables_of_the_demo_differ_in_the_zone_alone(demo: dict[str, Path]) -> None:
-    hidden, nothing = (pd.read_csv(demo[name]) for name in ("table", "nothing_hidden"))
-    assert hidden[["sequence", "time", "agent"]].equals(nothing[["sequence", "time", "agent"]])
-    assert hidden["sequence"].nunique() == 20
-    away = (hidden["x"] - nothing["x"]).abs()
-    # nobody of the platoon has reached the zone yet
-    before = hidden.groupby(["sequence", "time"])["x"].transform("max") < SlowZone().a - 1
+def test_demo_tables_differ_only_after_the_zone(demo: dict[str, Path]) -> None:
+    with_zone, without = (pd.read_csv(demo[name]) for name in ("table", "nothing_hidden"))
+    keys = ["sequence", "time", "agent"]
+    assert with_zone[keys].equals(without[keys])
+    assert with_zone["sequence"].nunique() == 20
+    difference = (with_zone["x"] - without["x"]).abs()
+    # no vehicle of the platoon has reached the zone
+    before = with_zone.groupby(keys[:2])["x"].transform("max") < SlowZone().a - 1
     assert before.any()
-    assert (away[before] < 1e-6).all()
-    assert away.max() > 10
+    assert (difference[before] < 1e-6).all()
+    assert difference.max() > 10

@@ -1,4 +1,4 @@
-"""Platoons and models of second order that tests of laws, effects and steps share."""
+"""Platoons and car-following models for tests of laws, effects and steps."""
 
 from __future__ import annotations
 
@@ -14,28 +14,27 @@ from torch import Tensor
 from nnode.data.sequence import Batch, collate
 from nnode.model import System, Traffic, build_model
 from nnode.model.laws import CAR_FOLLOWING_LAWS, NEURONS
+from nnode.simulation import TorchdiffeqSolver, Trajectory
 from tests.builders import lane
 
 DT = 0.1
 
 
 def model(law: str | dict[str, Any], *effects: dict[str, Any], **options: Any) -> Traffic:
-    """A law of the field by its name, or another one, behind a measured leader."""
+    """A law of the catalogue by its name, or a law by its description, with a measured leader."""
     name = law if isinstance(law, str) else "mine"
-    more = {"network": NEURONS[name]} if name in NEURONS else {}
-    found = build_model(
+    network = {"network": NEURONS[name]} if name in NEURONS else {}
+    return build_model(
         {
             "term": "formula",
             "name": name,
             "leader": "measured",
             "effects": list(effects),
             "law": CAR_FOLLOWING_LAWS[name] if isinstance(law, str) else law,
-            **more,
+            **network,
             **options,
         }
     )
-    assert isinstance(found, Traffic)
-    return found
 
 
 def set_(system: Traffic, **values: float) -> Traffic:
@@ -46,7 +45,7 @@ def set_(system: Traffic, **values: float) -> Traffic:
     return system
 
 
-def numbers(system: Traffic) -> SimpleNamespace:
+def parameters_of(system: Traffic) -> SimpleNamespace:
     """The law's parameters as plain numbers."""
     law = system.terms[0]
     return SimpleNamespace(**{name: float(getattr(law, name).detach()) for name in law.scalars})
@@ -56,7 +55,7 @@ def idm(net: Any, v: Any, ahead: Any, p: Any) -> Any:
     """Accelerations by Treiber, Hennecke & Helbing 2000, equations (2) and (3).
 
     Args:
-        net: gaps from bumper to bumper, m; there is no wish below the smallest gap of 0.1 m.
+        net: gaps from bumper to bumper, m; gaps below 0.1 m count as 0.1 m.
         v, ahead: speeds of the vehicles and of those ahead, m/s.
         p: the parameters as attributes.
     """
@@ -64,21 +63,20 @@ def idm(net: Any, v: Any, ahead: Any, p: Any) -> Any:
     return p.a * (1 - (v / p.v0) ** 4 - (wish / np.maximum(net, 0.1)) ** 2)
 
 
-def behind(
+def platoon_behind(
     lead: Any, gaps: Many[float], seconds: float, length: float = 4.0, dt: float = DT
 ) -> Batch:
-    """Vehicles that all start with their leader's speed; he drives ``lead(t)`` m."""
+    """Vehicles that all start at their leader's speed; the leader's position is ``lead(t)``, m."""
     time = dt * np.arange(round(seconds / dt) + 1)
-    place, hair = lead(time), 1e-4
-    speed = (lead(time + hair) - lead(time - hair)) / (2 * hair)
-    apart = np.cumsum([0.0, *gaps])[::-1]
-    x = place[:, None] - apart
+    h = 1e-4
+    speed = (lead(time + h) - lead(time - h)) / (2 * h)
+    x = lead(time)[:, None] - np.cumsum([0.0, *gaps])[::-1]
     return collate([lane(x, dt, v=speed[:, None], length=length)])
 
 
 def states(seed: int = 3, platoons: int = 40) -> Batch:
-    """Random states of platoons of one to five vehicles: some stand, some touch, some tie."""
-    draw, found = np.random.default_rng(seed), []
+    """Random platoons of one to five vehicles; some stand, some touch, some have equal speeds."""
+    draw, sequences = np.random.default_rng(seed), []
     for number in range(platoons):
         n = 1 + number % 5
         gap = draw.uniform(0.0, 60.0, n - 1)
@@ -86,23 +84,29 @@ def states(seed: int = 3, platoons: int = 40) -> Batch:
         v = draw.uniform(0.0, 35.0, n)
         v[draw.random(n) < 0.15] = 0.0
         if number % 4 == 0:
-            v[:] = v[0]  # ties of speeds
+            v[:] = v[0]
         x = 100 + np.cumsum([0.0, *gap])
         x = x + v * np.array([[0.0], [DT]])
-        found.append(lane(x, DT, v=v, length=4.0, name=f"s{number}"))
-    return collate(found)
+        sequences.append(lane(x, DT, v=v, length=4.0, name=f"s{number}"))
+    return collate(sequences)
+
+
+def simulate(
+    system: System, batch: Batch, method: str | None = None, step: float = DT
+) -> Trajectory:
+    """A simulation without gradients, by default with the method of the law."""
+    with torch.no_grad():
+        return TorchdiffeqSolver(method, "discrete", step)(system, batch)
 
 
 def rates(system: System, batch: Batch, t: float = 0.0, y: Tensor | None = None) -> Tensor:
     """Rates of all states, ``(B, N, M)``, by default at the start."""
     y = system.initial(batch) if y is None else y
-    found: Tensor = system(torch.tensor(t, dtype=torch.float64), y, system.scene(batch))
-    return found.detach()
+    return system(torch.tensor(t, dtype=torch.float64), y, system.scene(batch)).detach()
 
 
 def accelerations(system: Traffic, batch: Batch, method: str = "euler") -> np.ndarray:
-    """``(B, N)`` rates of speeds at the start, as a step of ``DT`` takes them; NaN of others
-    than followers."""
+    """``(B, N)`` accelerations at the start in a step of ``DT``; NaN except for followers."""
     scene = replace(system.scene(batch), step=DT, method=method)
     with torch.no_grad():
         rate = system(torch.zeros((), dtype=torch.float64), system.initial(batch), scene)
@@ -110,7 +114,7 @@ def accelerations(system: Traffic, batch: Batch, method: str = "euler") -> np.nd
 
 
 def each_follower(batch: Batch) -> list[tuple[int, int, float, float, float]]:
-    """Per follower sequence, number, gap (front to front, m), speed, speed ahead (m/s)."""
+    """Per follower: sequence, number, gap (front to front, m), speed, speed ahead (m/s)."""
     x, v = batch.x[0, ..., 0].numpy(), batch.v[0, ..., 0].numpy()
     return [
         (b, i, float(x[b, i + 1] - x[b, i]), float(v[b, i]), float(v[b, i + 1]))

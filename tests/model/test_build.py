@@ -1,4 +1,4 @@
-"""Models from options: start values, precision, seeds, and errors."""
+"""Models from options: start values, precision, seeds, errors and names of parameters."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ import torch
 from scipy import stats
 
 from nnode.errors import ConfigError
-from nnode.model import Crowd, System, Traffic, build_model
+from nnode.model import Crowd, System, build_model, make_law
+from nnode.model.effects.lane import SpeedZone
 from nnode.model.options import (
     LawOptions,
     NetworkForceOptions,
     NetworkSpeedOptions,
     SocialForceOptions,
 )
+from nnode.model.term import short_names
 
 
 def options(kind: type, term: str, **changes: Any) -> dict[str, Any]:
@@ -37,36 +39,31 @@ def flat(model: System) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("term", ["lin", "log"])
-def test_laws_start_where_the_paper_starts(term: str) -> None:
+def test_start_values_of_laws(term: str) -> None:
     model = build_model(options(LawOptions, term))
-    assert isinstance(model, Traffic)
     physical = {name: (value.item(), unit) for name, (value, unit) in model.physical().items()}
     assert physical == {f"{term}.v0": (30.0, "m/s"), f"{term}.L": (5.0, "m")}
     assert model.leader == "constant"
 
 
 @pytest.mark.parametrize(("hidden", "weights"), [(2, 7), (4, 13), (10, 31)])
-def test_networks_start_at_30_metres_per_second(hidden: int, weights: int) -> None:
+def test_network_speed_parameters(hidden: int, weights: int) -> None:
     model = build_model(options(NetworkSpeedOptions, "network_speed", hidden=hidden))
     assert model.physical()["network_speed.v0"][0].item() == 30.0
     assert flat(model).numel() == 1 + weights
 
 
-def test_two_networks_of_30_weights_move_the_crowd() -> None:
+def test_network_force_has_two_networks_of_30_weights() -> None:
     model = build_model(options(NetworkForceOptions, "network_force"))
     assert isinstance(model, Crowd)
     assert flat(model).numel() == 60
 
 
-def test_people_act_on_themselves_where_the_options_say_so() -> None:
-    chosen = options(NetworkForceOptions, "network_force")
-    printed = build_model({**chosen, "self_interaction": True}).find_law("network_force")
-    # checkpoints of earlier versions have no such option
-    chosen.pop("self_interaction")
-    earlier = build_model(chosen).find_law("network_force")
-    assert printed is not None
-    assert earlier is not None
-    assert (printed.self_interaction, earlier.self_interaction) == (True, False)
+def test_self_interaction_option() -> None:
+    chosen = options(NetworkForceOptions, "network_force", self_interaction=True)
+    assert build_model(chosen).find_law("network_force").self_interaction
+    del chosen["self_interaction"]  # checkpoints of earlier versions do not have this option
+    assert not build_model(chosen).find_law("network_force").self_interaction
 
 
 def test_social_force_starts_uniform_on_0_to_50() -> None:
@@ -76,7 +73,7 @@ def test_social_force_starts_uniform_on_0_to_50() -> None:
         assert stats.kstest(sample, stats.uniform(0, 50).cdf).pvalue > 1e-3
 
 
-def test_given_start_values_leave_the_others_draws_alone() -> None:
+def test_given_start_value_does_not_change_the_others() -> None:
     free = build_model(options(SocialForceOptions, "social_force"), seed=4).physical()
     given = build_model(options(SocialForceOptions, "social_force", A=0.0044), seed=4).physical()
     assert given["social_force.A"][0].item() == 0.0044
@@ -85,7 +82,7 @@ def test_given_start_values_leave_the_others_draws_alone() -> None:
 
 
 @pytest.mark.parametrize("choice", ALL, ids=lambda o: o["term"])
-def test_a_seed_means_the_same_start_in_every_precision(choice: dict[str, Any]) -> None:
+def test_seed_gives_equal_starts_in_both_precisions(choice: dict[str, Any]) -> None:
     double = build_model(choice, seed=7)
     single = build_model(choice, seed=7, dtype=torch.float32)
     assert {p.dtype for p in double.parameters()} == {torch.float64}
@@ -94,30 +91,29 @@ def test_a_seed_means_the_same_start_in_every_precision(choice: dict[str, Any]) 
 
 
 @pytest.mark.parametrize("choice", ALL[2:], ids=lambda o: o["term"])
-def test_another_seed_means_another_start(choice: dict[str, Any]) -> None:
+def test_seeds_give_different_starts(choice: dict[str, Any]) -> None:
     assert not torch.equal(flat(build_model(choice, seed=7)), flat(build_model(choice, seed=8)))
 
 
 @pytest.mark.parametrize(("start", "length"), [(4.7, 4.7), (1.0, 2.0)])
-def test_a_built_law_keeps_the_digits_of_admissible_start_values(
-    start: float, length: float
-) -> None:
+def test_start_values_are_projected_onto_bounds(start: float, length: float) -> None:
     law = build_model(options(LawOptions, "log", L=start))
     assert law.physical()["log.L"][0].item() == length
 
 
-def test_a_built_network_is_within_its_box() -> None:
+def test_network_weights_are_within_their_box() -> None:
     boxed = build_model(options(NetworkSpeedOptions, "network_speed", box=0.1))
     assert flat(boxed)[1:].abs().max().item() == 0.1
 
 
 @pytest.mark.parametrize(
-    ("choice", "words"),
+    ("choice", "message"),
     [
         (options(NetworkSpeedOptions, "network_speed", hidden=0), "at least two layers"),
         (options(NetworkSpeedOptions, "network_speed", box=-1.0), "low <= high"),
         (options(SocialForceOptions, "social_force", tau=0.0), "tau"),
         (options(SocialForceOptions, "social_force", B=-1.0), "B=-1"),
+        (options(SocialForceOptions, "social_force", r=-0.1), r"\br=-0\.1"),
         (options(NetworkForceOptions, "network_force", mass=0.0), "mass"),
         (options(NetworkForceOptions, "network_force", wall_spacing=0.0), "wall_spacing"),
         (
@@ -131,17 +127,45 @@ def test_a_built_network_is_within_its_box() -> None:
     ],
     ids=lambda v: v if isinstance(v, str) else "",
 )
-def test_impossible_values_are_a_config_error(choice: dict[str, Any], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
+def test_invalid_values(choice: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         build_model(choice)
 
 
-def test_v0_of_a_network_with_a_measured_leader_is_idle() -> None:
-    options = {"term": "network_speed", "v0": 30.0, "hidden": 2, "box": None}
-    free = build_model({**options, "leader": "constant"})
-    idle = build_model({**options, "leader": "measured"})
-    assert list(free.physical()) == ["network_speed.v0"]
-    assert list(idle.physical()) == []
-    trained = [name for name, p in idle.named_parameters() if p.requires_grad]
+def test_v0_of_a_network_with_a_measured_leader_is_not_trained() -> None:
+    chosen = options(NetworkSpeedOptions, "network_speed", leader="constant")
+    assert list(build_model(chosen).physical()) == ["network_speed.v0"]
+    model = build_model({**chosen, "leader": "measured"})
+    assert list(model.physical()) == []
+    trained = [name for name, p in model.named_parameters() if p.requires_grad]
     assert trained
     assert not any(name.endswith("v0") for name in trained)
+
+
+# -- names of parameters -------------------------------------------------------------------------
+
+
+def with_effects(*effects: str) -> System:
+    chosen = [{"name": name, "alpha": 0.7} for name in effects]
+    return build_model(options(LawOptions, "lin", effects=chosen))
+
+
+@pytest.mark.parametrize("others", [(), ("speed_zone",)])
+def test_names_do_not_depend_on_other_terms(others: tuple[str, ...]) -> None:
+    physical = with_effects(*others, "speed_period").physical()
+    assert float(physical["speed_period.alpha"][0]) == 0.7
+    assert physical["lin.v0"][1] == "m/s"
+    assert len(physical) == 2 + 3 * (1 + len(others))
+
+
+def test_two_terms_of_one_name() -> None:
+    two = System([make_law("lin", v0=30.0), SpeedZone(alpha=0.7), SpeedZone(alpha=0.9)])
+    physical = {name: float(value) for name, (value, _) in two.physical().items()}
+    assert (physical["speed_zone.alpha"], physical["speed_zone_2.alpha"]) == (0.7, 0.9)
+
+
+def test_printed_names_of_unique_parameters_are_short() -> None:
+    names = list(with_effects("speed_zone", "speed_period").physical())
+    assert short_names(names) == {name: name for name in names} | {"lin.v0": "v0", "lin.L": "L"}
+    assert "v0=30 m/s" in repr(with_effects())
+    assert "speed_zone.alpha=0.7 1" in repr(with_effects("speed_zone", "speed_period"))

@@ -1,4 +1,4 @@
-"""What the pages say of formulas holds."""
+"""Formulas in docs/method.md."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ METHOD = (
 )
 
 
-def test_your_own_law_in_one_line() -> None:
+def test_law_in_a_file() -> None:
     (text,) = re.findall(r"```yaml\n(.*?)```", METHOD, re.S)
-    given = {k: v for k, v in yaml.safe_load(text).items() if k != "defaults"}
-    model = build_model({"term": "formula", "effects": [], **given})
+    options = {k: v for k, v in yaml.safe_load(text).items() if k != "defaults"}
+    model = build_model({"term": "formula", "effects": [], **options})
     values = {name: float(value) for name, (value, _) in model.physical().items()}
     assert values == pytest.approx({"saturation.v0": 30.0, "saturation.reach": 12.0})
     gap = torch.tensor([6.0, 12.0], dtype=torch.float64)
-    speed = model.terms[0].speed(gap).detach()  # type: ignore[union-attr, operator]
+    speed = model.terms[0].speed(gap).detach()
     torch.testing.assert_close(speed, 30 * (1 - torch.exp(-gap / 12)), rtol=1e-14, atol=0)
-    assert "saturation.reach" in source(model)  # type: ignore[arg-type]
+    assert "saturation.reach" in source(model)
 
 
 def test_laws_on_the_command_line() -> None:
@@ -43,7 +43,7 @@ def test_laws_on_the_command_line() -> None:
 
 
 @pytest.mark.parametrize("name", CAR_FOLLOWING_LAWS)
-def test_the_field_s_laws_stand_in_the_page_with_their_parameters(name: str) -> None:
+def test_laws_are_documented_with_their_parameters(name: str) -> None:
     rows = [line.split("|") for line in METHOD.splitlines() if line.startswith("| `")]
     (row,) = [row for row in rows if f"`{name}`" in row[1]]
     shown = row[3].replace("κ", "kappa").replace("λ", "lam")
@@ -52,7 +52,7 @@ def test_the_field_s_laws_stand_in_the_page_with_their_parameters(name: str) -> 
     assert f"`{name}`" in Path("README.md").read_text("utf-8")
 
 
-def test_effects_on_accelerations_stand_in_the_page() -> None:
+def test_effects_on_accelerations_are_documented() -> None:
     table = METHOD.split("what becomes of an acceleration W")[1].split("\n\n")[0]
     rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     names = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
@@ -60,5 +60,5 @@ def test_effects_on_accelerations_stand_in_the_page() -> None:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_every_function_stands_in_the_page(name: str) -> None:
+def test_functions_are_documented(name: str) -> None:
     assert name in METHOD

@@ -1,4 +1,4 @@
-"""The package's laws as their files describe them."""
+"""Laws as their files describe them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.model.following import rates
 from tests.model.test_forces import people
 
 FILES = sorted(Path(laws.__file__).parent.glob("*.yaml"))
-#: Everything that an entry may say.
+#: All keys of an entry.
 KEYS = {
     "about",
     "formula",
@@ -47,7 +47,7 @@ KEYS = {
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_a_file_is_a_law(file: Path) -> None:
+def test_law_from_its_file(file: Path) -> None:
     entry = yaml.safe_load(file.read_text("utf-8"))
     assert set(entry) <= KEYS
     assert entry["about"].endswith(".")
@@ -58,13 +58,13 @@ def test_a_file_is_a_law(file: Path) -> None:
     assert isinstance(law, InteractionForce) is ("force" in entry)
 
 
-def test_entries_are_in_the_order_of_their_ranks() -> None:
+def test_entries_are_ordered_by_rank() -> None:
     ranks = [entry["rank"] for entry in laws.entries().values()]
     assert ranks == sorted(set(ranks))
     assert {file.stem for file in FILES} == set(laws.entries())
 
 
-def test_one_file_is_enough_for_a_new_law(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_law_needs_only_an_entry(monkeypatch: pytest.MonkeyPatch) -> None:
     entry = {
         "about": "Exponential saturation.",
         "source": "none",
@@ -73,9 +73,9 @@ def test_one_file_is_enough_for_a_new_law(monkeypatch: pytest.MonkeyPatch) -> No
         "parameters": {"v0": "30 m/s", "reach": {"value": "12 m", "low": "1 m"}},
         "rate": {"x": "v0*(1 - exp(-gap/reach))"},
     }
-    known = {**laws.entries(), "saturated": entry}
-    monkeypatch.setattr(laws, "entries", lambda: known)
-    monkeypatch.setattr("nnode.model.build.entries", lambda: known)
+    entries = {**laws.entries(), "saturated": entry}
+    for module in ("laws", "build"):
+        monkeypatch.setattr(f"nnode.model.{module}.entries", lambda: entries)
     options = {"term": "saturated", "name": "new", "leader": "constant", "reach": 8.0}
     model = build_model({**options, "reach_min": 2.0})
     assert {k: float(v) for k, (v, _) in model.physical().items()} == {
@@ -83,7 +83,6 @@ def test_one_file_is_enough_for_a_new_law(monkeypatch: pytest.MonkeyPatch) -> No
         "saturated.reach": 8.0,
     }
     assert model.bounds()["terms.0.reach"].low == 2.0
-    assert isinstance(model, Traffic)
     assert model.formula is not None
 
 
@@ -95,7 +94,7 @@ def test_one_file_is_enough_for_a_new_law(monkeypatch: pytest.MonkeyPatch) -> No
         ("network_speed", {"hidden": 0}, "at least two layers"),
     ],
 )
-def test_options_that_are_none(name: str, options: dict[str, Any], error: str) -> None:
+def test_invalid_options(name: str, options: dict[str, Any], error: str) -> None:
     with pytest.raises(ValueError, match=error):
         make_law(name, **options)
 
@@ -114,7 +113,7 @@ class Tanh(FollowTheLeader):
         return self.v0 * torch.tanh(gap / 10)
 
 
-def test_effects_change_a_force_that_is_code() -> None:
+def test_effects_on_a_force_in_code() -> None:
     batch, change = collate([people(5, 1)]), []
     for kind in (InteractionForce, Halved):
         model = Crowd([make_law("relaxation"), kind(entry="social_force", A=2.0, k=3.0, kappa=1.0)])
@@ -125,16 +124,16 @@ def test_effects_change_a_force_that_is_code() -> None:
     torch.testing.assert_close(change[1], 0.5 * change[0], rtol=1e-12, atol=1e-14)
 
 
-def test_a_law_that_is_code_is_called_by_the_formula() -> None:
+def test_law_in_code_has_a_formula_of_calls() -> None:
     model = Traffic([Tanh(20.0)])
     assert model.formula is not None
     assert not model.formula.is_formula
     gap = torch.tensor([3.0, 30.0], dtype=torch.float64)
-    assert torch.equal(model.terms[0].speed(gap), 20 * torch.tanh(gap / 10))  # type: ignore[operator]
+    assert torch.equal(model.terms[0].speed(gap), 20 * torch.tanh(gap / 10))
 
 
-def test_a_formula_of_more_than_the_gap_does_not_go_with_code() -> None:
+def test_formula_of_speeds_cannot_be_mixed_with_code() -> None:
     law = make_law("idm")
     x = torch.zeros(1, 2, 1, dtype=torch.float64)
     with pytest.raises(ConfigError, match="cannot be mixed with terms that are code"):
-        law(State(torch.zeros(()), x, None, None))  # type: ignore[arg-type]
+        law(State(torch.zeros(()), x, None, None))

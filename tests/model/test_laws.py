@@ -18,7 +18,7 @@ GAPS = [2.5, 5.0, 7.3, 18.0, 60.0]
 
 
 def at_rest(*platoons: list[float]) -> Batch:
-    """Vehicles at rest at positions (m), the last of each platoon leading."""
+    """Platoons at rest at positions (m), the leader last."""
     return collate([lane([p, p], name=str(i)) for i, p in enumerate(platoons)])
 
 
@@ -33,7 +33,7 @@ def test_speeds_of_laws(name: str, expected: Callable[[float], float], gap: floa
 
 
 @pytest.mark.parametrize("gap", [0.0, -3.0, -1e6])
-def test_log_and_its_gradient_are_finite_without_a_gap(gap: float) -> None:
+def test_log_and_its_gradient_without_a_gap(gap: float) -> None:
     term = make_law("log")
     at = torch.tensor(gap, dtype=torch.float64, requires_grad=True)
     speed = term.speed(at)
@@ -43,33 +43,32 @@ def test_log_and_its_gradient_are_finite_without_a_gap(gap: float) -> None:
     assert all(g.isfinite() for g in gradients)
 
 
-def test_network_speed_is_its_network_of_the_gap() -> None:
+def test_network_speed() -> None:
     term = make_law("network_speed", hidden=2, generator=torch.Generator().manual_seed(1))
     (w1, w2), (b1, b2) = (
         [getattr(layer, name).detach().numpy() for layer in term.network.layers]
         for name in ("weight", "bias")
     )
     gap = 11.0
-    expected = b2[0] + sum(
-        w2[0, k] * math.log(1 + math.exp(w1[k, 0] * gap + b1[k])) for k in range(2)
+    expected = (w2 @ np.log(1 + np.exp(w1[:, 0] * gap + b1)) + b2).item()
+    assert term.speed(torch.tensor([gap], dtype=torch.float64)).item() == pytest.approx(
+        expected, rel=1e-8
     )
-    got = term.speed(torch.tensor([gap], dtype=torch.float64))
-    assert got.item() == pytest.approx(expected, rel=1e-8)
 
 
-def test_each_vehicle_looks_at_the_next_and_the_last_drives_at_v0() -> None:
+def test_speeds_in_padded_platoons() -> None:
     term = make_law("lin", v0=20.0, L=4.0)
     batch = at_rest([0.0, 8.0, 28.0, 30.0], [5.0, 15.0], [3.0])
-    found = term(State(torch.zeros(()), batch.x[0], None, Scene.of(batch)))[..., 0].detach()
+    speeds = term(State(torch.zeros(()), batch.x[0], None, Scene.of(batch)))[..., 0].detach()
     expected = [
         [20 * (1 - 4 / 8), 20 * (1 - 4 / 20), 20 * (1 - 4 / 2), 20.0],
         [20 * (1 - 4 / 10), 20.0, 0.0, 0.0],
         [20.0, 0.0, 0.0, 0.0],
     ]
-    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    np.testing.assert_allclose(speeds, expected, rtol=1e-14)
 
 
-def test_a_measured_leader_is_not_driven_by_the_law() -> None:
+def test_rate_of_a_measured_leader_is_zero() -> None:
     model = Traffic([make_law("lin", v0=20.0, L=4.0)], leader="measured")
     np.testing.assert_allclose(rates(model, at_rest([0.0, 8.0]))[0, :, 0], [10.0, 0.0])
 
@@ -87,7 +86,7 @@ def test_length_is_projected_onto_its_bound(law: str, start: float, length: floa
     assert (term.L.item(), term.v0.item()) == (length, -3.0)
 
 
-def test_box_bounds_the_weights_and_nothing_else() -> None:
+def test_box_bounds_only_the_weights() -> None:
     term = make_law(
         "network_speed", hidden=4, v0=30.0, box=0.25, generator=torch.Generator().manual_seed(0)
     )
@@ -99,6 +98,6 @@ def test_box_bounds_the_weights_and_nothing_else() -> None:
     assert max(p.abs().max() for n, p in term.named_parameters() if n != "v0") == 0.25
 
 
-def test_unknown_leader_is_refused() -> None:
+def test_unknown_leader() -> None:
     with pytest.raises(ValueError, match="leader=first"):
         Traffic([make_law("lin")], leader="first")

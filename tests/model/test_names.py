@@ -1,4 +1,4 @@
-"""Names in formulas: what may become a name in generated source."""
+"""Valid names in formulas and in generated source."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from nnode.model.laws import (
     CAR_FOLLOWING_LAWS,
     NEURONS,
     PEDESTRIAN_LAWS,
-    Law,
     law_from,
     make_law,
 )
 from nnode.model.names import check_names, check_symbols
+from nnode.model.system import Traffic
 from nnode.model.term import Term
 from nnode.model.terms import Rule
 from nnode.simulation.kernels.alone import WalkSource
@@ -26,8 +26,8 @@ from nnode.simulation.kernels.crowds import CrowdSource
 from nnode.simulation.kernels.lanes import LaneSource
 
 CODE = '__import__("os").abort()'
-#: An annotation, an index, a default, a second line, letters and digits that are not ASCII.
-WRONG = [
+#: Code in several forms, wrong underscores, non-ASCII letters and digits, and keywords.
+INVALID = [
     f"a: {CODE}",
     f"[{CODE}]",
     f"a={CODE}",
@@ -74,56 +74,53 @@ ENTRIES: list[tuple[dict[str, Any], str, Any]] = [
 
 
 @pytest.mark.parametrize("name", ["v0", "T", "time_gap", "a_1", "A2_b3_c", "lambda_0"])
-def test_a_name_is_letters_digits_and_single_underscores(name: str) -> None:
+def test_valid_names(name: str) -> None:
     check_names("it", [name])
 
 
-@pytest.mark.parametrize("name", WRONG)
-def test_anything_else_is_refused(name: str) -> None:
+@pytest.mark.parametrize("name", INVALID)
+def test_invalid_names(name: str) -> None:
     with pytest.raises(ConfigError, match=r"^it: .* cannot be a name; expected ASCII letters"):
         check_names("it", ["good", name])
-    with pytest.raises(ConfigError, match=r"^model\.name: "):
-        law_from(name, LAW)
-    with pytest.raises(ConfigError, match=r"^model\.name: "):
-        law_from(name, PERSON)
-    if name != "a_":  # as lambda_, in Python code
+    for law in (LAW, PERSON):
+        with pytest.raises(ConfigError, match=r"^model\.name: "):
+            law_from(name, law)
+    if name != "a_":  # parameters in Python code may end like lambda_
         with pytest.raises(ConfigError, match=r"^parameters: "):
             Term().declare(name, 1.0, unit="m")
 
 
 @pytest.mark.parametrize(("law", "kind", "entry"), ENTRIES)
-def test_no_entry_of_a_law_has_such_a_name(law: dict[str, Any], kind: str, entry: Any) -> None:
-    good = {**law, kind: {**law.get(kind, {}), "other": entry}, "remembered": 2}
-    if law is PERSON:
-        del good["remembered"]
+def test_invalid_names_in_laws(law: dict[str, Any], kind: str, entry: Any) -> None:
+    good = {**law, kind: {**law.get(kind, {}), "other": entry}}
+    if law is LAW:
+        good["remembered"] = 2
     law_from("mine", good)
-    for name in WRONG:
+    for name in INVALID:
         with pytest.raises(ConfigError, match=rf"^model\.law\.{kind}: .* cannot be a name"):
             law_from("mine", {**good, kind: {**law.get(kind, {}), name: entry}})
 
 
 @pytest.mark.parametrize("kind", ["states", "delayed", "where", "constants", "inputs"])
-def test_nor_has_a_rule(kind: str) -> None:
+def test_invalid_names_in_rules(kind: str) -> None:
     with pytest.raises(ConfigError, match=rf"^{kind}: "):
-        Rule(**{kind: {f"a: {CODE}": ("m", "v", "x")}})  # type: ignore[arg-type]
+        Rule(**{kind: {f"a: {CODE}": ("m", "v", "x")}})
     if kind not in ("states", "delayed"):
         with pytest.raises(ConfigError, match=rf"^{kind}: "):
-            Rule(("0", "0"), **{kind: {f"a: {CODE}": "m"}})  # type: ignore[arg-type]
+            Rule(("0", "0"), **{kind: {f"a: {CODE}": "m"}})
 
 
-def test_nor_has_an_effect() -> None:
-    class Wrong(CATALOGUE.effects["relative_speed"]):  # type: ignore[misc, name-defined]
+def test_invalid_names_of_effects() -> None:
+    class Misnamed(CATALOGUE.effects["relative_speed"]):
         name = f"a: {CODE}"
 
-    from nnode.model.system import Traffic
-
-    model = Traffic([make_law("lin"), Wrong(kappa=0.3)])
+    model = Traffic([make_law("lin"), Misnamed(kappa=0.3)])
     with pytest.raises(ConfigError, match=r"^terms: "):
         model.formula  # noqa: B018
 
 
-def test_all_names_of_the_package_are_such_names() -> None:
-    laws: list[Law] = [
+def test_names_in_the_catalogue_are_valid() -> None:
+    laws = [
         *(
             law_from(name, law, network=NEURONS.get(name))
             for name, law in CAR_FOLLOWING_LAWS.items()
@@ -142,18 +139,18 @@ def test_all_names_of_the_package_are_such_names() -> None:
 
 
 @pytest.mark.parametrize("name", ["x__d0", "mine__v0", "D_mine__v0__d1_1", "who_mine__a", "G_a__b"])
-def test_symbols_are_owner_and_name(name: str) -> None:
+def test_valid_symbols(name: str) -> None:
     check_symbols([name])
 
 
-@pytest.mark.parametrize("name", [*WRONG[:5], "_a", "pass", "a__ä"])
-def test_generated_source_takes_no_other_name(name: str) -> None:
+@pytest.mark.parametrize("name", [*INVALID[:5], "_a", "pass", "a__ä"])
+def test_invalid_symbols(name: str) -> None:
     with pytest.raises(ConfigError, match="no source is generated with the name"):
         check_symbols(["x", name])
 
 
-def test_each_generator_checks_the_names_itself() -> None:
-    """Also where a formula did not come by way of a law."""
+def test_generators_check_symbols() -> None:
+    """Formulas that were not made from a law are checked too."""
     law = law_from("mine", LAW)
     lane, bad = law.dynamics().flat(), symbol(f"a: {CODE}")
     lane.rates["v"] = lane.rates["v"] + bad
@@ -167,7 +164,7 @@ def test_each_generator_checks_the_names_itself() -> None:
             source(crowd).text()
 
 
-def test_numbers_too_large_for_floats_stay_operations() -> None:
+def test_constants_that_overflow_are_not_folded() -> None:
     """``inf`` would be a name in generated source."""
     law = law_from("mine", {**LAW, "rate": {"v": "(v0 - v)/T*min(1e308*10, 1)"}})
     assert "inf" not in LaneSource(law.dynamics().flat()).text()

@@ -1,4 +1,4 @@
-"""A law of people of one's own, written as a formula."""
+"""A user's law of people, written as a formula."""
 
 from __future__ import annotations
 
@@ -26,23 +26,17 @@ LAW: dict[str, Any] = {
 }
 
 
-def own(**changes: Any) -> Crowd:
+def formula(**changes: Any) -> Crowd:
     options = {"term": "formula", "name": "mine", "leader": "measured", "effects": []}
-    model = build_model({**options, "law": {**LAW, **changes}})
-    assert isinstance(model, Crowd)
-    return model
+    return build_model({**options, "law": {**LAW, **changes}})
 
 
-def same() -> Crowd:
-    """The same of terms of the package."""
-    more = CATALOGUE.effects["pair_repulsion"](A_2=2.0, B_2=0.4)
-    return Crowd([make_law("relaxation", tau=0.7), more])
-
-
-def test_it_computes_what_it_says() -> None:
-    batch, model = collate([people(5, 1), people(3, 2)]), own()
-    found, wanted = (rates(m, batch)[batch.agent] for m in (model, same()))
-    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
+def test_formula_equals_built_in_terms() -> None:
+    batch, model = collate([people(5, 1), people(3, 2)]), formula()
+    repulsion = CATALOGUE.effects["pair_repulsion"](A_2=2.0, B_2=0.4)
+    built_in = Crowd([make_law("relaxation", tau=0.7), repulsion])
+    rate, expected = (rates(m, batch)[batch.agent] for m in (model, built_in))
+    torch.testing.assert_close(rate, expected, rtol=1e-12, atol=1e-12)
     physical = {name: (float(value), unit) for name, (value, unit) in model.physical().items()}
     assert physical == {
         "mine.A": (2.0, "m/s²"),
@@ -50,7 +44,7 @@ def test_it_computes_what_it_says() -> None:
         "mine.tau": (0.7, "s"),
     }
     with torch.no_grad():
-        model.terms[0].A.fill_(-1.0)  # type: ignore[union-attr, operator]
+        model.terms[0].A.fill_(-1.0)
     model.project_()
     assert float(model.physical()["mine.A"][0]) == 0.0
 
@@ -68,17 +62,16 @@ def test_it_computes_what_it_says() -> None:
         ({"crowds": {}}, "unknown entries crowds; there are .*others, points, walls"),
     ],
 )
-def test_what_is_wrong_is_told(changes: dict[str, Any], message: str) -> None:
+def test_invalid_laws(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        own(**changes)
+        formula(**changes)
 
 
-def test_without_interaction_it_is_its_drive() -> None:
-    batch, model = collate([people(5, 1), people(3, 2)]), own()
-    bare = Crowd([model.terms[0].alone()])  # type: ignore[union-attr, operator]
-    drive = Crowd([make_law("relaxation", tau=0.7)])
-    found, wanted = (rates(m, batch)[batch.agent] for m in (bare, drive))
-    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
+def test_law_without_interaction() -> None:
+    batch, bare = collate([people(5, 1), people(3, 2)]), Crowd([formula().terms[0].alone()])
+    relaxation = Crowd([make_law("relaxation", tau=0.7)])
+    rate, expected = (rates(m, batch)[batch.agent] for m in (bare, relaxation))
+    torch.testing.assert_close(rate, expected, rtol=1e-12, atol=1e-12)
     with torch.no_grad():
-        found, wanted = (FusedSolver(0.02)(m, batch).x[batch.valid] for m in (bare, drive))
-    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
+        x, expected = (FusedSolver(0.02)(m, batch).x[batch.valid] for m in (bare, relaxation))
+    torch.testing.assert_close(x, expected, rtol=1e-12, atol=1e-12)

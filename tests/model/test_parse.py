@@ -1,4 +1,4 @@
-"""Formulas from text: what is read, and what is refused with its place."""
+"""Reading, simplifying and printing formulas; errors and their positions."""
 
 from __future__ import annotations
 
@@ -50,21 +50,21 @@ IDM = "a*(1 - (v/v0)**4 - ((s0 + max(0, v*T + v*dv/(2*sqrt(a*b))))/gap)**2)"
         ("(" * 300 + "a" + ")" * 300, "cannot be read|nested", 0),
     ],
 )
-def test_what_is_no_formula_is_refused(text: str, problem: str, column: int) -> None:
-    with pytest.raises(FormulaError, match=problem) as found:
+def test_invalid_formulas(text: str, problem: str, column: int) -> None:
+    with pytest.raises(FormulaError, match=problem) as error:
         parse(text)
-    mark = str(found.value).splitlines()[-1]
+    mark = str(error.value).splitlines()[-1]
     assert mark.strip() == "^"
     if column and column < 50:
         assert mark.index("^") == column + 2
 
 
-def test_an_unknown_name_is_told_with_the_known_ones() -> None:
+def test_unknown_name() -> None:
     with pytest.raises(FormulaError, match=r"gpa is unknown; there are gap, v0\n  v0\*gpa\n {5}\^"):
         parse("v0*gpa", {"v0": symbol("v0"), "gap": symbol("gap")})
 
 
-def test_equal_parts_are_one_node() -> None:
+def test_equal_subexpressions_share_one_node() -> None:
     assert parse("exp(a + b)*exp(a + b)").args[0] is parse("exp(a + b)")
     assert len(topological([parse("(a + b)*(a + b)")])) == 4
 
@@ -87,11 +87,11 @@ def test_equal_parts_are_one_node() -> None:
         ("a - a", "0"),
     ],
 )
-def test_what_needs_no_computing_is_not_computed(text: str, same: str) -> None:
+def test_simplification(text: str, same: str) -> None:
     assert parse(text) is parse(same)
 
 
-def test_a_law_inside_an_effect() -> None:
+def test_law_in_an_effect() -> None:
     names = {name: symbol(name) for name in ("gap", "beta", "W", "v0")}
     law = parse("v0*gap", names)
     assert parse("W + law(gap=gap - beta) - law()", names, {"law": law}) is parse(
@@ -118,21 +118,17 @@ formulas = st.recursive(
 )
 
 
-def _value(node: Expr, values: dict[str, float]) -> float:
-    tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
-    return float(Formulas([node])(tensors)[0])
-
-
 @given(formulas)
 @settings(max_examples=200, deadline=None)
-def test_what_is_written_is_read_again(text: str) -> None:
+def test_printed_formula_has_the_same_value(text: str) -> None:
     try:
         node = parse(text)
     except FormulaError:
-        return  # divides by a zero that it computes
-    again = parse(plain(node))  # signs may be put together that stood apart
-    values = {"a": 0.7, "b": 1.3, "gap": 2.9}
-    assert _value(again, values) == pytest.approx(_value(node, values), rel=1e-12, nan_ok=True)
+        return  # a division by zero
+    inputs = {"a": 0.7, "b": 1.3, "gap": 2.9}
+    tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in inputs.items()}
+    printed, original = map(float, Formulas([parse(plain(node)), node])(tensors))
+    assert printed == pytest.approx(original, rel=1e-12, nan_ok=True)
     assert latex(node).count("{") == latex(node).count("}")
 
 
@@ -140,20 +136,19 @@ def test_what_is_written_is_read_again(text: str) -> None:
     "text",
     ["v0*(1 - L/gap)", "a + (b - a)", "a - (b + c)", "a*(1 - (v/v0)**4 - (w/s)**2)", "-a*b/(c*d)"],
 )
-def test_what_is_written_is_what_was_read(text: str) -> None:
-    assert plain(parse(plain(parse(text)))) == plain(parse(text))
+def test_printed_formula_is_the_same_node(text: str) -> None:
     assert parse(plain(parse(text))) is parse(text)
 
 
 @pytest.mark.thorough
 @given(st.text(max_size=40))
 @settings(max_examples=300, deadline=None)
-def test_any_text_is_a_formula_or_an_error(text: str) -> None:
+def test_any_text(text: str) -> None:
     with contextlib.suppress(FormulaError):
         assert isinstance(parse(text), Expr)
 
 
-def test_numbers_are_kept_to_the_last_digit() -> None:
+def test_printed_numbers_have_all_digits() -> None:
     value = 0.1 + 0.2
     assert parse(plain(const(value))).value == value
     assert "frac" in latex(parse(IDM))

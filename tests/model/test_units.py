@@ -1,4 +1,4 @@
-"""Units of formulas: what goes together, and what is told of what does not."""
+"""Units of formulas and of quantities."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ UNITS = {
         ("sqrt(gap)*sqrt(s0)", "m"),
     ],
 )
-def test_what_goes_together(text: str, unit: str) -> None:
+def test_consistent_units(text: str, unit: str) -> None:
     check("it", parse(text), UNITS, unit)
 
 
@@ -55,7 +55,7 @@ def test_what_goes_together(text: str, unit: str) -> None:
         ("choose(n, v, gap)", r"puts together v"),
     ],
 )
-def test_what_does_not(text: str, problem: str) -> None:
+def test_inconsistent_units(text: str, problem: str) -> None:
     with pytest.raises(ConfigError, match=problem):
         check("it", parse(text), UNITS, "m/s")
 
@@ -91,7 +91,7 @@ def test_quantities() -> None:
         ("1E-3 m", 1e-3, "m"),
     ],
 )
-def test_ways_to_write_a_quantity(text: str, value: float, unit: str) -> None:
+def test_notations_of_quantities(text: str, value: float, unit: str) -> None:
     assert in_si(text) == (pytest.approx(value), unit)
 
 
@@ -125,8 +125,8 @@ def test_ways_to_write_a_quantity(text: str, value: float, unit: str) -> None:
         "m" + "*m" * 10**6,
     ],
 )
-def test_powers_and_sizes_that_never_end_are_not_computed(text: str) -> None:
-    """Pint evaluates what it is given: most of these would take hours, or all memory."""
+def test_huge_powers_are_not_computed(text: str) -> None:
+    """Pint would need hours or all memory for most of these texts."""
     start = time.monotonic()
     with pytest.raises(ConfigError, match="is no quantity; expected a finite number") as error:
         in_si(text)

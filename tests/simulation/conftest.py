@@ -1,11 +1,26 @@
-"""Batches that the solvers' tests share."""
+"""Fixtures of the tests of solvers."""
 
 from __future__ import annotations
 
 import pytest
 
 from nnode.data.sequence import Sequence
+from nnode.simulation import fused
+from nnode.simulation.kernels import lanes
+from tests.simulation.kernels.interpreted import interpreted
 from tests.simulation.scenes import platoon
+
+
+@pytest.fixture
+def without_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Generated code of lanes is interpreted."""
+    monkeypatch.setattr(lanes, "compiled", interpreted)
+
+
+@pytest.fixture
+def without_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fused solver cannot use PyTorch in place of compiled code."""
+    monkeypatch.delattr(fused, "TorchdiffeqSolver")
 
 
 @pytest.fixture(scope="session")
@@ -21,7 +36,7 @@ def ragged() -> list[Sequence]:
 
 @pytest.fixture(scope="session")
 def equal() -> list[Sequence]:
-    """Forty platoons of four vehicles: more than one block, and blocks that are not full."""
+    """Forty platoons of four vehicles, which fill more than one block of compiled code."""
     return [
         platoon([10.0 + 0.3 * i, 20.0 - 0.2 * i, 15.0], samples=4, name=f"e{i}") for i in range(40)
     ]

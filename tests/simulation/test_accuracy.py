@@ -1,7 +1,6 @@
-"""Trajectories against an analytic solution, in single precision, and models that blow up.
+"""Trajectories against an analytic solution, in single precision, and of divergent models.
 
-A follower of the law Lin behind a leader at v0 has dg/dt = v0 - v0 (1 - L / g) = v0 L / g, so its
-gap is g(t) = sqrt(g(0)² + 2 v0 L t).
+The gap of a follower with the law Lin behind a leader at v0 is g(t) = sqrt(g(0)² + 2 v0 L t).
 """
 
 from __future__ import annotations
@@ -48,12 +47,11 @@ def test_multistep_methods_step_inside_the_sampling_interval(method: str) -> Non
     coarse = abs(simulated_gap(method, 0.04) - ANALYTIC).max()
     fine = abs(simulated_gap(method, 0.01) - ANALYTIC).max()
     assert coarse > 0
-    # order four at least
     assert fine < coarse / 4**3.5
 
 
 @pytest.mark.parametrize("method", ["dopri5", "scipy_solver"])
-def test_adaptive_methods_meet_their_tolerance(method: str) -> None:
+def test_tolerance_of_adaptive_methods(method: str) -> None:
     error = {}
     for tolerance in (1e-5, 1e-10):
         gap = simulated_gap(method, 0.2, rtol=tolerance, atol=tolerance)
@@ -74,45 +72,46 @@ def test_adaptive_methods_meet_their_tolerance(method: str) -> None:
     ],
     ids=["lane", "crowd"],
 )
-def test_single_precision_stays_close(model: System, item: Sequence) -> None:
-    # rounding of one step, 6e-8 of the position, over at most 240 steps
+def test_single_precision(model: System, item: Sequence) -> None:
+    # a rounding error of 6e-8 of the position in each of at most 240 steps
     close = {"limit": 1e-3, "rtol": 6e-8 * 240, "atol": 1e-5}
     solver = TorchdiffeqSolver("euler", "discrete", 0.01)
     compare(model, collate([item]), 0.01, solver, single_precision=True, **close)
 
 
-def test_the_gradient_does_not_change_the_trajectory() -> None:
+def test_trajectory_does_not_depend_on_the_gradient() -> None:
     model, batch = Traffic([make_law("lin", v0=25.0, L=4.5)]), collate([platoon([12.0, 30.0])])
-    adjoint = TorchdiffeqSolver(gradient="adjoint", dt=0.02)(model, batch).x
-    discrete = TorchdiffeqSolver(gradient="discrete", dt=0.02)(model, batch).x
+    adjoint, discrete = (
+        TorchdiffeqSolver(gradient=gradient, dt=0.02)(model, batch).x
+        for gradient in ("adjoint", "discrete")
+    )
     assert torch.equal(adjoint, discrete)
 
 
-def runaway() -> Traffic:
-    """Speed 1e40 m/s per metre of gap: single precision lasts only a few steps."""
+def divergent() -> Traffic:
+    """A speed of 1e12 m/s per metre of gap, which overflows in float32 after a few steps."""
     term = make_law("network_speed", hidden=1, v0=0.0)
     with torch.no_grad():
         for weight, value in zip(term.network.parameters(), (1.0, 0.0, -1e12, 0.0), strict=True):
             weight.fill_(value)
-    return Traffic([term])
+    return Traffic([term]).to(torch.float32)
 
 
-def test_a_blow_up_is_dated() -> None:
-    model = runaway().to(torch.float32)
+def test_time_of_an_overflow() -> None:
     batch = collate([platoon([30.0], samples=9, noise=0.0)]).to(dtype=torch.float32)
     # each Euler step of 0.2 s multiplies the gap by 0.2e12: 30 * (2e11)^k overflows at k = 4
     with pytest.raises(SimulationError, match=r"agent 0 at 0\.8 s"):
-        TorchdiffeqSolver(dt=0.2)(model, batch)
+        TorchdiffeqSolver(dt=0.2)(divergent(), batch)
 
 
-def test_a_sequence_stands_still_after_its_end() -> None:
-    model = runaway().to(torch.float32)
+def test_states_after_the_end_of_a_sequence_are_constant() -> None:
+    model = divergent()
     short, long = platoon([30.0], samples=3, noise=0.0), platoon([], samples=9)
     batch = collate([short, long]).to(dtype=torch.float32)
     trajectory = TorchdiffeqSolver(gradient="discrete", dt=0.2)(model, batch)
     x = trajectory.x.detach()
     assert x.isfinite().all()
     assert torch.equal(x[4:, 0], x[-1:, 0].expand_as(x[4:, 0]))
-    # what overflows behind the end would turn into NaN here, masked or not
+    # an overflow after the end would give NaN here, although it is masked
     (trajectory.x[..., 0] * batch.valid).sum().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())

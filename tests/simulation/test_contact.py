@@ -1,6 +1,6 @@
-"""The linear response of people in contact, where the derivative of the social force jumps.
+"""The linear response of people in contact, against finite differences of SciPy's solutions.
 
-The force of the equation and the differences are written out here; SciPy integrates the equation.
+The derivative of the social force jumps at a contact.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from nnode.data.sequence import Sequence, collate
 from nnode.model import Crowd, make_law
 from nnode.simulation.alone import PersonAlone, RunAlone, Surroundings
 
-#: Of the force, in the units of its law: A, k, kappa.
+#: A, k, kappa.
 STRENGTHS = np.array([2.0, 30.0, 20.0])
 B, R, TAU = 0.1, 0.25, 0.5
 GOAL = np.array([20.0, 0.0])
-#: Of the one who walks, and of two whom he meets, the first one in contact: m, m/s.
+#: State of a person, and positions of two others, of whom the first comes into contact: m, m/s.
 START, OTHERS = np.array([0.0, 0.0, 1.3, 0.0]), np.array([[2.6, 0.32], [4.0, -0.6]])
 PACE, SECONDS = np.array([-1.2, 0.0]), 2.0
 
 
 def acceleration(t: float, y: np.ndarray, strengths: np.ndarray) -> np.ndarray:
-    """Of him, m/s²: relaxation, repulsion, contact and sliding of N = 3 people."""
+    """Acceleration of the person, m/s²: relaxation and the social force of N = 3 people."""
     big, k, kappa = strengths
     x, v = y[:2], y[2:]
     ahead = (GOAL - x) / np.linalg.norm(GOAL - x)
@@ -42,7 +42,7 @@ def integrated(change: np.ndarray, steps: int, contact: float) -> np.ndarray:
     """``(steps + 1, 2)`` positions.
 
     Args:
-        change: of x, y, vx and vy at the start, of A, k and kappa, and of the size of a push.
+        change: of x, y, vx and vy at the start, of A, k and kappa, and size of a push.
         contact: factor of k and kappa.
     """
     strengths = STRENGTHS * [1.0, contact, contact] + change[4:7]
@@ -60,23 +60,17 @@ def pushed(t: float) -> np.ndarray:
 
 
 def run(steps: int, contact: float) -> RunAlone:
-    """The model's own simulation of him among the paths of the others."""
+    """The package's simulation of the person among the paths of the others."""
     time = np.linspace(0.0, SECONDS, 2 * steps + 1)
     place = OTHERS + PACE * time[:, None, None]
-    mine = START[:2] + START[2:] * time[:, None]
-    x = np.concatenate([mine[:, None], place], 1)
+    straight = START[:2] + START[2:] * time[:, None]
+    x = np.concatenate([straight[:, None], place], 1)
     v = np.broadcast_to(np.stack([START[2:], PACE, PACE]), x.shape)
     goals = np.stack([GOAL, -GOAL, -GOAL])
     batch = collate([Sequence(name="s", recording="r", time=time, x=x, v=v, destination=goals)])
-    big, k, kappa = STRENGTHS
-    system = Crowd(
-        [
-            make_law("relaxation", tau=TAU),
-            make_law(
-                "social_force", A=big, k=k * contact, kappa=kappa * contact, B=B, r=R, walls=False
-            ),
-        ]
-    ).double()
+    big, k, kappa = STRENGTHS * [1.0, contact, contact]
+    force = make_law("social_force", A=big, k=k, kappa=kappa, B=B, r=R, walls=False)
+    system = Crowd([make_law("relaxation", tau=TAU), force]).double()
     window = torch.zeros(1, dtype=torch.long)
     around = Surroundings(system.scene(batch), batch.x, batch.v, window, window, SECONDS / steps)
     values = {name: p.detach()[None] for name, p in system.named_parameters()}
@@ -86,26 +80,25 @@ def run(steps: int, contact: float) -> RunAlone:
 
 
 def errors(steps: int, contact: float) -> np.ndarray:
-    """Of the responses to each change, the largest by the size of the response."""
+    """The largest relative error of the response to each change."""
     linear = run(steps, contact)
     by_start, by_push = (part[0].numpy() for part in linear.unit_responses())
     columns = [linear.of_people(field)[0].numpy() for field in linear.parameters([1e-4] * 3)]
     columns.append(np.concatenate([pushed(t) for t in np.linspace(0.0, SECONDS, steps + 1)]))
     responses = [*np.moveaxis(by_start, -1, 0), *(by_push @ column for column in columns)]
-    small = 1e-5
-    away = []
+    h, relative = 1e-5, []
     for unit, response in zip(np.eye(8), responses, strict=True):
-        after, before = (integrated(s * small * unit, steps, contact) for s in (1, -1))
-        wanted = (after - before) / (2 * small)
-        away.append(np.abs(response - wanted).max() / np.abs(wanted).max())
-    return np.array(away)
+        upper, lower = (integrated(sign * h * unit, steps, contact) for sign in (1, -1))
+        expected = (upper - lower) / (2 * h)
+        relative.append(np.abs(response - expected).max() / np.abs(expected).max())
+    return np.array(relative)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("contact", "order", "most"), [(0.0, 2, 0.01), (1.0, 1, 0.1)])
-def test_responses_are_differences_of_simulations(contact: float, order: int, most: float) -> None:
-    """Where the force has no corner, the error has the order of the interpolation of its derivative
-    between the steps. At a contact this derivative jumps within a step."""
+def test_responses(contact: float, order: int, most: float) -> None:
+    """The order is that of the interpolation of the force's derivative between the steps. At a
+    contact the derivative jumps within a step."""
     coarse, fine = errors(25, contact), errors(100, contact)
     assert fine.max() < most
     assert fine.max() < 2 * coarse.max() / 4**order

@@ -1,8 +1,6 @@
 """Laws, effects, methods and engines: states and gradients against float64 autograd.
 
-Of lanes most cases run the generated source in Python's interpreter, which takes less time than
-to compile it. The compiled ones are a selection here, and all of them are among the thorough tests.
-Crowds are always compiled.
+Most cases of lanes interpret the generated source, which takes less time than its compilation.
 """
 
 from __future__ import annotations
@@ -26,13 +24,13 @@ from nnode.simulation import FusedSolver, TorchdiffeqSolver, Trajectory
 from nnode.simulation.kernels import lanes
 from tests.builders import lane, straight
 from tests.model.effects.test_crowd_effects import VALUES
-from tests.model.following import model
+from tests.model.following import model, set_
+from tests.model.test_own_force import LAW
 from tests.simulation.fused.compare import RungeKutta
-from tests.simulation.kernels.interpreted import interpreted
 
 LEADERS = ("constant", "measured")
 SUBSTEPS = 2
-#: Laws of the paper; networks start at random weights.
+#: Laws of the paper; networks have random weights.
 PAPER: dict[str, dict[str, Any]] = {
     "lin": {"term": "lin", "v0": 21.0, "L": 4.0, "L_min": 2.0},
     "log": {"term": "log", "v0": 21.0, "L": 4.0, "L_min": 2.0},
@@ -40,9 +38,8 @@ PAPER: dict[str, dict[str, Any]] = {
         f"n{n}": {"term": "network_speed", "v0": 21.0, "hidden": n, "box": None} for n in (2, 4, 10)
     },
 }
-#: What a user's law may have: a state, a delay, a network, the time, the second vehicle ahead.
+#: Users' laws with a state, a delay, a network, or the second vehicle ahead.
 OWN: dict[str, dict[str, Any]] = {
-    "speed": {"parameters": {"v0": "21 m/s", "L": "4 m"}, "rate": {"x": "v0*(1 - L/gap)"}},
     "speed_ahead": {
         "parameters": {"v0": "21 m/s", "L": "4 m", "c": "0.3"},
         "rate": {"x": "(1 - c)*v0*(1 - L/gap) + c*dx_1"},
@@ -72,9 +69,9 @@ OWN: dict[str, dict[str, Any]] = {
         "parameters": {"c": "0.1 1/s²", "k": "0.4 1/s"},
         "rate": {"v": "c*(gap_1 - gap) + k*(v_2 - v)"},
     },
-    "beside": {**CAR_FOLLOWING_LAWS["idm"], "network": 2},
+    "hybrid": {**CAR_FOLLOWING_LAWS["idm"], "network": 2},
 }
-#: One value that is not neutral of every effect.
+#: Values of effects that are not neutral; the others' defaults are not neutral.
 EFFECTS: dict[str, dict[str, Any]] = {
     "speed_zone": {"alpha": 0.7, "a": 10.0, "b": 40.0},
     "speed_period": {"alpha": 0.7, "a": 0.1, "b": 2.0},
@@ -83,11 +80,11 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "slope": {"grade": 0.04, "a": 10.0, "b": 45.0},
     "pure_delay": {"T": 0.13},
 }
-#: Laws that are compiled in the thorough tests: one of each kind.
-COMPILED = ("lin", "speed_ahead", "state", "beside", "ovm", "fvdm", "helly", "gipps", "a2")
+#: Laws that the thorough tests compile.
+COMPILED = ("lin", "speed_ahead", "state", "hybrid", "ovm", "fvdm", "helly", "gipps", "a2")
 
 SOCIAL = {"term": "social_force", "A": 2.0, "k": 30.0, "kappa": 9.0, "B": 0.1}
-#: Forces of the paper, as options of the model.
+#: Options of the paper's forces.
 FORCES: dict[str, dict[str, Any]] = {
     "sf": SOCIAL,
     "sf_opposing": {**SOCIAL, "r": 0.3, "mass": 2.0, "tau": 0.7, "opposing_wall_friction": True},
@@ -96,17 +93,9 @@ FORCES: dict[str, dict[str, Any]] = {
     "nn_open": {"term": "network_force", "hidden": 3, "mass": 2.0, "walls": False},
     "nn_self": {"term": "network_force", "self_interaction": True},
 }
-#: What a user's law of people may have: sums, smallest and largest values that name each other.
+#: Users' laws of people with sums, and with smallest and largest values that name each other.
 OWN_FORCES: dict[str, dict[str, Any]] = {
-    "sums": {
-        "parameters": {"A": "2 m/s²", "B": "40 cm", "tau": "0.7 s"},
-        "where": {"push": "A*exp((2*r - d)/B)"},
-        "others": {"push_x": "push*n_x", "push_y": "push*n_y"},
-        "rate": {
-            "vx": "(speed*way_x - vx)/tau + push_x",
-            "vy": "(speed*way_y - vy)/tau + push_y",
-        },
-    },
+    "sums": LAW,
     "smallest": {
         "parameters": {"A": "0.6 1/s", "B": "0.5 m", "C": "0.3 1/s²", "tau": "0.7 s"},
         "where": {
@@ -128,15 +117,14 @@ CROWD_EFFECTS: dict[str, dict[str, Any]] = {
     **VALUES,
     "walker_heterogeneity": {"people": {"6": [0.1, -0.2, 0.0, 0.3, 0.1, -0.1], "2": [0.2, 0.1]}},
 }
-#: Laws of people that are compiled every time; the others take seconds each and are thorough.
+#: Laws of people in the fast tests.
 OFTEN = ("sf", "nn", "nn_self", "sums")
 #: Two sides of a room, and a wall in it; x1, y1, x2, y2 in m.
 WALLS = np.array([[0.0, 0.0, 4.0, 0.0], [4.0, 2.5, 0.0, 2.5], [1.0, 0.5, 2.5, 2.0]])
 
 
 def platoons(numbers: tuple[int, ...] = (4, 2, 3)) -> Batch:
-    """Platoons of different numbers of vehicles and of samples, in a wave; of cars and
-    trucks."""
+    """Oscillating platoons of cars and trucks, with different numbers of vehicles and samples."""
     items = []
     for i, n in enumerate(numbers):
         late = 0.1 * np.arange(6 - i)[:, None] - 0.3 * np.arange(n)[::-1]
@@ -152,18 +140,16 @@ def platoons(numbers: tuple[int, ...] = (4, 2, 3)) -> Batch:
 
 def lane_of(law: str, leader: str, *effects: str) -> Traffic:
     chosen = [{"name": e, **EFFECTS.get(e, {})} for e in effects]
-    if law in CAR_FOLLOWING_LAWS:
-        own_law = {**CAR_FOLLOWING_LAWS[law], "remembered": 4} if law == "newell" else law
-        system = model(own_law, *chosen, leader=leader)
-    elif law in OWN:
-        given = dict(OWN[law])
-        network = {"network": given.pop("network")} if "network" in given else {}
-        system = model(given, *chosen, leader=leader, **network)
+    if law in PAPER:
+        system = build_model({"name": law, "leader": leader, "effects": chosen, **PAPER[law]})
+    elif law == "newell":
+        short = {**CAR_FOLLOWING_LAWS[law], "remembered": 4}
+        system = model(short, *chosen, leader=leader)
     else:
-        built = build_model({"name": law, "leader": leader, "effects": chosen, **PAPER[law]})
-        assert isinstance(built, Traffic)
-        system = built
-    with torch.no_grad():  # nothing stays at a kink, or at the neutral value of a network
+        entry = dict(OWN.get(law, {}))
+        network = {"network": entry.pop("network")} if "network" in entry else {}
+        system = model(entry or law, *chosen, leader=leader, **network)
+    with torch.no_grad():  # away from kinks and from neutral networks
         for i, p in enumerate(system.parameters()):
             if p.ndim:
                 p.add_(0.05 * torch.cos(torch.arange(p.numel()) + i).reshape(p.shape))
@@ -178,19 +164,19 @@ def weights(batch: Batch, states: int) -> Tensor:
 
 
 def states_of(path: Trajectory) -> Tensor:
-    """``(K, B, N, M)`` positions, and speeds of laws of second order."""
+    """``(K, B, N, M)`` positions, and for laws of second order speeds."""
     return path.x if path.v is None else torch.cat([path.x, path.v], -1)
 
 
 def exact(system: System, batch: Batch, method: str) -> Tensor:
-    """States at the samples by automatic differentiation of PyTorch."""
+    """States at the samples by PyTorch."""
     dt = batch.dt / SUBSTEPS
     solver = RungeKutta(SUBSTEPS) if method == "rk4" else TorchdiffeqSolver(method, "discrete", dt)
     return states_of(solver(system, batch))
 
 
 def compiled(system: System, batch: Batch, method: str, threads: int = 1) -> Tensor:
-    """The same by the generated code."""
+    """States by generated code."""
     if isinstance(system, Traffic):
         return by_lanes(system, batch, method)
     solver = FusedSolver(batch.dt / SUBSTEPS, threads, method=method)
@@ -200,20 +186,18 @@ def compiled(system: System, batch: Batch, method: str, threads: int = 1) -> Ten
 
 
 def threaded(system: System, batch: Batch, method: str) -> Tensor:
-    """The same by two threads."""
+    """States by generated code in two threads."""
     return compiled(system, batch, method, 2)
 
 
 def by_lanes(system: Traffic, batch: Batch, method: str, **options: Any) -> Tensor:
-    """The first run. The solver itself refuses gradients by a leader's measured path."""
-    assert system.formula is not None
+    """States of the first run. The solver refuses gradients by a leader's measured path."""
     y = lanes.simulate(system, system.formula, batch, SUBSTEPS, method=method, **options)[:, 0]
     return states_of(Trajectory(*system.observe(y, batch)))
 
 
 def ensemble(system: Traffic, batch: Batch, method: str) -> Tensor:
-    """The same with two runs at once, whose parameters are rows of numbers; nothing is returned of
-    the second run, which has other parameters."""
+    """States of the first of two simultaneous runs with different parameters."""
     pairs = {name: torch.stack([p, 1.01 * p]) for name, p in system.named_parameters()}
     return by_lanes(system, batch, method, parameters=pairs)
 
@@ -239,24 +223,23 @@ def with_slopes(
 
 
 def by_tangents(system: Traffic, batch: Batch, method: str) -> tuple[Tensor, dict[str, Tensor]]:
-    """The same by the derivatives of all states, of the parameters alone."""
+    """The same by derivatives of all states by parameters."""
     lane = system.formula
-    assert lane is not None
-    own = {name: torch.zeros_like(p) for name, p in system.named_parameters() if p.requires_grad}
-    owned = {symbol: at for symbol, at in lane.owned.items() if at[0] in own}
+    total = {name: torch.zeros_like(p) for name, p in system.named_parameters() if p.requires_grad}
+    owned = {symbol: at for symbol, at in lane.owned.items() if at[0] in total}
     y, slopes = lanes.tangents(system, lane, batch, SUBSTEPS, list(owned), method=method)
     weight = weights(batch, system.order)
     if system.leader == "measured":
         weight = torch.where(system.scene(batch).follower[..., None], weight, 0.0)
     for slope, (name, place, _) in zip(slopes, owned.values(), strict=True):
-        own[name].view(-1)[place] = (weight * slope[..., : system.order]).sum()
-    return states_of(Trajectory(*system.observe(y, batch))), own
+        total[name].view(-1)[place] = (weight * slope[..., : system.order]).sum()
+    return states_of(Trajectory(*system.observe(y, batch))), total
 
 
 def check(system: System, batch: Batch, method: str, *engines: Any) -> None:
-    """Compare states, and every part of the gradient by itself."""
-    states, wanted = with_slopes(exact, system, batch, method)
-    assert wanted["x"].abs().max() > 0
+    """Compare states, and each part of the gradient."""
+    states, expected = with_slopes(exact, system, batch, method)
+    assert expected["x"].abs().max() > 0
     for engine in engines:
         simulated, slopes = (
             engine(system, batch, method)
@@ -267,71 +250,56 @@ def check(system: System, batch: Batch, method: str, *engines: Any) -> None:
             simulated[batch.valid], states[batch.valid], rtol=1e-12, atol=1e-11
         )
         for name, slope in slopes.items():
-            size = float(wanted[name].abs().max())
-            away = float((slope - wanted[name]).abs().max())
-            # of cancelling sums rounding remains, in units of the largest part of the gradient
-            assert away <= 1e-9 * size + 1e-12, (engine.__name__, name, slope, wanted[name])
+            # sums cancel: the rounding error scales with the largest part of the gradient
+            limit = 1e-9 * float(expected[name].abs().max()) + 1e-12
+            error = float((slope - expected[name]).abs().max())
+            assert error <= limit, (engine.__name__, name, slope, expected[name])
+
+
+def methods(law: str, *effects: str) -> list[str]:
+    """All methods, except that discrete laws have no stages."""
+    discrete = "dt" in lane_of(law, "measured", *effects).formula.symbols
+    return [method for method in METHODS if not (method == "rk4" and discrete)]
 
 
 def cases(laws: Iterable[str]) -> list[Any]:
-    """Laws with the methods that they have: a map has no stages in between. Large networks are
-    formulas like small ones."""
+    """Laws with methods; large networks are slow, and have formulas like small networks."""
     rows = []
     for law in laws:
-        for method in METHODS:
+        for method in methods(law):
             large = law in ("n4", "n10", "a4", "a10") and method != "rk4"
-            if not (method == "rk4" and _is_map(law)):
-                marks = [pytest.mark.thorough] if large else []
-                rows.append(pytest.param(law, method, marks=marks))
+            marks = [pytest.mark.thorough] if large else []
+            rows.append(pytest.param(law, method, marks=marks))
     return rows
 
 
-#: Effects that act on each other, and several memories.
-TOGETHER = (
-    ("lin", "reaction_delay+relative_speed+speed_zone"),
-    ("lin", "reaction_delay+inertia"),
-    ("idm", "memory+relative_speed"),
-)
-
-
-def _is_map(law: str, *effects: str) -> bool:
-    lane = lane_of(law, "measured", *effects).formula
-    assert lane is not None
-    return "dt" in lane.symbols
-
-
 def with_effects() -> list[Any]:
-    """One effect of each kind on a law of each order."""
-    rows = []
+    """Each effect on a law of each order, and effects that depend on each other."""
+    rows = [
+        ("lin", "reaction_delay+relative_speed+speed_zone", "euler"),
+        ("lin", "reaction_delay+inertia", "euler"),
+        ("idm", "memory+relative_speed", "euler"),
+    ]
     for law, order in (("lin", 1), ("idm", 2)):
         for effect in CATALOGUE.of("traffic", every=True):
-            if order not in effect.rules:
-                continue
-            for method in METHODS:
-                if method == "rk4" and _is_map(law, effect.name):
-                    continue
+            for method in methods(law, effect.name) if order in effect.rules else ():
                 often = method in ("rk4", "ballistic" if effect.name == "pure_delay" else "")
                 marks = [] if often else [pytest.mark.thorough]
                 rows.append(pytest.param(law, effect.name, method, marks=marks))
-    return rows + [(law, effects, "euler") for law, effects in TOGETHER]
-
-
-@pytest.fixture
-def without_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lanes, "compiled", interpreted)
+    return rows
 
 
 @pytest.mark.usefixtures("without_compiler")
 @pytest.mark.parametrize("leader", LEADERS)
 @pytest.mark.parametrize(("law", "method"), cases([*PAPER, *OWN, *CAR_FOLLOWING_LAWS]))
-def test_every_law_and_method(law: str, method: str, leader: str) -> None:
+def test_laws_and_methods(law: str, method: str, leader: str) -> None:
     check(lane_of(law, leader), platoons(), method, compiled, ensemble, by_tangents)
 
 
 @pytest.mark.usefixtures("without_compiler")
 @pytest.mark.parametrize("leader", LEADERS)
 @pytest.mark.parametrize(("law", "effect", "method"), with_effects())
-def test_every_effect(law: str, effect: str, method: str, leader: str) -> None:
+def test_effects(law: str, effect: str, method: str, leader: str) -> None:
     system = lane_of(law, leader, *effect.split("+"))
     check(system, platoons(), method, compiled, by_tangents)
 
@@ -340,8 +308,6 @@ def test_every_effect(law: str, effect: str, method: str, leader: str) -> None:
     "law", ["n4", "idm", *(pytest.param(n, marks=pytest.mark.thorough) for n in COMPILED)]
 )
 def test_compiled_stages(law: str) -> None:
-    """A leader that drives by itself, in vehicles side by side and in vehicles one after the
-    other."""
     check(lane_of(law, "constant"), platoons(), "rk4", compiled)
 
 
@@ -353,14 +319,14 @@ def test_compiled_runs_and_tangents(law: str, method: str) -> None:
 
 
 def room() -> Batch:
-    """Crowds of one to nine people, of different duration, with none to three walls."""
+    """Crowds of one to nine people with different durations, and zero to three walls."""
     crowds = []
     for n, walls, samples in ((6, 1, 6), (9, 2, 4), (1, 3, 6), (2, 0, 6)):
         draw = np.random.default_rng(n)
         x, v = draw.uniform(0, [4.0, 2.5], (n, 2)), draw.normal(0, 0.8, (n, 2))
-        wish = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
+        preferred = draw.choice([-1.3, 1.3], (n, 1)) * [1.0, 0.1]
         group = tuple("ab"[i % 2] for i in range(n))
-        fields = {"walls": WALLS[:walls], "preferred": wish, "group": group}
+        fields = {"walls": WALLS[:walls], "preferred": preferred, "group": group}
         crowds.append(straight(x, v, samples, 0.04, name=f"{n}", **fields))
     return collate(crowds)
 
@@ -369,13 +335,10 @@ def crowd_of(law: str, *effects: str) -> System:
     chosen = [{"name": e, **CROWD_EFFECTS[e]} for e in effects]
     if law in FORCES:
         return build_model({**model_options({"name": law, **FORCES[law]}), "effects": chosen}, 3)
-    own_law = OWN_FORCES.get(law) or PEDESTRIAN_LAWS[law]
-    options = model_options({"term": "formula", "name": law, "law": own_law})
+    entry = OWN_FORCES.get(law) or PEDESTRIAN_LAWS[law]
+    options = model_options({"term": "formula", "name": law, "law": entry})
     system = build_model({**options, "desired": "direction", "effects": chosen})
-    if law == "ttc":  # milder, so that nobody is thrown out of the room
-        with torch.no_grad():
-            system.terms[0].k.fill_(0.2)  # type: ignore[union-attr, operator]
-    return system
+    return set_(system, k=0.2) if law == "ttc" else system  # so that people stay in the room
 
 
 @pytest.mark.parametrize(
@@ -385,22 +348,21 @@ def crowd_of(law: str, *effects: str) -> System:
         for law in (*FORCES, *OWN_FORCES, *PEDESTRIAN_LAWS)
     ],
 )
-def test_every_law_of_people(law: str) -> None:
+def test_laws_of_people(law: str) -> None:
     check(crowd_of(law).double(), room(), "euler", compiled, threaded)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("effect", CROWD_EFFECTS)
-def test_every_effect_on_people(effect: str) -> None:
+def test_effects_on_people(effect: str) -> None:
     check(crowd_of("sf", effect).double(), room(), "euler", compiled)
 
 
 @pytest.mark.parametrize("leader", LEADERS)
 @pytest.mark.parametrize("law", ["lin", "idm"])
 @pytest.mark.parametrize(("method", "order"), [("euler", 1), ("ballistic", 1), ("rk4", 4)])
-def test_the_adjoint_equation(law: str, method: str, order: int, leader: str) -> None:
-    """torchdiffeq's adjoint approaches the gradient of the solution with the order of the method:
-    a finer step by a factor of four divides its distance to that of the next one by 4**order."""
+def test_adjoint_gradient_converges(law: str, method: str, order: int, leader: str) -> None:
+    """A step that is four times smaller divides the error of the gradient by 4**order."""
     system, batch = lane_of(law, leader), platoons()
 
     def adjoint(system: System, batch: Batch, substeps: int) -> Tensor:
@@ -413,7 +375,7 @@ def test_the_adjoint_equation(law: str, method: str, order: int, leader: str) ->
     *gradients, finest = (gradient(adjoint, substeps) for substeps in (1, 4, 16))
     coarse, fine = (float((each - finest).norm()) for each in gradients)
     assert fine > 0
-    # of errors c, c/r and c/r² with r = 4**order the distances to the last one have the ratio r + 1
+    # errors c, c/r and c/r² with r = 4**order: the distances to the last have the ratio r + 1
     assert coarse / fine > 0.7 * (4**order + 1), (coarse, fine)
     away = gradient(exact, "rk4") - finest
     assert away.norm() < 2 * coarse / 4**order + 1e-7 * finest.norm()

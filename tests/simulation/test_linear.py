@@ -1,4 +1,4 @@
-"""Linear responses: both solvers agree, and models that blow up give no number and no error."""
+"""Linear responses by each solver, and divergent models."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from nnode.simulation.linear import (
 )
 
 
-def test_an_equation_without_a_solution_gives_no_number() -> None:
-    # 1 - dt/2 A vanishes where A = 2/dt: a growth by which a step of the rule has no end
+def test_singular_step_of_the_dense_solver() -> None:
+    # 1 - dt/2 A is singular at A = 2/dt
     matrix = np.zeros((3, 2, 2, 2))
     matrix[1, 0] = 20.0 * np.eye(2)
     moved = DenseSolver(matrix, 2, 0.1).response(np.ones((3, 1, 1, 1, 2)))
@@ -26,7 +26,7 @@ def test_an_equation_without_a_solution_gives_no_number() -> None:
     np.testing.assert_allclose(moved[:, 0, 0, 1], [0.0, 0.1, 0.2])
 
 
-def test_what_cannot_be_inverted_is_no_number_there_alone() -> None:
+def test_singular_step_of_one_vehicle_in_one_sequence() -> None:
     slope = np.zeros((1, 3, 3))  # vehicles, times, sequences
     slope[0, 1, 2] = 20.0
     blocks = {(0, 0, 0): slope, (1, 0, 1): np.full((1, 3, 3), -20.0)}
@@ -39,13 +39,12 @@ def test_what_cannot_be_inverted_is_no_number_there_alone() -> None:
 
 
 @pytest.mark.parametrize("reads_speed", [False, True])
-def test_platoon_is_solved_from_its_front_as_by_dense_matrices(reads_speed: bool) -> None:
-    """Two states, four vehicles, five times, three changes, two sequences; both solvers use the
-    trapezoidal rule."""
+def test_front_to_back_solver_equals_dense_solver(reads_speed: bool) -> None:
+    """Two states, four vehicles, five times, three changes and two sequences."""
     rng = np.random.default_rng(4)
     m, n, k, c, b, dt = 2, 4, 5, 3, 2, 0.2
     keys = [(p, ahead, q) for p in range(m) for ahead in range(3) for q in range(m)]
-    keys += [(1, 1, m)] if reads_speed else []  # the acceleration by the speed of the vehicle ahead
+    keys += [(1, 1, m)] if reads_speed else []  # acceleration by speed ahead
     blocks: Blocks = {key: rng.normal(size=(n - 1, k, b)) for key in keys}
     source, start = rng.normal(size=(k, m, n, c, b)), rng.normal(size=(m, n, c, b))
     matrix = dense_jacobian(blocks, (m, n, k, b)).reshape(m * n, m * n, k, b).transpose(2, 3, 0, 1)
@@ -57,8 +56,8 @@ def test_platoon_is_solved_from_its_front_as_by_dense_matrices(reads_speed: bool
     assert not np.allclose(expected, dense.response(source), atol=0.1)
 
 
-def test_short_steps_follow_states_that_are_faster_than_samples() -> None:
-    """States of rates up to 20 per second, constant over an interval, against the exponential."""
+def test_subdivided_steps() -> None:
+    """States with rates up to 20 per second, against the matrix exponential."""
     dt, rng = 0.2, np.random.default_rng(6)
     matrix = np.array([[0.0, 1.0, 0.0], [-3.0, -2.0, 0.5], [12.0, 0.0, -20.0]])
     push = rng.normal(size=3)
@@ -75,8 +74,8 @@ def test_short_steps_follow_states_that_are_faster_than_samples() -> None:
     assert max(errors[1]) < 5e-3
 
 
-def test_runge_kutta_follows_fast_accelerations() -> None:
-    """Two people whose accelerations depend on both and on time, and are pushed at 1 Hz."""
+def test_runge_kutta_solver() -> None:
+    """Two people with coupled accelerations that depend on time, and pushes at 1 Hz."""
     rng = np.random.default_rng(5)
     n, dt, times = 2, 0.1, 0.1 * np.arange(31)
     to_velocity = np.block([[np.zeros((n, n)), np.eye(n)]])
@@ -101,5 +100,5 @@ def test_runge_kutta_follows_fast_accelerations() -> None:
     source = np.zeros((len(times), 2, n, 1, 1))
     source[:, 1, :, 0, 0] = push(times).T
     moved = solver.response(source, first.reshape(2, n, 1, 1))[..., 0, 0].T
-    # the first step has no parabola yet: dt^3 / 12 of the second derivative of the push, 0.0033 m/s
+    # the first step has an error of dt^3 / 12 times the push's second derivative, 0.0033 m/s
     np.testing.assert_allclose(moved, exact, atol=0.004)

@@ -1,4 +1,4 @@
-"""Where the origin of coordinates lies does not matter, in float32 as little as in float64."""
+"""Results do not depend on the origin of coordinates, also in float32."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.base import simulated_batch
 from tests.builders import lane, social_forces, straight
 
-#: Metres: a city's own coordinates, a country's, and northings of UTM.
+#: Distances of the origin in coordinates of a country and of UTM, m.
 AWAY = (1e5, 7e6)
 SOLVERS = {
     "torchdiffeq": TorchdiffeqSolver("euler", "discrete", 0.02),
@@ -34,7 +34,7 @@ SOLVERS = {
 
 
 def people(shift: float = 0.0) -> Sequence:
-    """Two streams that meet between two walls, of people who touch."""
+    """Two opposite streams of people in contact, between two walls."""
     start = np.array([[0.0, 0.0], [1.2, 0.3], [4.0, 0.62], [5.0, -0.4], [2.5, 1.0]])
     speed = np.array([[1.3, 0.0], [1.1, 0.0], [-1.2, 0.0], [-1.0, 0.0], [0.9, -0.3]])
     walls = np.array([[-5.0, -1.0, 15.0, -1.0], [15.0, 2.0, -5.0, 2.0]])
@@ -59,10 +59,14 @@ def idm(dtype: torch.dtype) -> System:
     return Traffic([law_from("idm", CAR_FOLLOWING_LAWS["idm"])], leader="measured").to(dtype)
 
 
+def platoons(shift: float) -> Batch:
+    return collate([cars(shift), cars(shift + 3e4, 3)])
+
+
 CASES = {
     "people": (crowd, lambda shift: collate([people(shift)])),
-    "lin": (lin, lambda shift: collate([cars(shift), cars(shift + 3e4, 3)])),
-    "idm": (idm, lambda shift: collate([cars(shift), cars(shift + 3e4, 3)])),
+    "lin": (lin, platoons),
+    "idm": (idm, platoons),
 }
 
 
@@ -71,7 +75,7 @@ def single(batch: Batch) -> Batch:
 
 
 def gradient(model: System, solver: object, batch: Batch) -> tuple[Tensor, Tensor]:
-    path = solver(model, batch)  # type: ignore[operator]
+    path = solver(model, batch)
     parts = torch.autograd.grad(sequence_costs(path, batch).sum(), list(model.parameters()))
     return path.x.detach(), torch.cat([part.flatten() for part in parts])
 
@@ -82,37 +86,37 @@ def gradient(model: System, solver: object, batch: Batch) -> tuple[Tensor, Tenso
 def test_float32_does_not_depend_on_the_origin(case: str, kind: str) -> None:
     build, make = CASES[case]
     exact = SOLVERS[kind](build(torch.float64), make(0.0)).x.detach()
-    here, slope = gradient(build(torch.float32), SOLVERS[kind], single(make(0.0)))
+    near, slope = gradient(build(torch.float32), SOLVERS[kind], single(make(0.0)))
     real = make(0.0).valid[..., None].expand_as(exact)
-    assert (here - exact)[real].abs().max() < 0.01
+    assert (near - exact)[real].abs().max() < 0.01
     for shift in AWAY:
-        shifted, other = gradient(build(torch.float32), SOLVERS[kind], single(make(shift)))
-        # what is left is the rounding of the measured positions in float64, 1e-9 m at 7,000 km,
-        # which can move a float32 by its last place
-        assert (shifted - shift - here)[real].abs().max() < 1e-3
-        torch.testing.assert_close(other, slope, rtol=1e-3, atol=1e-3)
+        far, far_slope = gradient(build(torch.float32), SOLVERS[kind], single(make(shift)))
+        # measured positions have rounding errors of 1e-9 m at 7,000 km in float64, which can
+        # change the last digit in float32
+        assert (far - shift - near)[real].abs().max() < 1e-3
+        torch.testing.assert_close(far_slope, slope, rtol=1e-3, atol=1e-3)
 
 
-def test_costs_of_an_ensemble_and_tangents_far_away() -> None:
+def test_ensemble_costs_and_tangents_far_away() -> None:
     model, solver = idm(torch.float32), FusedSolver()
-    near, far = (single(CASES["idm"][1](shift)) for shift in (0.0, 7e6))
-    rows = [EnsembleCost(model, b, solver) for b in (near, far)]
+    batches = [single(platoons(shift)) for shift in (0.0, 7e6)]
     row = ParameterVector(model).row[None]
-    torch.testing.assert_close(rows[0].costs(row), rows[1].costs(row), rtol=1e-4, atol=1e-6)
-    curved = [ResidualProblem(model, b, solver)(row[0].numpy()) for b in (near, far)]
-    np.testing.assert_allclose(curved[0].cost, curved[1].cost, rtol=1e-4)
-    scale = np.abs(curved[0].gradient).max()
-    np.testing.assert_allclose(curved[0].gradient, curved[1].gradient, atol=1e-3 * scale)
+    near, far = (EnsembleCost(model, batch, solver).costs(row) for batch in batches)
+    torch.testing.assert_close(near, far, rtol=1e-4, atol=1e-6)
+    near, far = (ResidualProblem(model, batch, solver)(row[0].numpy()) for batch in batches)
+    np.testing.assert_allclose(near.cost, far.cost, rtol=1e-4)
+    scale = np.abs(near.gradient).max()
+    np.testing.assert_allclose(near.gradient, far.gradient, atol=1e-3 * scale)
 
 
-def test_float64_takes_positions_as_they_are() -> None:
+def test_float64_positions_are_not_shifted() -> None:
     batch = collate([people(1e5)])
-    same, origin = simulated_batch(crowd(torch.float64), batch)
-    assert same is batch
+    simulated, origin = simulated_batch(crowd(torch.float64), batch)
+    assert simulated is batch
     assert origin is None
 
 
-def test_positions_of_a_batch_stay_as_they_were_measured() -> None:
+def test_float32_positions_are_shifted_in_simulations_only() -> None:
     batch = collate([people(7e6), replace(people(-3e6), walls=None)])
     moved = single(batch)
     for name in ("x", "destination", "walls"):
@@ -124,12 +128,13 @@ def test_positions_of_a_batch_stay_as_they_were_measured() -> None:
     assert (origin == origin.round()).all()
     assert near.x.dtype == near.walls.dtype == near.destination.dtype == torch.float32
     for name, ends in (("x", 1), ("destination", 1), ("walls", 2)):
-        back = getattr(near, name).double() + origin.repeat(1, ends)[:, None]
-        wanted = getattr(batch, name)
-        torch.testing.assert_close(back, wanted, rtol=0, atol=1e-5, equal_nan=True)
+        restored = getattr(near, name).double() + origin.repeat(1, ends)[:, None]
+        torch.testing.assert_close(
+            restored, getattr(batch, name), rtol=0, atol=1e-5, equal_nan=True
+        )
 
 
-def test_a_leader_that_follows_its_measured_path_has_no_error_at_all() -> None:
+def test_measured_leader_has_no_rounding_error() -> None:
     batch = single(collate([cars(7e6), cars(7e6, 3)]))
     x = FusedSolver()(idm(torch.float32), batch).x
     for b, last in enumerate((4, 2)):
@@ -139,7 +144,7 @@ def test_a_leader_that_follows_its_measured_path_has_no_error_at_all() -> None:
 @pytest.mark.parametrize(
     "name", ["lin", "log", "n4", "sf", "nn", *CAR_FOLLOWING_LAWS, *PEDESTRIAN_LAWS]
 )
-def test_laws_name_no_places(name: str) -> None:
+def test_laws_do_not_depend_on_position(name: str) -> None:
     assert not build_model(model_options(name)).depends_on_position
 
 
@@ -149,41 +154,33 @@ PLACES = {"speed_zone", "slope", "obstacle", "attraction"}
 @pytest.mark.parametrize(
     ("kind", "leader"), [("lin", "measured"), ("idm", "measured"), ("sf", None)]
 )
-def test_effects_of_places_name_places(kind: str, leader: str | None) -> None:
-    domain = "crowd" if kind == "sf" else "traffic"
-    catalogue = CATALOGUE.of(domain, every=True)  # type: ignore[arg-type]
-    offered, dependent = set(), set()
+def test_effects_that_depend_on_position(kind: str, leader: str | None) -> None:
+    catalogue = CATALOGUE.of("crowd" if kind == "sf" else "traffic", every=True)
+    dependent = {}
     for effect in (e for e in catalogue if e.__module__.startswith("nnode.")):
-        with suppress(ConfigError):  # some are for laws of the other order
+        with suppress(ConfigError):  # effects on laws of the other order
             model = build_model(model_options(kind, leader, [effect.name]))
-            offered.add(effect.name)
-            if model.depends_on_position:
-                dependent.add(effect.name)
-    assert dependent == PLACES & offered
+            dependent[effect.name] = model.depends_on_position
+    assert dependent == {name: name in PLACES for name in dependent}
 
 
-def test_a_term_that_is_code_may_name_places() -> None:
+def test_terms_in_code_may_depend_on_position() -> None:
     class Windy(Law):
-        def forward(self, state):  # type: ignore[no-untyped-def]
+        def forward(self, state):
             return super().forward(state) + state.x * 1e-3
 
     assert Crowd([Windy("relaxation")]).depends_on_position
 
 
-def test_a_zone_stays_where_it_is() -> None:
-    def zoned(shift: float, dtype: torch.dtype) -> System:
+def test_zone_far_away() -> None:
+    def simulated(shift: float, dtype: torch.dtype, zones: int = 1) -> Tensor:
         model = Traffic([make_law("lin", v0=25.0, L=5.0)], leader="measured")
         zone = {"name": "speed_zone", "alpha": 0.5, "a": shift + 60.0, "b": shift + 160.0}
-        add_effects(model, [zone])
-        return model.to(dtype)
+        add_effects(model, zones * [zone])
+        batch = platoons(shift).to(dtype=dtype)
+        return SOLVERS["torchdiffeq"](model.to(dtype), batch).x.detach()[:, 0] - shift
 
-    plain, solver = CASES["lin"][1], TorchdiffeqSolver("euler", "discrete", 0.02)
-    exact = solver(zoned(0.0, torch.float64), plain(0.0)).x.detach()
-    bare = solver(
-        Traffic([make_law("lin", v0=25.0, L=5.0)], leader="measured"), plain(0.0)
-    ).x.detach()
-    assert (exact - bare).abs()[:, 0].max() > 1
+    exact = simulated(0.0, torch.float64)
+    assert (exact - simulated(0.0, torch.float64, zones=0)).abs().max() > 1
     for shift, limit in ((0.0, 0.02), (4096.0, 0.2)):
-        batch = single(plain(shift))
-        near = solver(zoned(shift, torch.float32), batch).x.detach() - shift
-        assert (near - exact)[:, 0].abs().max() < limit
+        assert (simulated(shift, torch.float32) - exact).abs().max() < limit

@@ -1,4 +1,4 @@
-"""How many steps are taken, and that they are the ones asked for."""
+"""Number and size of steps, and invalid options of solvers."""
 
 from __future__ import annotations
 
@@ -19,13 +19,6 @@ LANE, PEOPLE = Traffic([make_law("lin")]), Crowd([make_law("relaxation")])
 FOLLOWING = Traffic([law_from("idm", CAR_FOLLOWING_LAWS["idm"])])
 
 
-def count_evaluations(system: System) -> list[int]:
-    """A list whose length grows by one with each evaluation of the right-hand side."""
-    calls: list[int] = []
-    system.register_forward_hook(lambda *_: calls.append(1))
-    return calls
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(
     ("method", "samples", "sampling", "dt", "evaluations"),
@@ -41,9 +34,10 @@ def count_evaluations(system: System) -> list[int]:
         ("rk4", 13, 0.2, 0.02, 4 * 120),
     ],
 )
-def test_number_of_steps(dtype, method, samples, sampling, dt, evaluations) -> None:  # type: ignore[no-untyped-def]
+def test_number_of_steps(dtype, method, samples, sampling, dt, evaluations) -> None:
     model = Traffic([make_law("lin", v0=15.0)]).to(dtype)
-    calls = count_evaluations(model)
+    calls: list[int] = []
+    model.register_forward_hook(lambda *_: calls.append(1))
     batch = collate([platoon([20.0], samples=samples, dt=sampling)]).to(dtype=dtype)
     trajectory = TorchdiffeqSolver(method, "adjoint", dt=dt)(model, batch)
     assert len(calls) == evaluations
@@ -59,7 +53,7 @@ def test_number_of_steps(dtype, method, samples, sampling, dt, evaluations) -> N
         (LANE, 0.2 + 3e-9, 0.02, 10),  # recorded times carry rounding errors
         (LANE, 0.30000000000000004, 0.1, 3),
         (LANE, 1 / 25, 0.01, 4),
-        # without a step, the fewest below the default
+        # without dt, the smallest number of steps that are not above the default
         (LANE, 0.2, None, 100),
         (LANE, 0.1, None, 50),
         (LANE, 0.001, None, 1),
@@ -77,41 +71,41 @@ def test_substeps(system: System, sampling: float, dt: float | None, number: int
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, float("nan"), float("inf")])
-def test_a_step_must_be_positive(dt: float) -> None:
+def test_step_must_be_positive(dt: float) -> None:
     with pytest.raises(ConfigError, match=r"solver\.dt=.*positive"):
         substeps(0.2, dt, LANE)
 
 
 @pytest.mark.parametrize(("sampling", "dt"), [(0.2, 1e-7), (2e8, 0.1), (2e8, None)])
-def test_more_than_a_million_steps_are_refused(sampling: float, dt: float | None) -> None:
+def test_more_than_a_million_steps(sampling: float, dt: float | None) -> None:
     with pytest.raises(ConfigError, match=r"expected at most 1e\+06; take a larger solver\.dt"):
         substeps(sampling, dt, LANE)
     assert substeps(0.1, 1e-7, LANE) == 10**6
 
 
 @pytest.mark.parametrize("dt", [0.03, 0.3, 0.19, 0.2001, 1e3])
-def test_a_step_that_does_not_divide_is_refused_with_ones_that_do(dt: float) -> None:
-    with pytest.raises(ConfigError, match="does not divide") as caught:
+def test_step_that_does_not_divide_the_sampling_interval(dt: float) -> None:
+    with pytest.raises(ConfigError, match="does not divide") as error:
         substeps(0.2, dt, LANE)
-    offered = str(caught.value).split("use solver.dt=")[1].split(",")[0].split(" or ")
+    offered = str(error.value).split("use solver.dt=")[1].split(",")[0].split(" or ")
     for value in offered:
         assert substeps(0.2, float(value), LANE) >= 1
 
 
-def test_a_single_sample_has_no_sampling_interval() -> None:
+def test_single_sample() -> None:
     batch = collate([platoon([20.0], samples=1)])
     with pytest.raises(DataError, match="at least two samples"):
         TorchdiffeqSolver()(Traffic([make_law("lin")]), batch)
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ({"method": "eular"}, r"solver\.method=eular.*euler"),
         ({"gradient": "exact"}, r"solver\.gradient=exact.*adjoint, discrete"),
         ({"method": "scipy_solver", "gradient": "discrete"}, "leaves no graph"),
     ],
 )
-def test_unknown_choices_are_refused(options: dict[str, str], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
+def test_invalid_options(options: dict[str, str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         TorchdiffeqSolver(**options)

@@ -1,11 +1,10 @@
-"""Files with planted faults, and files that are right: what is said of them, what reads them."""
+"""The check of a file: recognised formats, units and rates, and planted faults."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -14,30 +13,22 @@ import pytest
 import nnode
 from nnode.data.check.examine import Examination, examine
 from nnode.data.check.recognise import recognised
-from nnode.data.readers.jupedsim import WalkwayOptions
-from nnode.data.readers.pairs import PairOptions
-from nnode.data.readers.vehicles import VehicleTableOptions
 from nnode.data.sequence import LENGTH_UNITS, SPEED_UNITS
 from nnode.data.units import certainty
 from nnode.errors import ConfigError, DataError
 from tests.data.check.planted import cars, people, saved, text
 
 
-def said(file: Examination, level: str = "error") -> dict[str, str]:
-    """Findings of a level by kind."""
+def findings(file: Examination, level: str = "error") -> dict[str, str]:
+    """The texts of the findings of a level by kind."""
     return {item.kind: item.text for item in file.findings if item.level == level}
 
 
-def vehicles(file: Examination) -> VehicleTableOptions:
-    assert file.source.group == "vehicles"
-    return cast(VehicleTableOptions, file.source.options)
-
-
-def test_a_sound_table_is_read_with_the_options_that_are_told(tmp_path: Path) -> None:
+def test_correct_table_has_no_findings(tmp_path: Path) -> None:
     file = examine(saved(cars(), tmp_path))
-    assert said(file) == {}
-    assert said(file, "warning") == {}
-    options = vehicles(file)
+    assert findings(file) == findings(file, "warning") == {}
+    assert file.source.group == "vehicles"
+    options = file.source.options
     assert options.columns == {"vehicle": "veh", "time": "t", "speed": "v"}
     assert (options.position_unit, options.time_unit, options.speed_unit) == ("m", "s", "m/s")
     assert (options.direction, options.dt) == (1, 0.2)
@@ -48,59 +39,62 @@ def test_a_sound_table_is_read_with_the_options_that_are_told(tmp_path: Path) ->
     assert file.rows.dt == pytest.approx(0.1)
 
 
+FEET = {"x": 1 / 0.3048, "length": 1 / 0.3048}
+
+
 @pytest.mark.parametrize(
-    ("scale", "units", "lacking"),
+    ("scale", "units", "dropped"),
     [
-        ({"x": 1 / 0.3048, "length": 1 / 0.3048}, ("ft", "s", "m/s"), []),
-        ({"x": 1 / 0.3048, "length": 1 / 0.3048}, ("ft", "s", "m/s"), ["v"]),
+        (FEET, ("ft", "s", "m/s"), []),
+        (FEET, ("ft", "s", "m/s"), ["v"]),
         ({"v": 3.6}, ("m", "s", "km/h"), []),
         ({"t": 1000}, ("m", "ms", "m/s"), []),
     ],
 )
-def test_other_units(
-    tmp_path: Path, scale: dict[str, float], units: tuple[str, ...], lacking: list[str]
+def test_units_are_recognised(
+    tmp_path: Path, scale: dict[str, float], units: tuple[str, ...], dropped: list[str]
 ) -> None:
-    table = cars().drop(columns=lacking)
+    table = cars().drop(columns=dropped)
     for column, factor in scale.items():
         table[column] = (factor * table[column]).round(9)
     file = examine(saved(table, tmp_path))
-    options = vehicles(file)
+    assert file.source.group == "vehicles"
+    options = file.source.options
     assert (options.position_unit, options.time_unit, options.speed_unit) == units
-    assert said(file) == {}
+    assert findings(file) == {}
     assert np.ptp(file.rows.x) == pytest.approx(np.ptp(cars()["x"]), rel=1e-9)
 
 
-def test_the_rate_of_frames_follows_from_speeds_in_the_file(tmp_path: Path) -> None:
+def test_frame_rate_follows_from_speeds(tmp_path: Path) -> None:
     table = cars(dt=0.04)
     table["frame"] = (table.pop("t") / 0.04).round().astype(int)
     file = examine(saved(table, tmp_path))
-    options = vehicles(file)
+    assert file.source.group == "vehicles"
+    options = file.source.options
     assert (options.time_unit, options.frame_rate) == ("frame", 25.0)
     assert options.columns["time"] == "frame"
-    assert said(file) == {}
+    assert findings(file) == {}
     assert file.rows.dt == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.5, 0.25])
-def test_a_clock_that_is_wrong_is_told_by_speeds_in_the_file(tmp_path: Path, factor: float) -> None:
-    table = cars()
-    table["t"] *= factor
-    file = examine(saved(table, tmp_path))
-    text = said(file)["time_scale"]
-    (speed,) = re.findall(r"by their positions vehicles drive ([\d.]+) m/s", text)
+def test_wrong_clock_is_detected_by_speeds(tmp_path: Path, factor: float) -> None:
+    file = examine(saved(cars().assign(t=lambda table: factor * table.t), tmp_path))
+    message = findings(file)["time_scale"]
+    (speed,) = re.findall(r"by their positions vehicles drive ([\d.]+) m/s", message)
     assert float(speed) == pytest.approx(12 / factor, rel=0.01)
-    assert f"times multiplied by {1 / factor:.3g} would agree" in text
+    assert f"times multiplied by {1 / factor:.3g} would agree" in message
 
 
-def test_a_mirrored_direction_is_turned(tmp_path: Path) -> None:
+def test_reversed_direction_is_recognised(tmp_path: Path) -> None:
     file = examine(saved(cars().assign(x=lambda t: -t["x"]), tmp_path))
-    assert vehicles(file).direction == -1
-    assert "data.direction=-1" in said(file, "warning")["direction"]
-    assert said(file) == {}
+    assert file.source.options.direction == -1
+    assert "data.direction=-1" in findings(file, "warning")["direction"]
+    assert findings(file) == {}
 
 
 @pytest.mark.parametrize(
-    ("rows", "column", "change", "level", "kind", "words"),
+    ("rows", "column", "change", "level", "kind", "message"),
     [
         (
             "veh < 3",
@@ -130,122 +124,125 @@ def test_a_mirrored_direction_is_turned(tmp_path: Path) -> None:
         ("veh == 3", "length", lambda length: length + 195, "error", "overlap", "long, at"),
     ],
 )
-def test_a_planted_fault_is_a_finding(
+def test_planted_fault_is_found(
     tmp_path: Path,
     rows: str,
     column: str,
     change: Callable[[pd.Series], pd.Series],
     level: str,
     kind: str,
-    words: str,
+    message: str,
 ) -> None:
     table = cars()
-    planted = table.eval(rows)
-    table.loc[planted, column] = change(table.loc[planted, column])
+    selected = table.eval(rows)
+    table.loc[selected, column] = change(table.loc[selected, column])
     file = examine(saved(table, tmp_path))
-    assert re.search(words, said(file, level)[kind])
-    # a swap is not reported as jumps or overlaps as well
-    assert kind != "identity_swap" or set(said(file)) == {kind}
+    assert re.search(message, findings(file, level)[kind])
+    # a swap is not reported as a jump or an overlap in addition
+    assert kind != "identity_swap" or set(findings(file)) == {kind}
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_nobody_comes_or_goes_where_a_sequence_begins_and_ends(told: bool, tmp_path: Path) -> None:
-    """Of three stays one after the other the second begins and ends amid the others."""
+@pytest.mark.parametrize("has_sequences", [True, False])
+def test_sequence_boundaries_are_not_broken_tracks(has_sequences: bool, tmp_path: Path) -> None:
+    """The second of three consecutive sequences begins and ends between the others."""
     table = cars()
-    stays = [
-        table.assign(t=table["t"] + 100 * k, x=table["x"] + 300 * (k == 1), veh=100 * k + table.veh)
+    parts = [
+        table.assign(
+            sequence=k, t=table.t + 100 * k, x=table.x + 300 * (k == 1), veh=table.veh + k * 100
+        )
         for k in range(3)
     ]
-    table = pd.concat([stay.assign(sequence=k) for k, stay in enumerate(stays)])
-    file = examine(saved(table if told else table.drop(columns="sequence"), tmp_path))
-    kinds = {item.kind for item in file.findings}
-    assert ("broken" in kinds) is not told
+    table = pd.concat(parts)
+    file = examine(saved(table if has_sequences else table.drop(columns="sequence"), tmp_path))
+    assert ("broken" in {item.kind for item in file.findings}) is not has_sequences
 
 
-def test_cells_rows_and_holes(tmp_path: Path) -> None:
+def test_invalid_cells_duplicate_rows_and_holes(tmp_path: Path) -> None:
     table = cars().astype({"x": object})
     table.loc[100, "x"] = "oops"
     table.loc[101, "x"] = None
-    table = pd.concat([table, table.iloc[[7, 7]]])
-    table = table.drop(index=range(600, 640))
+    table = pd.concat([table, table.iloc[[7, 7]]]).drop(index=range(600, 640))
     file = examine(saved(table, tmp_path))
-    wrong = said(file)
-    # the empty one is a missing sample
-    assert "column 'x' (x) holds no number in 1 of" in wrong["cells"]
-    assert "first 'oops' in line 102" in wrong["cells"]
-    assert (
-        "2 rows repeat the agent and the time of an earlier row (2 of them" in wrong["duplicates"]
-    )
-    assert "refuses it" in wrong["reader"]
-    assert "the longest of 4.1 s" in said(file, "note")["holes"]
-    assert "readers sort them" in said(file, "note")["unsorted"]
+    errors, notes = findings(file), findings(file, "note")
+    # the empty cell is a missing sample
+    assert "column 'x' (x) holds no number in 1 of" in errors["cells"]
+    assert "first 'oops' in line 102" in errors["cells"]
+    duplicates = "2 rows repeat the agent and the time of an earlier row (2 of them"
+    assert duplicates in errors["duplicates"]
+    assert "refuses it" in errors["reader"]
+    assert "the longest of 4.1 s" in notes["holes"]
+    assert "readers sort them" in notes["unsorted"]
 
 
-def test_people_in_text_whose_header_tells_all(tmp_path: Path) -> None:
-    head = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
-    file = examine(text(people(), tmp_path, head, 100.0))
-    assert said(file) == said(file, "warning") == {}
-    options = cast(WalkwayOptions, file.source.options)
+def test_header_states_rate_and_unit(tmp_path: Path) -> None:
+    header = "# framerate: 16 fps\n# id frame x/cm y/cm z/cm\n"
+    file = examine(text(people(), tmp_path, header, 100.0))
+    assert findings(file) == findings(file, "warning") == {}
     assert file.source.group == "pedpy"
-    assert (options.frame_rate, options.unit) == (None, None)
-    assert "right to about a tenth" in said(file, "note")["gait"]
-    assert "50% of them towards larger values" in said(file, "note")["direction"]
+    assert (file.source.options.frame_rate, file.source.options.unit) == (None, None)
+    notes = findings(file, "note")
+    assert "right to about a tenth" in notes["gait"]
+    assert "50% of them towards larger values" in notes["direction"]
 
 
-def test_people_in_centimetres_whose_rate_nobody_tells(tmp_path: Path) -> None:
+def test_missing_rate_is_estimated_from_gait(tmp_path: Path) -> None:
     file = examine(text(people(), tmp_path, "", 100.0))
-    options = cast(WalkwayOptions, file.source.options)
-    assert options.unit == "cm"
-    assert options.frame_rate == pytest.approx(16, rel=0.15)  # by their gait
-    assert "of a rate that the file does not tell" in said(file, "warning")["units"]
-    assert " 16" in said(file, "warning")["units"]
-    stated = examine(file.path, rate=16.0)
-    assert said(stated, "warning") == {}
-    assert cast(WalkwayOptions, stated.source.options).frame_rate == 16.0
+    assert file.source.options.unit == "cm"
+    assert file.source.options.frame_rate == pytest.approx(16, rel=0.15)
+    warning = findings(file, "warning")["units"]
+    assert "of a rate that the file does not tell" in warning
+    assert " 16" in warning
+    with_rate = examine(file.path, rate=16.0)
+    assert findings(with_rate, "warning") == {}
+    assert with_rate.source.options.frame_rate == 16.0
 
 
-def test_a_wrong_rate_is_told_by_peoples_gait_alone(tmp_path: Path) -> None:
-    head = "# framerate: 30 fps\n# id frame x/m y/m z/m\n"
-    text_ = said(examine(text(people(), tmp_path, head)))["time_scale"]
-    (speed,) = re.findall(r"at the stated 30 frames/s, people walk ([\d.]+) m/s", text_)
+def test_wrong_rate_is_detected_by_gait(tmp_path: Path) -> None:
+    header = "# framerate: 30 fps\n# id frame x/m y/m z/m\n"
+    message = findings(examine(text(people(), tmp_path, header)))["time_scale"]
+    (speed,) = re.findall(r"at the stated 30 frames/s, people walk ([\d.]+) m/s", message)
     assert float(speed) == pytest.approx(1.3 * 30 / 16, rel=0.1)
-    assert "16 frames/s fit" in text_ or "15 frames/s fit" in text_
+    assert re.search("1[56] frames/s fit", message)
 
 
-def test_the_copied_eth_set_and_its_rate(tmp_path: Path) -> None:
-    """Frames that count 15 in a second, velocities of their own, taken for 25 frames/s."""
+def test_eth_data_with_a_wrong_rate(tmp_path: Path) -> None:
+    """The file has velocities and counts 15 frames per second; the given rate is 25 frames/s."""
     table = people(rate=2.5, length=16.0, number=60)
-    table["frame"] *= 6  # every sixth frame of 15 in a second
-    faster = 1.47 / table["vx"].abs().median()
-    table["x"], table["vx"] = faster * table["x"], faster * table["vx"]
+    table["frame"] *= 6  # every sixth of 15 frames per second
+    table[["x", "vx"]] *= 1.47 / table["vx"].abs().median()
     rows = table.assign(a=0.0, b=0.0)[["frame", "id", "x", "a", "y", "vx", "b", "vy"]]
     path = tmp_path / "obsmat.txt"
     path.write_text(rows.sort_values("frame").to_csv(sep=" ", header=False, index=False))
     file = examine(path, rate=25.0)
     assert file.meanings["agent"].column == "column 2"
     assert file.meanings["y"].column == "column 5"
-    text_ = said(file)["time_scale"]
-    assert "at the stated 25 frames/s, people walk 2.4" in text_
-    assert "its own velocities say 1.4" in text_
-    assert "15 frames/s fit" in text_
-    # and the file that would be read says so
+    message = findings(file)["time_scale"]
+    assert "at the stated 25 frames/s, people walk 2.4" in message
+    assert "its own velocities say 1.4" in message
+    assert "15 frames/s fit" in message
     assert file.source.group == "pedpy"
-    speed = np.concatenate(
-        [np.linalg.norm(np.diff(s.x, axis=0), axis=-1).ravel() / s.dt for s in file.sequences]
-    )
-    assert np.median(speed) == pytest.approx(1.47, rel=0.05)
+    speed = [np.linalg.norm(np.diff(s.x, axis=0), axis=-1).ravel() / s.dt for s in file.sequences]
+    assert np.median(np.concatenate(speed)) == pytest.approx(1.47, rel=0.05)
 
 
-def test_pairs_and_tidy_tables(tmp_path: Path) -> None:
-    lead, follow = pair()
-    pairs = pd.DataFrame({"t": lead["t"], "xFollower": follow["x"], "x_leader": lead["x"]})
-    pairs = pairs.assign(v_follower=follow["v"], v_leader=lead["v"])
-    file = examine(saved(pairs, tmp_path, "pairs.csv"))
+def test_pairs_with_positions(tmp_path: Path) -> None:
+    leader, follower = pair()
+    table = pd.DataFrame({"t": leader["t"], "xFollower": follower["x"], "x_leader": leader["x"]})
+    table = table.assign(v_follower=follower["v"], v_leader=leader["v"])
+    file = examine(saved(table, tmp_path))
     assert file.source.group == "pairs"
-    assert said(file) == {}
+    assert findings(file) == {}
     assert len(file.sequences) == 1
-    tidy = cars().rename(columns={"veh": "agent", "t": "time"}).assign(sequence=0)
-    file = examine(saved(tidy[["sequence", "time", "agent", "x"]], tmp_path, "tidy.csv"))
+
+
+def tidy() -> pd.DataFrame:
+    """The cars as a tidy table of positions."""
+    table = cars().rename(columns={"veh": "agent", "t": "time"}).assign(sequence=0)
+    return table[["sequence", "time", "agent", "x"]]
+
+
+def test_tidy_table(tmp_path: Path) -> None:
+    file = examine(saved(tidy(), tmp_path))
     assert file.source.group == "table"
     assert len(file.sequences) == 1
 
@@ -256,34 +253,35 @@ def pair() -> tuple[pd.DataFrame, ...]:
     return tuple(table[table["veh"] == i].reset_index() for i in (0, 1))
 
 
-def spaced(units: dict[str, float]) -> pd.DataFrame:
-    """Four pairs of spacings and speeds, numbered anew on either side of a division."""
-    lead, follow = pair()
-    single_pair = pd.DataFrame(
+def spaced(position: float = 1.0, speed: float = 1.0) -> pd.DataFrame:
+    """Four pairs of spacings and speeds, numbered from 0 in both parts of a division.
+
+    Args:
+        position, speed: units, m and m/s.
+    """
+    leader, follower = pair()
+    table = pd.DataFrame(
         {
-            "t": lead["t"],
-            "spacing": (lead["x"] - follow["x"] - 4.5) / units["position"],
-            "speed": follow["v"] / units["speed"],
-            "leader_speed": lead["v"] / units["speed"],
+            "t": leader["t"],
+            "spacing": (leader["x"] - follower["x"] - 4.5) / position,
+            "speed": follower["v"] / speed,
+            "leader_speed": leader["v"] / speed,
         }
     )
-    parts = [
-        single_pair.assign(event=i, split=side) for i in range(2) for side in ("train", "test")
-    ]
-    return pd.concat(parts)
+    return pd.concat(
+        table.assign(event=i, split=part) for i in range(2) for part in ("train", "test")
+    )
 
 
 @pytest.mark.parametrize("position", ["m", "ft"])
 @pytest.mark.parametrize("speed", ["m/s", "km/h"])
-def test_pairs_without_positions_and_their_units(tmp_path: Path, position: str, speed: str) -> None:
-    """How spacings change with the speeds tells one unit by the other."""
-    units = {"position": LENGTH_UNITS[position], "speed": SPEED_UNITS[speed]}
-    file = examine(saved(spaced(units), tmp_path, "pairs.csv"))
-    assert said(file) == said(file, "warning") == {}
+def test_units_of_pairs_without_positions(tmp_path: Path, position: str, speed: str) -> None:
+    """The changes of the spacings and the speeds determine each other's units."""
+    file = examine(saved(spaced(LENGTH_UNITS[position], SPEED_UNITS[speed]), tmp_path))
+    assert findings(file) == findings(file, "warning") == {}
     assert (file.scale.position, file.scale.speed) == (position, speed)
-    options = file.source.options
-    assert isinstance(options, PairOptions)
-    assert options.columns == {
+    assert file.source.group == "pairs"
+    assert file.source.options.columns == {
         "time": "t",
         "pair": "event",
         "run": "split",
@@ -295,25 +293,25 @@ def test_pairs_without_positions_and_their_units(tmp_path: Path, position: str, 
     assert np.abs(np.gradient(first.x[:, 0, 0], 0.1) - first.velocity()[:, 0, 0]).max() < 0.5
 
 
-def test_pairs_that_are_left_out_are_a_finding(tmp_path: Path) -> None:
-    table = spaced({"position": 1.0, "speed": 1.0})
-    short = table[(table["event"] == 0) & (table["split"] == "test")]
-    table = pd.concat([table, short.iloc[:2].assign(event=7)])
-    told = said(examine(saved(table, tmp_path, "pairs.csv")), "warning")
-    assert told["left_out"] == (
+def test_omitted_pairs_are_found(tmp_path: Path) -> None:
+    table = spaced()
+    short = table[(table["event"] == 0) & (table["split"] == "test")].iloc[:2].assign(event=7)
+    warnings = findings(examine(saved(pd.concat([table, short]), tmp_path)), "warning")
+    assert warnings["left_out"] == (
         "records that are left out, as there is no sequence of them: 1 (fewer than "
         "data.min_samples=3 times in 1; first test/7)"
     )
 
 
+EPOCH = 1_577_865_600
 DATES = {
     "dates": lambda t: (pd.Timestamp("2020-01-01 23:00") + pd.to_timedelta(t, unit="s")).astype(
         str
     ),
     "durations": lambda t: pd.to_timedelta(t, unit="s").astype(str),
-    "ms": lambda t: 1_577_865_600_000 + (1e3 * t).round().astype("int64"),
-    "us": lambda t: 1_577_865_600_000_000 + (1e6 * t).round().astype("int64"),
-    "ns": lambda t: 1_577_865_600_000_000_000 + (1e9 * t).round().astype("int64"),
+    "ms": lambda t: EPOCH * 10**3 + (1e3 * t).round().astype("int64"),
+    "us": lambda t: EPOCH * 10**6 + (1e6 * t).round().astype("int64"),
+    "ns": lambda t: EPOCH * 10**9 + (1e9 * t).round().astype("int64"),
 }
 
 
@@ -322,16 +320,11 @@ DATES = {
     [*(("vehicles", kind) for kind in DATES), ("table", "dates"), ("table", "us"), ("pairs", "ns")],
 )
 def test_dates_and_epochs_are_recognised(tmp_path: Path, group: str, kind: str) -> None:
-    table = cars()
-    if group == "table":
-        table = table.rename(columns={"veh": "agent", "t": "time"}).assign(sequence=0)
-        table = table[["sequence", "time", "agent", "x"]]
-    elif group == "pairs":
-        table = spaced({"position": 1.0, "speed": 1.0})
-    clock = "time" if group == "table" else "t"
-    table[clock] = DATES[kind](table[clock])
-    file = examine(saved(table, tmp_path, "t.csv"))
-    assert said(file) == {}
+    table = {"vehicles": cars, "table": tidy, "pairs": spaced}[group]()
+    time = "time" if group == "table" else "t"
+    table[time] = DATES[kind](table[time])
+    file = examine(saved(table, tmp_path))
+    assert findings(file) == {}
     assert file.source.group == group
     assert file.scale.time == (kind if kind in ("ms", "us", "ns") else "s")
     assert file.source.options.time_unit == file.scale.time
@@ -340,8 +333,8 @@ def test_dates_and_epochs_are_recognised(tmp_path: Path, group: str, kind: str) 
 
 
 @pytest.mark.parametrize("dates", [True, False])
-def test_semicolons_and_commas(tmp_path: Path, dates: bool) -> None:
-    path = tmp_path / "german.csv"
+def test_semicolons_and_decimal_commas(tmp_path: Path, dates: bool) -> None:
+    path = tmp_path / "t.csv"
     table = cars()
     table["t"] = DATES["dates"](table["t"]) if dates else table["t"]
     table.to_csv(path, index=False, sep=";", decimal=",")
@@ -353,14 +346,14 @@ def test_semicolons_and_commas(tmp_path: Path, dates: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "message"),
     [
         (b"", "is empty"),
         (b" \n\n", "is empty"),
         (bytes(range(256)) * 20, "is no text"),
         (b"veh,t,x,lane\n", "has no rows below"),
         (b"veh,t,x,lane\n1,0,5,1\n", "1 row, in which no agent"),
-        (b"just some words in a letter\nand more of them\n", "no column was recognised"),
+        (b"just some message in a letter\nand more of them\n", "no column was recognised"),
         (b"# only\n# comments\n", "no rows below its comments"),
         (b"a,b\n1,2\n", "is no table of trajectories"),
         (b"<html><body></body></html>", "expected the root element <fcd-export>"),
@@ -370,18 +363,19 @@ def test_semicolons_and_commas(tmp_path: Path, dates: bool) -> None:
         ("veh,t,x\n".encode("utf-16"), "UTF-16"),
     ],
 )
-def test_what_is_no_table_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+def test_invalid_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "file.csv"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=words):
+    with pytest.raises(DataError, match=message):
         examine(path)
 
 
-def test_no_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="there is no file"):
-        examine(tmp_path / "absent.csv")
-    with pytest.raises(ConfigError, match="is a folder"):
-        examine(tmp_path)
+@pytest.mark.parametrize(
+    ("name", "message"), [("absent.csv", "there is no file"), ("", "is a folder")]
+)
+def test_missing_file_and_folder_are_refused(tmp_path: Path, name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        examine(tmp_path / name)
 
 
 REAL = {
@@ -405,23 +399,23 @@ def test_real_files_are_recognised(real_data: Path, name: str) -> None:
     file = examine(real_data / name)
     assert (file.source.group, file.scale.domain) == REAL[name]
     assert file.sequences
-    assert "time_scale" not in said(file)
-    assert "reader" not in said(file)
+    assert "time_scale" not in findings(file)
+    assert "reader" not in findings(file)
 
 
 @pytest.mark.real
-@pytest.mark.parametrize(("told", "wrong"), [(16.0, False), (25.0, True), (10.0, True)])
-def test_real_people_tell_their_rate(real_data: Path, told: float, wrong: bool) -> None:
-    """HERMES took 16 frames in a second, as its archive says; nothing in the file does."""
-    file = examine(real_data / "juelich" / "bo-360-050-050.txt", rate=told)
-    assert ("time_scale" in said(file)) == wrong
+@pytest.mark.parametrize(("rate", "wrong"), [(16.0, False), (25.0, True), (10.0, True)])
+def test_wrong_rate_of_real_people(real_data: Path, rate: float, wrong: bool) -> None:
+    """The rate of HERMES is 16 frames/s; only its archive states it."""
+    file = examine(real_data / "juelich" / "bo-360-050-050.txt", rate=rate)
+    assert ("time_scale" in findings(file)) == wrong
 
 
-def test_random_damage_ends_in_words_or_in_findings(tmp_path: Path) -> None:
+def test_random_damage_gives_findings_or_an_error(tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
-    good = [saved(cars(3, 3.0), tmp_path), text(people(4), tmp_path, "# framerate: 16 fps\n")]
-    contents = [path.read_bytes() for path in good]
-    examined, refused = 0, list[str]()
+    files = [saved(cars(3, 3.0), tmp_path), text(people(4), tmp_path, "# framerate: 16 fps\n")]
+    contents = [path.read_bytes() for path in files]
+    path, n_examined = tmp_path / "damaged.csv", 0
     for trial in range(60):
         content = bytearray(contents[trial % 2])
         for _ in range(int(rng.integers(1, 8))):
@@ -437,41 +431,39 @@ def test_random_damage_ends_in_words_or_in_findings(tmp_path: Path) -> None:
                     content[at:at] = content[: int(rng.integers(1, 400))]
                 case _:
                     content = content[: max(at, 1)]
-        path = tmp_path / "damaged.csv"
-        path.write_bytes(bytes(content))
+        path.write_bytes(content)
         try:
-            examined += bool(examine(path).findings)
+            n_examined += bool(examine(path).findings)
         except DataError as error:
-            refused.append(str(error))
-    assert examined > 10
-    assert all(str(path) in words for words in refused)
+            assert str(path) in str(error)  # noqa: PT017
+    assert n_examined > 10
 
 
-def test_people_on_an_oval_keep_the_rate_that_is_told(tmp_path: Path) -> None:
-    """In curves the sway across the way from start to end is none."""
+def test_stated_rate_is_kept_on_an_oval(tmp_path: Path) -> None:
+    """On a closed course no sway is perpendicular to the line from start to end."""
     k = np.arange(1200)
     parts = []
     for i in range(4):
-        angle = 2 * np.pi * (1.0 * k / 25 / 15 + i / 4)
+        angle = 2 * np.pi * (k / 25 / 15 + i / 4)
         x, y = 2.4 * np.cos(angle), 2.4 * np.sin(angle) + 0.02 * np.sin(2 * np.pi * 1.7 * k / 25)
         parts.append(pd.DataFrame({"id": i, "frame": k, "x": x, "y": y}))
-    head = "# framerate: 25 fps\n# id frame x/m y/m z/m\n"
-    file = examine(text(pd.concat(parts), tmp_path, head))
-    assert "time_scale" not in said(file)
+    header = "# framerate: 25 fps\n# id frame x/m y/m z/m\n"
+    file = examine(text(pd.concat(parts), tmp_path, header))
+    assert "time_scale" not in findings(file)
     assert file.scale.rate == 25.0
 
 
-def test_times_that_are_numbers_of_frames(tmp_path: Path) -> None:
+def test_times_as_frame_numbers(tmp_path: Path) -> None:
     table = people(rate=2.5).rename(columns={"id": "ped"}).drop(columns=["vx", "vy"])
     file = examine(saved(table.assign(timestamp=table.frame), tmp_path))
-    options = cast(WalkwayOptions, file.source.options)
+    options = file.source.options
     assert (options.time_unit, options.frame_rate) == ("frame", 2.5)
     assert options.columns == {"agent": "ped", "time": "frame"}
     assert file.sequences[0].dt == pytest.approx(0.4)
 
 
-def test_people_sampled_coarsely_have_no_clock(tmp_path: Path) -> None:
-    """At 2.5 positions a second what is left of the sway is the slow turns of the way."""
+def test_coarse_samples_do_not_determine_the_rate(tmp_path: Path) -> None:
+    """At 2.5 samples per second the sway is not resolved; only slow turns of the path remain."""
     k = np.arange(60)
     y = 0.5 * np.sin(2 * np.pi * 0.06 * 0.4 * k)
     parts = [
@@ -479,37 +471,33 @@ def test_people_sampled_coarsely_have_no_clock(tmp_path: Path) -> None:
         for i in range(12)
     ]
     file = examine(saved(pd.concat(parts), tmp_path), domain="crowd", rate=2.5)
-    assert "time_scale" not in said(file)
+    assert "time_scale" not in findings(file)
     assert file.scale.rate == 2.5
 
 
-def test_names_in_the_last_comment_above_columns_parted_by_tabs(tmp_path: Path) -> None:
-    path = tmp_path / "people.txt"
-    table = people(12)[["id", "frame", "x", "y"]]
-    path.write_text(
-        "#framerate: 16\n#ID\tFR\tX\tY\n" + table.to_csv(sep="\t", header=False, index=False)
-    )
-    file = examine(path)
-    assert {m: item.column for m, item in file.meanings.items()} == {
-        "agent": "ID",
-        "frame": "FR",
-        "x": "X",
-        "y": "Y",
-    }
-    options = cast(WalkwayOptions, file.source.options)
+def tabbed(table: pd.DataFrame, folder: Path, header: str) -> Path:
+    """Write people as text, separated by tabs, below comments."""
+    rows = table[["id", "frame", "x", "y"]].to_csv(sep="\t", header=False, index=False)
+    path = folder / "people.txt"
+    path.write_text(header + rows)
+    return path
+
+
+def test_column_names_in_the_last_comment(tmp_path: Path) -> None:
+    file = examine(tabbed(people(12), tmp_path, "#framerate: 16\n#ID\tFR\tX\tY\n"))
+    columns = {meaning: item.column for meaning, item in file.meanings.items()}
+    assert columns == {"agent": "ID", "frame": "FR", "x": "X", "y": "Y"}
+    options = file.source.options
     assert (options.time_unit, options.frame_rate) == ("frame", 16.0)
     assert {name for s in file.sequences for name in s.agents} <= set(map(str, range(1, 13)))
 
 
-def test_a_rate_that_the_file_tells_is_read_and_doubted(tmp_path: Path) -> None:
-    """Filmed at 16 frames/s, said to be 30: the check says so, the reader takes what is said."""
-    path = tmp_path / "people.txt"
-    table = people()[["id", "frame", "x", "y"]]
-    rows = table.to_csv(sep="\t", header=False, index=False)
-    path.write_text(f"#framerate: 30\n#id\tframe\tx\ty\n{rows}")
+def test_wrong_stated_rate_is_used_and_reported(tmp_path: Path) -> None:
+    """People recorded at 16 frames/s in a file that states 30 frames/s."""
+    path = tabbed(people(), tmp_path, "#framerate: 30\n#id\tframe\tx\ty\n")
     file = examine(path)
-    assert "time_scale" in said(file)
-    assert cast(WalkwayOptions, file.source.options).frame_rate == 30.0
+    assert "time_scale" in findings(file)
+    assert file.source.options.frame_rate == 30.0
     assert file.sequences[0].dt == pytest.approx(1 / 30)
     line = recognised(path).line
     assert "times in frames of 1/30 s" in line
@@ -518,33 +506,26 @@ def test_a_rate_that_the_file_tells_is_read_and_doubted(tmp_path: Path) -> None:
 
 @pytest.mark.real
 @pytest.mark.parametrize(
-    ("file", "agent"), [("single_file/oval/UX_24_1.txt", "ID"), ("eth_ucy/eth_hotel.parquet", "id")]
+    ("name", "agent"), [("single_file/oval/UX_24_1.txt", "ID"), ("eth_ucy/eth_hotel.parquet", "id")]
 )
-def test_public_tables_of_people_are_read_as_they_are(
-    real_data: Path, file: str, agent: str
-) -> None:
-    if not (real_data / file).is_file():
-        pytest.skip(f"{file} is not there")
-    examination = examine(real_data / file)
-    options = cast(WalkwayOptions, examination.source.options)
-    assert options.columns["agent"] == agent
-    assert options.time_unit == "frame"
-    assert examination.sequences
+def test_public_tables_of_people(real_data: Path, name: str, agent: str) -> None:
+    if not (real_data / name).is_file():
+        pytest.skip(f"there is no {name}")
+    file = examine(real_data / name)
+    assert file.source.options.columns["agent"] == agent
+    assert file.source.options.time_unit == "frame"
+    assert file.sequences
 
 
-def test_the_window_that_noise_asks_for_reads_and_smooths(tmp_path: Path) -> None:
+def test_suggested_window_smooths_noise(tmp_path: Path) -> None:
     table = cars(4)
     noisy = table.assign(x=table.x + 0.3 * np.random.default_rng(2).standard_normal(len(table)))
     path = saved(noisy.drop(columns="v"), tmp_path)
-    text_ = said(examine(path), "warning")["noise"]
-    (window,) = re.findall(r"data\.smooth=([\d.]+) \(s\)", text_)
-    raw, smooth = (
-        nnode.sequences(
-            path, data="vehicles", columns={"vehicle": "veh", "time": "t"}, **smoothing
-        )[0]
-        for smoothing in ({}, {"smooth": float(window)})
-    )
-    true = table[table.veh == 0].set_index("t").v  # the leader, last in its platoon
-    for s, low, high in ((raw, 1.0, np.inf), (smooth, 0.0, 0.25)):
-        error = s.velocity()[5:-5, -1, 0] - true.loc[s.time[5:-5].round(6)].to_numpy()
+    message = findings(examine(path), "warning")["noise"]
+    (window,) = re.findall(r"data\.smooth=([\d.]+) \(s\)", message)
+    speed = table[table.veh == 0].set_index("t").v  # the leader, the last in its platoon
+    columns = {"vehicle": "veh", "time": "t"}
+    for smooth, low, high in ((None, 1.0, np.inf), (float(window), 0.0, 0.25)):
+        s = nnode.sequences(path, data="vehicles", columns=columns, smooth=smooth)[0]
+        error = s.velocity()[5:-5, -1, 0] - speed.loc[s.time[5:-5].round(6)].to_numpy()
         assert low < np.std(error) < high

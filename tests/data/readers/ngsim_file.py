@@ -1,4 +1,4 @@
-"""Made-up files in the layout of NGSIM's public trajectories, with the truth behind them."""
+"""Generated files in the layout of NGSIM's public trajectories."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PERIODS = {
     ("us-101", "0805"): 1118847842000,
 }
 
-#: As the portal's file writes them.
+#: The columns of the portal's file.
 COLUMNS = [
     *("Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time"),
     *("Local_X", "Local_Y", "Global_X", "Global_Y"),
@@ -42,15 +42,15 @@ def period(
 
     ``noise`` (m) is the standard deviation of errors of the positions; speeds are the true ones.
     """
-    draw = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     frames = np.arange(1, round(seconds * 10) + 1)
     time = frames / 10
     parts = []
     for lane in range(1, lanes + 1):
         for place in range(cars):
             number = cars * (lane - 1) + place + 1
-            swing = 2 * np.sin(2 * np.pi * (time / 15 - 0.1 * place + draw.uniform(0, 0.1)))
-            speed = 10 + swing
+            deviation = 2 * np.sin(2 * np.pi * (time / 15 - 0.1 * place + rng.uniform(0, 0.1)))
+            speed = 10 + deviation
             x = 30.0 * (cars - place) + np.cumsum(speed) / 10
             parts.append(
                 {
@@ -59,7 +59,7 @@ def period(
                     "Total_Frames": len(frames),
                     "Global_Time": PERIODS[location, called] + 100 * frames,
                     "Local_X": 12.0 * lane - 6,
-                    "Local_Y": (x + noise * draw.standard_normal(len(x))) / FOOT,
+                    "Local_Y": (x + noise * rng.standard_normal(len(x))) / FOOT,
                     "Global_X": 6042842.116,
                     "Global_Y": 2133117.662,
                     "v_length": 15.0,
@@ -82,14 +82,17 @@ def period(
 
 
 def published(path: Path, *periods: pd.DataFrame) -> Path:
-    """The portal's file: all periods below each other, in no order, with a line of names."""
+    """Write the portal's file: the rows of all periods in random order, with column names."""
     table = pd.concat(periods).sample(frac=1.0, random_state=0)
     table.to_csv(path, index=False)
     return path
 
 
 def quarter(path: Path, table: pd.DataFrame) -> Path:
-    """An older file of one period: no names, no location; blanks, or commas in a ``.csv``."""
+    """Write an older file of one period, without column names and location.
+
+    The separator is a comma in a ``.csv`` file and a blank in others.
+    """
     table = table.drop(columns=[*STREET, "Location"])
     table.to_csv(path, index=False, header=False, sep="," if path.suffix == ".csv" else " ")
     return path

@@ -1,4 +1,4 @@
-"""Cells and columns that no reader expects are told, whatever pandas makes of them."""
+"""Unexpected cells and columns, in files and in data frames."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def cells(value: Any) -> pd.Series:
     return pd.Series([value] * 60, dtype=object)
 
 
-def test_two_columns_of_one_name() -> None:
+def test_duplicate_column_names() -> None:
     table = lane()
     with pytest.raises(DataError, match="2 columns 'x'; give every column a name of its own"):
         nnode.sequences(pd.concat([table, table[["x"]]], axis=1))
@@ -48,28 +48,28 @@ def test_two_columns_of_one_name() -> None:
         ("agent", b"a\xff", r"b'a\\xff'|b'a\\\\xff'"),
     ],
 )
-def test_cells_that_are_no_number_or_name(column: str, value: Any, shown: str) -> None:
+def test_invalid_numbers_and_names(column: str, value: Any, shown: str) -> None:
     with pytest.raises(DataError, match=rf"table, row 1: column '{column}' holds .*{shown}"):
         nnode.sequences(lane().assign(**{column: cells(value)}))
 
 
-def test_complex_numbers_keep_no_real_part() -> None:
+def test_complex_numbers_are_not_numbers() -> None:
     assert np.isnan(floats(pd.Series([1 + 2j]))).all()
 
 
 @pytest.mark.parametrize("value", [{}, [1], np.array([1, 2]), b"a\xff", 10**400], ids=str)
-def test_cells_of_columns_that_are_not_read_may_be_anything(value: Any) -> None:
+def test_cells_of_other_columns_are_ignored(value: Any) -> None:
     assert len(nnode.sequences(lane().assign(note=cells(value)))) == 1
 
 
-def test_zero_characters_do_not_make_two_names_of_one(tmp_path: Path) -> None:
+def test_null_characters_in_names_are_removed(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     lane().to_csv(path, index=False)
     path.write_bytes(path.read_bytes().replace(b"c1,", b"c1\0,", 1))
     assert set(Table(path).names("agent")) == {"c0", "c1", "c2"}
 
 
-def test_names_of_bytes_that_are_no_text(tmp_path: Path) -> None:
+def test_names_with_invalid_encoding(tmp_path: Path) -> None:
     path = tmp_path / "a.parquet"
     lane().replace({"agent": {"c1": "zzqq"}}).to_parquet(path, compression=None)
     path.write_bytes(path.read_bytes().replace(b"zzqq", b"\xffzqq"))
@@ -77,14 +77,14 @@ def test_names_of_bytes_that_are_no_text(tmp_path: Path) -> None:
         Table(path).names("agent")
 
 
-def test_what_nobody_thought_of_names_the_file() -> None:
+def test_unexpected_error_names_the_file() -> None:
     with (
         pytest.raises(DataError, match=r"a\.csv cannot be read \(KeyError: 'q'\)"),
         reading("a.csv"),
     ):
         raise KeyError("q")
-    with pytest.raises(ConfigError, match=r"^own$"), reading("a.csv"):
-        raise ConfigError("own")
+    with pytest.raises(ConfigError, match=r"^message$"), reading("a.csv"):
+        raise ConfigError("message")
 
 
 @pytest.mark.parametrize("length", [0.0, -4.5])
@@ -97,7 +97,7 @@ def test_what_nobody_thought_of_names_the_file() -> None:
         (PairOptions, "follower_length"),
     ],
 )
-def test_lengths_are_positive(
+def test_lengths_must_be_positive(
     tmp_path: Path, kind: type[DataOptions], column: str, length: float
 ) -> None:
     table = tidy(4, 2).assign(vehicle=0, x_follower=0.0, x_leader=30.0).assign(**{column: length})
@@ -118,13 +118,11 @@ PLATOON = "run,position,t,v,gap\n" + "".join(
             (f"r,{position},0.5,10,15\n", "line 38: position is .* whole number from 1 to 1000")
             for position in ("2147483648", "1001", "-4", "0", "1.5", "1e300")
         ),
-        # times that would ask for a large table
+        # times that would need a large table
         ("".join(f"r,{p},90000.0,10,15\n" for p in range(4, 16)), "wrong, or cut the file"),
     ],
 )
-def test_places_and_times_of_a_platoon_that_are_none(
-    tmp_path: Path, rows: str, message: str
-) -> None:
+def test_invalid_positions_and_times_of_a_platoon(tmp_path: Path, rows: str, message: str) -> None:
     path = tmp_path / "flat.csv"
     path.write_text(PLATOON + rows)
     with pytest.raises(DataError, match=message):
@@ -132,7 +130,7 @@ def test_places_and_times_of_a_platoon_that_are_none(
 
 
 @pytest.mark.parametrize("encoding", ["inf", "utf-7", "shift_jis", "idna"])
-def test_an_encoding_of_xml_that_is_not_read(tmp_path: Path, encoding: str) -> None:
+def test_unsupported_xml_encodings(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "a.xml"
     path.write_text(
         f'<?xml version="1.0" encoding="{encoding}"?>\n<fcd-export>\n<timestep time="0">'
@@ -142,18 +140,18 @@ def test_an_encoding_of_xml_that_is_not_read(tmp_path: Path, encoding: str) -> N
         read(SumoOptions, path)
 
 
-def test_clocks_of_ngsim_out_of_range(tmp_path: Path) -> None:
+def test_ngsim_clock_out_of_range(tmp_path: Path) -> None:
     from benchmarks.fault_injection.targets import CORPUS
 
-    path, sound = tmp_path / "a.csv", (CORPUS / "ngsim.csv").read_bytes()
-    path.write_bytes(sound.replace(b",1113433135100,", b",1e308,", 1))
+    path, content = tmp_path / "a.csv", (CORPUS / "ngsim.csv").read_bytes()
+    path.write_bytes(content.replace(b",1113433135100,", b",1e308,", 1))
     with pytest.raises(DataError, match=r"line 2: Global_Time and Frame_ID put frame 0 at 1e\+308"):
         read(NgsimOptions, path)
 
 
-def test_vehicles_with_numbers_of_thousands_of_digits(tmp_path: Path) -> None:
+def test_error_message_shortens_long_cells(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("vehicle,time,x\n" + "".join(f"{n},0,{'9' * 5000}\n" for n in range(4)))
-    with pytest.raises(DataError, match="holds") as told:
+    with pytest.raises(DataError, match="holds") as error:
         read(VehicleTableOptions, path)
-    assert len(str(told.value)) <= 2000
+    assert len(str(error.value)) <= 2000

@@ -1,4 +1,4 @@
-"""Reading the ESIMAS sequences: shapes, names, and files that are not what they should be."""
+"""The ESIMAS sequences: shapes, names, and invalid files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def recording(tmp_path: Path) -> Path:
     return esimas(tmp_path / "sequence_datademo.mat", (x, time), (x[:2, :3], time[:3]))
 
 
-def test_reads_positions_times_and_names(recording: Path) -> None:
+def test_positions_times_and_names(recording: Path) -> None:
     first, second = read_esimas(recording)
     assert (first.name, second.name, first.recording) == ("demo/000", "demo/001", "demo")
     assert first.x.shape == (4, 3, 1)
@@ -30,37 +30,31 @@ def test_reads_positions_times_and_names(recording: Path) -> None:
     assert first.agents == ()
 
 
-def test_reads_one_struct_array_as_well_as_cells(tmp_path: Path) -> None:
+def test_struct_array_without_cells(tmp_path: Path) -> None:
     structs = np.zeros((2,), dtype=[("Xarr", "O"), ("Tarr", "O")])
     for i in range(2):
         structs[i] = (np.array([[0.0, 4.0, 8.0], [30.0, 35.0, 40.0]]), np.array([0.0, 0.2, 0.4]))
-    savemat(tmp_path / "sequence_dataown.mat", {"sequences": structs})
-    assert [s.x.shape for s in read_esimas(tmp_path / "sequence_dataown.mat")] == [(3, 2, 1)] * 2
+    savemat(tmp_path / "sequence_datax.mat", {"sequences": structs})
+    assert [s.x.shape for s in read_esimas(tmp_path / "sequence_datax.mat")] == [(3, 2, 1)] * 2
 
 
-def test_holes_cut_and_uneven_times_are_interpolated(tmp_path: Path) -> None:
+def test_holes_and_uneven_times(tmp_path: Path) -> None:
+    """A hole divides a platoon; uneven times are interpolated."""
+
+    def platoon(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([[0.0], [30.0]]) + 25 * time, time
+
     time = 0.2 * np.arange(12)
-    x = np.array([[0.0], [30.0]]) + 25 * time
-    late = time + np.where(np.arange(12) == 5, 0.05, 0.0)
-    gone = np.delete(np.arange(12), [5, 6])
-    path = esimas(
-        tmp_path / "sequence_dataown.mat",
-        (x, time),
-        (np.array([[0.0], [30.0]]) + 25 * late, late),
-        (x[:, gone], time[gone]),
-    )
-    result = read_esimas(path)
-    assert [(s.name, s.n_samples) for s in result] == [
-        ("own/000", 12),
-        ("own/001", 12),
-        ("own/002_000", 5),
-        ("own/002_001", 5),
-    ]
+    uneven = time + 0.05 * (np.arange(12) == 5)
+    times = (time, uneven, np.delete(time, [5, 6]))
+    result = read_esimas(esimas(tmp_path / "sequence_datax.mat", *map(platoon, times)))
+    sizes = {s.name: s.n_samples for s in result}
+    assert sizes == {"x/000": 12, "x/001": 12, "x/002_000": 5, "x/002_001": 5}
     assert all(s.agents == () for s in result)
     np.testing.assert_allclose(result[1].x, result[0].x, atol=1e-9)
-    uneven, cut = result.notes
-    assert "times are uneven" in uneven
-    assert "sequence own/002: not all vehicles are there at 2 of 12 times" in cut
+    interpolated, divided = result.notes
+    assert "times are uneven" in interpolated
+    assert "sequence x/002: not all vehicles are there at 2 of 12 times" in divided
 
 
 @pytest.mark.real
@@ -85,36 +79,32 @@ def test_agrees_with_the_raw_file(real_data: Path) -> None:
         np.testing.assert_array_equal(s.time, cell["Tarr"])
 
 
-def test_other_recordings_of_a_folder(recording: Path) -> None:
-    source = str(recording.parent)
-    assert list(esimas_files(EsimasOptions(source=source))) == ["demo"]
-    assert list(esimas_files(EsimasOptions(source=source, recording=["demo"]))) == ["demo"]
+@pytest.mark.parametrize("options", [{}, {"recording": ["demo"]}])
+def test_recordings_of_a_folder(recording: Path, options: dict[str, list[str]]) -> None:
+    assert list(esimas_files(EsimasOptions(source=str(recording.parent), **options))) == ["demo"]
 
 
-def test_families_are_not_mixed_up(recording: Path) -> None:
+def test_families_are_kept_apart(recording: Path) -> None:
     esimas(recording.with_name("sequence_data_demo.mat"), (np.ones((2, 3)), np.arange(3.0)))
-    source = str(recording.parent)
-    three = esimas_files(EsimasOptions(source=source))
-    two = esimas_files(EsimasOptions(source=source, min_vehicles=2))
-    assert three["demo"].name == "sequence_datademo.mat"
-    assert two["demo"].name == "sequence_data_demo.mat"
-    assert list(three) == list(two) == ["demo"]
+    for size, name in ((3, "sequence_datademo.mat"), (2, "sequence_data_demo.mat")):
+        files = esimas_files(EsimasOptions(source=str(recording.parent), min_vehicles=size))
+        assert {key: path.name for key, path in files.items()} == {"demo": name}
 
 
-def test_unknown_recording_names_the_nearest_first(recording: Path) -> None:
-    with pytest.raises(ConfigError, match=r"recording=dem0.*nearest first.*are: demo, .*1-1_1"):
-        esimas_files(EsimasOptions(source=str(recording.parent), recording="dem0"))
-
-
-def test_unknown_family() -> None:
-    with pytest.raises(ConfigError, match="min_vehicles=4"):
-        esimas_files(EsimasOptions(min_vehicles=4))
-
-
-@pytest.mark.parametrize("value", [[], {"a": 1}, 1.5])
-def test_recording_must_be_names(recording: Path, value: object) -> None:
-    with pytest.raises(ConfigError, match="expected 'all', a name or a list of names"):
-        esimas_files(EsimasOptions(source=str(recording.parent), recording=value))
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"min_vehicles": 4}, "min_vehicles=4"),
+        ({"recording": "dem0"}, r"recording=dem0.*nearest first.*are: demo, .*1-1_1"),
+        *(
+            ({"recording": value}, "expected 'all', a name or a list of names")
+            for value in ([], {"a": 1}, 1.5)
+        ),
+    ],
+)
+def test_invalid_options(recording: Path, options: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        esimas_files(EsimasOptions(source=str(recording.parent), **options))
 
 
 @pytest.mark.parametrize("size", [0, 60, 200, 300])
@@ -124,31 +114,38 @@ def test_truncated_file(recording: Path, size: int) -> None:
         read_esimas(recording)
 
 
-def test_file_of_another_format(tmp_path: Path) -> None:
-    path = tmp_path / "sequence_dataown.mat"
-    path.write_text("time,x\n0,1\n")
-    with pytest.raises(DataError, match="cannot be read as a MATLAB file"):
-        read_esimas(path)
-    with pytest.raises(DataError, match="there is no file"):
-        read_esimas(tmp_path / "sequence_dataother.mat")
-    with pytest.raises(DataError, match="expected a file name like"):
-        read_esimas(tmp_path / "other.mat")
+def test_other_format_and_other_names(tmp_path: Path) -> None:
+    (tmp_path / "sequence_datax.mat").write_text("time,x\n0,1\n")
+    for name, message in (
+        ("sequence_datax.mat", "cannot be read as a MATLAB file"),
+        ("sequence_dataother.mat", "there is no file"),
+        ("other.mat", "expected a file name like"),
+    ):
+        with pytest.raises(DataError, match=message):
+            read_esimas(tmp_path / name)
 
 
-def test_other_content(tmp_path: Path) -> None:
-    path = tmp_path / "sequence_dataown.mat"
-    savemat(path, {"data": np.ones(3)})
-    with pytest.raises(DataError, match="expected a cell array 'sequences', found data"):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"data": np.ones(3)}, "expected a cell array 'sequences', found data"),
+        ({"sequences": np.empty((0, 1), dtype=object)}, "is empty"),
+        ({"sequences": np.ones((2, 2))}, "sequence 0: expected a struct"),
+    ],
+)
+def test_invalid_content(tmp_path: Path, content: dict[str, np.ndarray], message: str) -> None:
+    path = tmp_path / "sequence_datax.mat"
+    savemat(path, content)
+    with pytest.raises(DataError, match=message):
         read_esimas(path)
-    savemat(path, {"sequences": np.empty((0, 1), dtype=object)})
-    with pytest.raises(DataError, match="is empty"):
-        read_esimas(path)
-    savemat(path, {"sequences": np.ones((2, 2))})
-    with pytest.raises(DataError, match=r"sequence 0: expected a struct"):
-        read_esimas(path)
-    esimas(path, (np.ones((2, 3)), np.arange(3.0)), (np.ones((2, 3)), np.arange(4.0)))
+
+
+def test_invalid_platoons(tmp_path: Path) -> None:
+    path = tmp_path / "sequence_datax.mat"
+    time = np.arange(3.0)
+    esimas(path, (np.ones((2, 3)), time), (np.ones((2, 3)), np.arange(4.0)))
     with pytest.raises(DataError, match=r"sequence 1: expected Xarr .* found \(2, 3\) and \(4,\)"):
         read_esimas(path)
-    esimas(path, (np.array("text"), np.arange(3.0)))
+    esimas(path, (np.array("text"), time))
     with pytest.raises(DataError, match="Xarr holds no plain numbers"):
         read_esimas(path)

@@ -1,4 +1,4 @@
-"""Reading recordings in the format of highD: directions, fronts, classes, and what is missing."""
+"""Recordings in the format of highD: directions, fronts, classes, and missing tables."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ CARS = [
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """Both carriageways for 4 s at 25 frames/s; those in lane 2 drive to the left."""
+    """Both carriageways for 4 s at 25 frames/s; the vehicles in lane 2 drive to the left."""
     frames = np.arange(1, 102)
     tracks = pd.concat(
         pd.DataFrame(
             {
                 "frame": frames,
                 "id": number,
-                "x": corner + (1 if way == 2 else -1) * 0.8 * (frames - 1),
+                "x": corner + (1 if direction == 2 else -1) * 0.8 * (frames - 1),
                 "y": 8.0,
                 "width": length,
                 "height": 2.0,
-                "xVelocity": 20.0 if way == 2 else -20.0,
+                "xVelocity": 20.0 if direction == 2 else -20.0,
                 "laneId": lane,
             }
         )
-        for number, lane, way, length, corner, _ in CARS
+        for number, lane, direction, length, corner, _ in CARS
     )
     tracks.to_csv(tmp_path / "07_tracks.csv", index=False)
     meta = pd.DataFrame(
-        [(number, kind, way) for number, _, way, _, _, kind in CARS],
+        [(number, kind, direction) for number, _, direction, _, _, kind in CARS],
         columns=["id", "class", "drivingDirection"],
     )
     meta.to_csv(tmp_path / "07_tracksMeta.csv", index=False)
@@ -58,7 +58,7 @@ def recording(tmp_path: Path) -> Path:
 read = partial(tables.read, HighDOptions)
 
 
-def test_fronts_grow_in_both_directions(recording: Path) -> None:
+def test_positions_increase_in_both_directions(recording: Path) -> None:
     left, right = read(recording, kinds={"Car": "car", "Truck": "truck"})
     assert [s.recording for s in (left, right)] == ["07_lane2", "07_lane5"]
     assert (left.agents, right.agents) == (("6", "5", "4"), ("1", "2", "3"))
@@ -73,7 +73,7 @@ def test_fronts_grow_in_both_directions(recording: Path) -> None:
         np.testing.assert_allclose(np.diff(s.x, axis=0), 4.0)
 
 
-def test_lanes_are_chosen_and_prepared(recording: Path, tmp_path: Path) -> None:
+def test_prepare_one_lane(recording: Path, tmp_path: Path) -> None:
     options = HighDOptions(path=str(recording), lane=5, faults=Faults.error)
     store = prepare(options, tmp_path / "out")
     assert [s.recording for s in store] == ["07_lane5"]
@@ -82,34 +82,33 @@ def test_lanes_are_chosen_and_prepared(recording: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("missing", ["07_tracksMeta.csv", "07_recordingMeta.csv"])
-def test_a_missing_table_is_named(recording: Path, missing: str) -> None:
+def test_missing_table_is_named(recording: Path, missing: str) -> None:
     recording.with_name(missing).unlink()
     with pytest.raises(DataError, match=f"no file .*{missing}.*beside it"):
         read(recording)
 
 
-def test_another_file_of_the_recording(recording: Path) -> None:
+def test_path_of_another_table_of_the_recording(recording: Path) -> None:
     with pytest.raises(ConfigError, match=r"expected a file NAME_tracks\.csv"):
         read(recording.with_name("07_tracksMeta.csv"))
 
 
 @pytest.mark.parametrize(
-    ("name", "old", "new", "words"),
+    ("name", "old", "new", "message"),
     [
-        ("07_tracksMeta.csv", "4,Car,1", "4,Car,3", ["line 5", "drivingDirection is 3"]),
-        ("07_tracksMeta.csv", "2,Truck,2\n", "", ["line 103", "track 2", "tracksMeta"]),
-        ("07_tracksMeta.csv", "drivingDirection", "way", ["drivingDirection", "way"]),
-        ("07_recordingMeta.csv", "7,25,-1", "7,0,-1", ["frameRate", "positive"]),
-        ("07_recordingMeta.csv", "7,25,-1\n", "7,25,-1\n8,25,-1\n", ["one row", "2 rows"]),
-        ("07_tracks.csv", "1,1,0.0,8.0", "1,1,here,8.0", ["line 2", "'here'"]),
-        ("07_tracks.csv", "2,1,0.8,8.0", "1,1,0.8,8.0", ["line 3", "agent 1", "second time"]),
+        ("07_tracksMeta.csv", "4,Car,1", "4,Car,3", "line 5.*drivingDirection is 3"),
+        ("07_tracksMeta.csv", "2,Truck,2\n", "", "line 103.*track 2.*tracksMeta"),
+        ("07_tracksMeta.csv", "drivingDirection", "way", "drivingDirection.*way"),
+        ("07_recordingMeta.csv", "7,25,-1", "7,0,-1", "frameRate.*positive"),
+        ("07_recordingMeta.csv", "7,25,-1\n", "7,25,-1\n8,25,-1\n", "one row.*2 rows"),
+        ("07_tracks.csv", "1,1,0.0,8.0", "1,1,here,8.0", "line 2.*'here'"),
+        ("07_tracks.csv", "2,1,0.8,8.0", "1,1,0.8,8.0", "line 3.*agent 1.*second time"),
     ],
 )
-def test_one_clear_error(recording: Path, name: str, old: str, new: str, words: list[str]) -> None:
+def test_invalid_tables(recording: Path, name: str, old: str, new: str, message: str) -> None:
     path = recording.with_name(name)
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=f"(?s){message}"):
         read(recording)
-    assert all(word in str(caught.value) for word in words), str(caught.value)

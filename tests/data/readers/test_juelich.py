@@ -1,4 +1,4 @@
-"""Reading trajectory text files of people: cutting, units, walls, velocities, bad lines."""
+"""Text files of pedestrians: sequences, units, walls, velocities, invalid lines."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nnode.data.cut import Reading
 from nnode.data.readers.juelich import JuelichOptions, Velocity, juelich_files, read_juelich
 from nnode.errors import ConfigError, DataError
 
@@ -25,19 +26,23 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
+def read(path: Path, **options: object) -> Reading:
+    return read_juelich(path, JuelichOptions(**options))
+
+
 @pytest.fixture
 def corridor(tmp_path: Path) -> Path:
     text = HEADER + lines(10, 70, 3) + lines(10, 50, 7, y=200) + lines(20, 70, 8, y=300)
     return write(tmp_path / "corridor.txt", text)
 
 
-def test_cuts_consecutive_sequences_that_share_a_sample(corridor: Path) -> None:
-    first, second = read_juelich(corridor, JuelichOptions())
+def test_consecutive_sequences_share_a_sample(corridor: Path) -> None:
+    first, second = read(corridor)
     assert (first.n_samples, second.n_samples) == (26, 26)
     assert first.time[-1] == second.time[0] == pytest.approx(35 / 25)
-    assert first.agents == ("3", "7")  # 8 comes later
+    assert first.agents == ("3", "7")  # 8 enters later
     assert second.agents == ("3", "8")  # 7 leaves before
-    assert [s.name for s in (first, second)] == ["corridor/000", "corridor/001"]
+    assert (first.name, second.name) == ("corridor/000", "corridor/001")
     np.testing.assert_allclose(first.x[:, 0, 0], -2 + 0.04 * np.arange(10, 36))
     np.testing.assert_allclose(first.x[:, :, 1], np.tile([1.0, 2.0], (26, 1)))
     np.testing.assert_allclose(first.destination, first.x[-1])
@@ -46,39 +51,37 @@ def test_cuts_consecutive_sequences_that_share_a_sample(corridor: Path) -> None:
 
 def test_metres_without_header(tmp_path: Path) -> None:
     text = "".join(f"1 {f} 0.5 {0.1 * f:.3f} 1.7\r\n" for f in range(17))
-    path = write(tmp_path / "run.txt", text)
-    (s,) = read_juelich(path, JuelichOptions(frame_rate=16, unit="m", walking_axis="y"))
+    (s,) = read(write(tmp_path / "run.txt", text), frame_rate=16, unit="m", walking_axis="y")
     assert s.dt == pytest.approx(1 / 16)
     np.testing.assert_allclose(s.x[:, 0, 1], 0.1 * np.arange(17))
 
 
 def test_view_keeps_people_who_stay_inside(corridor: Path) -> None:
     # Person 3 walks from -1.6 m at frame 10 to -0.6 m at frame 35 and +0.4 m at frame 60.
-    sequences = read_juelich(corridor, JuelichOptions(view=[-1.0, 3.0]))
-    assert [s.agents for s in sequences] == [("3", "8")]
-    assert sequences[0].time[0] == pytest.approx(35 / 25)
+    (s,) = read(corridor, view=[-1.0, 3.0])
+    assert s.agents == ("3", "8")
+    assert s.time[0] == pytest.approx(35 / 25)
 
 
-def test_a_person_lost_for_some_frames_is_not_present_throughout(tmp_path: Path) -> None:
+def test_person_with_missing_frames_is_left_out(tmp_path: Path) -> None:
     text = HEADER + lines(0, 10, 1) + lines(12, 25, 1) + lines(0, 25, 2, y=300)
-    (s,) = read_juelich(write(tmp_path / "gap.txt", text), JuelichOptions())
+    (s,) = read(write(tmp_path / "gap.txt", text))
     assert s.agents == ("2",)
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
-def test_the_corridor_lies_left_of_both_walls(tmp_path: Path, axis: str) -> None:
+def test_corridor_is_left_of_both_walls(tmp_path: Path, axis: str) -> None:
     along, across = (0, 1) if axis == "x" else (1, 0)
     rows = []
     for f in range(26):
-        place = [0.0, 0.0]
-        place[along], place[across] = 4.0 * f - 50, 150.0
-        rows.append(f"1 {f} {place[0]} {place[1]} 0\n")
-    path = write(tmp_path / "a-300-b.txt", HEADER + "".join(rows))
-    options = JuelichOptions(
-        walking_axis=axis, walls={"*-300-*": [0.0, 3.0], "other": [1.0, 2.0]}, view=[-4.0, 4.0]
+        place = [4.0 * f - 50, 150.0]
+        rows.append(f"1 {f} {place[along]} {place[across]} 0\n")
+    (s,) = read(
+        write(tmp_path / "a-300-b.txt", HEADER + "".join(rows)),
+        walking_axis=axis,
+        walls={"*-300-*": [0.0, 3.0], "other": [1.0, 2.0]},
+        view=[-4.0, 4.0],
     )
-    (s,) = read_juelich(path, options)
-    assert s.walls is not None
     begin, end = s.walls[:, :2], s.walls[:, 2:]
     np.testing.assert_allclose(begin[:, across], [0, 3])
     np.testing.assert_allclose(end[:, across], [0, 3])
@@ -88,28 +91,25 @@ def test_the_corridor_lies_left_of_both_walls(tmp_path: Path, axis: str) -> None
         assert (d[:, 0] * r[:, 1] - d[:, 1] * r[:, 0] > 0).all()
 
 
-def test_no_walls_where_no_pattern_matches(corridor: Path) -> None:
-    assert read_juelich(corridor, JuelichOptions(walls={"other": [0, 1]}))[0].walls is None
+def test_no_walls_without_a_matching_pattern(corridor: Path) -> None:
+    assert read(corridor, walls={"other": [0, 1]})[0].walls is None
 
 
 @pytest.mark.parametrize("scheme", list(Velocity))
 def test_velocities_use_neighbouring_frames(tmp_path: Path, scheme: Velocity) -> None:
-    frames = np.arange(0, 76)
-    x = 0.01 * frames**2.0  # cm
-    rows = "".join(f"1 {f} {p:.6f} 0 0\n" for f, p in zip(frames, x, strict=True))
-    options = JuelichOptions(velocity=scheme)
-    _, middle, last = read_juelich(write(tmp_path / "a.txt", HEADER + rows), options)
-    k = frames[25:51]
+    rows = "".join(f"1 {f} {0.01 * f**2:.6f} 0 0\n" for f in range(76))  # cm
+    _, middle, last = read(write(tmp_path / "a.txt", HEADER + rows), velocity=scheme)
+    k = np.arange(25, 51)
     difference = {
         # x(k+1) - x(k), (x(k+1) - x(k-1)) / 2, x(k) - x(k-1) of 0.01 k²
         Velocity.forward: 2 * k + 1.0,
         Velocity.central: 2.0 * k,
         Velocity.backward: 2 * k - 1.0,
     }[scheme]
-    if scheme is Velocity.forward:  # looks at nothing beyond the sequence
+    if scheme is Velocity.forward:  # uses no sample after the sequence
         difference[-1] = difference[-2]
     np.testing.assert_allclose(middle.velocity()[:, 0, 0], 0.01 * difference * 25 / 100, atol=1e-6)
-    end = 2 * 75 - 1.0  # no frame follows: one-sided
+    end = 2 * 75 - 1.0  # one-sided, as no frame follows
     assert last.velocity()[-1, 0, 0] == pytest.approx(0.01 * end * 25 / 100, abs=1e-6)
 
 
@@ -130,7 +130,7 @@ def test_published_corridor(real_data: Path) -> None:
 
 
 @pytest.mark.real
-def test_published_headerless_runs(real_data: Path) -> None:
+def test_published_runs_without_header(real_data: Path) -> None:
     options = JuelichOptions(
         name="hermes", source=str(real_data), frame_rate=16, unit="cm", walking_axis="y"
     )
@@ -154,19 +154,26 @@ def test_published_headerless_runs(real_data: Path) -> None:
         ({"walking_axis": "z"}, r"walking_axis=z: expected one of x, y"),
         ({"view": [3.0, -3.0]}, r"view=\[3.0, -3.0\]: expected \[low, high\]"),
         ({"walls": {"*": [4.0]}}, r"walls.\*=\[4.0\]: expected \[low, high\]"),
+        ({"history": -1.0}, "history"),
     ],
 )
-def test_bad_options(corridor: Path, options: dict, message: str) -> None:
+def test_invalid_options(corridor: Path, options: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        read_juelich(corridor, JuelichOptions(**options))
+        read(corridor, **options)
 
 
-def test_headerless_files_need_rate_and_unit(tmp_path: Path) -> None:
-    path = write(tmp_path / "run.txt", lines(0, 30, 1))
-    with pytest.raises(ConfigError, match=r"no frame rate: set data.frame_rate \(1/s\)"):
-        read_juelich(path, JuelichOptions(unit="cm"))
-    with pytest.raises(ConfigError, match=r"no unit: set data.unit \(cm, m\)"):
-        read_juelich(path, JuelichOptions(frame_rate=25))
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"unit": "cm"}, r"no frame rate: set data.frame_rate \(1/s\)"),
+        ({"frame_rate": 25}, r"no unit: set data.unit \(cm, m\)"),
+    ],
+)
+def test_files_without_header_need_rate_and_unit(
+    tmp_path: Path, options: dict, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read(write(tmp_path / "run.txt", lines(0, 30, 1)), **options)
 
 
 @pytest.mark.parametrize(
@@ -185,28 +192,25 @@ def test_headerless_files_need_rate_and_unit(tmp_path: Path) -> None:
         (HEADER + lines(0, 10, 1), "no sequence"),
     ],
 )
-def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_files(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(DataError, match=message):
-        read_juelich(write(tmp_path / "bad.txt", text), JuelichOptions())
+        read(write(tmp_path / "bad.txt", text))
 
 
 def test_too_few_people(corridor: Path) -> None:
     with pytest.raises(DataError, match="nowhere are 3 people present for 1 s"):
-        read_juelich(corridor, JuelichOptions(min_agents=3))
+        read(corridor, min_agents=3)
 
 
-def test_preferred_velocities_are_those_before_a_sequence(tmp_path: Path) -> None:
-    # 1 turns round at frame 25; 2 comes at frame 15, half a second before the second sequence
-    away = lines(0, 24, 1) + "".join(
-        f"1 {f} {-200 + 4 * (50 - f):.1f} 100 176\n" for f in range(25, 51)
-    )
-    path = write(tmp_path / "turn.txt", HEADER + away + lines(15, 50, 2, y=200))
-    first, second = read_juelich(path, JuelichOptions())
+def test_preferred_velocities_precede_a_sequence(tmp_path: Path) -> None:
+    # 1 turns round at frame 25; 2 enters at frame 15, 0.4 s before the second sequence
+    back = [f"1 {f} {-200 + 4 * (50 - f):.1f} 100 176\n" for f in range(25, 51)]
+    text = HEADER + lines(0, 24, 1) + "".join(back) + lines(15, 50, 2, y=200)
+    path = write(tmp_path / "turn.txt", text)
+    first, second = read(path)
     assert first.preferred is None
     np.testing.assert_allclose(second.preferred, [[1.0, 0.0], [np.nan, np.nan]], atol=1e-9)
     np.testing.assert_allclose(second.velocity()[:, 0], [[-1.0, 0.0]] * 26, atol=1e-9)
-    half = read_juelich(path, JuelichOptions(history=0.4))[1].preferred
-    np.testing.assert_allclose(half, [[1.0, 0.0], [1.0, 0.0]], atol=1e-9)
-    assert read_juelich(path, JuelichOptions(history=0.0))[1].preferred is None
-    with pytest.raises(ConfigError, match="history"):
-        read_juelich(path, JuelichOptions(history=-1.0))
+    preferred = read(path, history=0.4)[1].preferred
+    np.testing.assert_allclose(preferred, [[1.0, 0.0], [1.0, 0.0]], atol=1e-9)
+    assert read(path, history=0.0)[1].preferred is None

@@ -1,4 +1,4 @@
-"""Reading NGSIM's public file as it is published, with its path as the only option."""
+"""NGSIM's public file as it is published."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.data.readers.ngsim_file import COLUMNS, FOOT, STREET, period, publish
 read = partial(tables.read, NgsimOptions, window=10.0)
 
 
-def test_the_published_file(tmp_path: Path) -> None:
+def test_published_file(tmp_path: Path) -> None:
     table = period("i-80", "1600")
     s = read(published(tmp_path / "NGSIM.csv", table))[0]
     assert (s.name, s.recording) == ("i-80_1600_lane1/000", "i-80_1600_lane1")
@@ -36,12 +36,12 @@ def test_the_published_file(tmp_path: Path) -> None:
 
 def test_locations_and_periods_are_recordings(tmp_path: Path) -> None:
     periods = [("i-80", "1600"), ("i-80", "1700"), ("us-101", "0750"), ("us-101", "0805")]
-    tables = [period(*which, seed=i) for i, which in enumerate(periods)]
+    tables = [period(*key, seed=i) for i, key in enumerate(periods)]
     path = published(tmp_path / "all.csv", *tables)
     names = {s.recording for s in read(path)}
     assert names == {f"{a}_{b}_lane{lane}" for a, b in periods for lane in (1, 2)}
-    (only,) = {s.recording for s in read(path, recording="us-101_0805_lane2")}
-    assert only == "us-101_0805_lane2"
+    selected = read(path, recording="us-101_0805_lane2")
+    assert {s.recording for s in selected} == {"us-101_0805_lane2"}
     assert {s.recording[-5:] for s in read(path, lane=2)} == {"lane2"}
     with pytest.raises(ConfigError, match=r"lane=9: .* has the lanes 1, 2"):
         read(path, lane=9)
@@ -50,7 +50,7 @@ def test_locations_and_periods_are_recordings(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["trajectories-0400-0415.txt", "trajectories-0400-0415.csv"])
-def test_older_files_have_neither_names_nor_location(tmp_path: Path, name: str) -> None:
+def test_older_files_without_names_and_location(tmp_path: Path, name: str) -> None:
     table = period("i-80", "1600")
     old, new = read(quarter(tmp_path / name, table)), read(published(tmp_path / "new.csv", table))
     assert old[0].recording == "trajectories-0400-0415_1600_lane1"
@@ -60,7 +60,7 @@ def test_older_files_have_neither_names_nor_location(tmp_path: Path, name: str) 
         assert sequence.agents == other.agents
 
 
-def test_capitals_thousands_and_rows_that_stand_there_twice(tmp_path: Path) -> None:
+def test_lower_case_thousands_separators_and_repeated_rows(tmp_path: Path) -> None:
     table = period("i-80", "1600")
     expected = read(published(tmp_path / "a.csv", table))
     table.columns = [name.lower() for name in COLUMNS]
@@ -82,22 +82,23 @@ def test_streets_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
         read(published(tmp_path / "b.csv", street))
 
 
-def test_a_platoon_ends_where_a_vehicle_changes_lane(tmp_path: Path) -> None:
+def test_lane_change_divides_a_platoon(tmp_path: Path) -> None:
     table = period("i-80", "1600", cars=6)
     table.loc[(table.Vehicle_ID == 3) & (table.Frame_ID > 150), "Lane_ID"] = 3
-    agents = {
-        (s.recording[-5:], s.agents, s.time[0]) for s in read(published(tmp_path / "a", table))
+    parts: dict[str, set[tuple[str, ...]]] = {"first": set(), "during": set(), "after": set()}
+    for s in read(published(tmp_path / "a", table)):
+        if s.recording.endswith("lane1"):
+            part = "first" if s.time[0] < 5 else "during" if s.time[0] < 15 else "after"
+            parts[part].add(s.agents)
+    assert parts == {
+        "first": {("6", "5", "4", "3", "2", "1")},
+        "during": {("6", "5", "4")},  # two vehicles ahead of the lane changer are too few
+        "after": {("6", "5", "4", "2", "1")},
     }
-    first = {cars for lane, cars, start in agents if lane == "lane1" and start < 5}
-    during = {cars for lane, cars, start in agents if lane == "lane1" and 5 < start < 15}
-    after = {cars for lane, cars, start in agents if lane == "lane1" and start > 15}
-    assert first == {("6", "5", "4", "3", "2", "1")}
-    assert during == {("6", "5", "4")}  # the two ahead of the place are too few
-    assert after == {("6", "5", "4", "2", "1")}
 
 
-def test_an_identifier_that_is_used_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Car 10 of lane 2 leaves; the car that bears its number ten seconds later enters behind."""
+def test_reused_identifier(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Car 10 of lane 2 leaves; ten seconds later another car with its number enters at the rear."""
     table = period("i-80", "1600", seconds=45.0)
     ten = table.Vehicle_ID == 10
     table.loc[ten & (table.Frame_ID > 250), "Local_Y"] -= 600
@@ -113,7 +114,7 @@ def test_an_identifier_that_is_used_again(tmp_path: Path, caplog: pytest.LogCapt
     assert ("10", "9", "8", "7", "6") in kept
 
 
-def test_a_preparation_needs_the_path_alone(tmp_path: Path) -> None:
+def test_prepare_needs_only_the_path(tmp_path: Path) -> None:
     path = published(tmp_path / "NGSIM.csv", period("i-80", "1600"))
     store = prepare(NgsimOptions(path=str(path), window=10.0), tmp_path / "out")
     assert len(store) == 6  # 40 s less the first 0.2 s are three windows in each of two lanes
@@ -121,28 +122,25 @@ def test_a_preparation_needs_the_path_alone(tmp_path: Path) -> None:
     assert store.manifest["identifiers"] == []
 
 
-def test_files_that_are_something_else(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    path.write_text("id,t,x\n1,0,0\n")
-    with pytest.raises(DataError, match=r"lacks Vehicle_ID, Frame_ID, .*; it has: id, t, x; .*"):
-        read(path)
-    path.write_text("1 2 3\n4 5 6\n")
-    with pytest.raises(DataError, match=r"has 3 columns without names; NGSIM's files have 18, 19"):
-        read(path)
+def test_invalid_files(tmp_path: Path) -> None:
     table = period("i-80", "1600")
-    table["Local_Y"] = table["Local_Y"].astype(object)
-    table.iloc[7, COLUMNS.index("Local_Y")] = "far"
-    table.to_csv(path, index=False)
-    with pytest.raises(DataError, match=r"line 9: column 'Local_Y' holds 'far'"):
-        read(path)
-    two = pd.concat([period("i-80", "1600"), period("i-80", "1600").assign(Local_Y=1.0).iloc[:1]])
-    two.to_csv(path, index=False)
-    with pytest.raises(DataError, match=r"line 4002: agent 1 stands .* at 0.1 s .*in line 2"):
-        read(path)
+    wrong_cell = table.astype({"Local_Y": object}).reset_index(drop=True)
+    wrong_cell.loc[7, "Local_Y"] = "far"
+    repeated = pd.concat([table, table.iloc[:1].assign(Local_Y=1.0)])
+    path = tmp_path / "t.csv"
+    for text, message in (
+        ("id,t,x\n1,0,0\n", r"lacks Vehicle_ID, Frame_ID, .*; it has: id, t, x; .*"),
+        ("1 2 3\n4 5 6\n", "has 3 columns without names; NGSIM's files have 18, 19"),
+        (wrong_cell.to_csv(index=False), "line 9: column 'Local_Y' holds 'far'"),
+        (repeated.to_csv(index=False), "line 4002: agent 1 stands .* at 0.1 s .*in line 2"),
+    ):
+        path.write_text(text)
+        with pytest.raises(DataError, match=message):
+            read(path)
 
 
 @pytest.mark.real
-def test_the_reconstructed_table_is_known_by_its_columns(real_data: Path) -> None:
+def test_reconstructed_table_is_recognised_by_its_columns(real_data: Path) -> None:
     path = real_data / "ngsim" / "i80_lanes_1_2.csv"
     columns = {"vehicle": "veh", "time": "t", "speed": "v", "kind": "cls"}
     expected = read_vehicles(path, VehicleTableOptions(columns=columns, window=10.0))

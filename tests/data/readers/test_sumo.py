@@ -1,4 +1,4 @@
-"""Reading SUMO's floating car data: lanes, steps, packed files, and files that are none."""
+"""SUMO's floating car data: lanes, time steps, compressed and invalid files."""
 
 from __future__ import annotations
 
@@ -22,33 +22,32 @@ HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<!-- by SUMO -->\n<fcd-export>\n
 
 
 def car(name: str, pos: float, lane: str = "e_0", attributes: str = "") -> str:
-    stated = (
-        f'id="{name}" x="0" y="0" type="car" speed="10.00" pos="{pos}" lane="{lane}"{attributes}'
+    return (
+        f'<vehicle id="{name}" x="0" y="0" type="car" speed="10.00" pos="{pos}" lane="{lane}"'
+        f"{attributes}/>\n"
     )
-    return f"<vehicle {stated}/>\n"
 
 
-def step(time: object, *inside: str) -> str:
-    return f'<timestep time="{time}">\n{"".join(inside)}</timestep>\n'
+def step(time: object, *elements: str) -> str:
+    return f'<timestep time="{time}">\n{"".join(elements)}</timestep>\n'
 
 
 def steps(n: int = 11, dt: float = 0.2, attributes: str = "", lane: str = "e_0") -> list[str]:
-    """Three cars at 10 m/s on one lane, the last of them beside a person."""
+    """Three cars at 10 m/s on one lane, and a person next to the last car."""
+    starts = {"a": 90, "b": 50, "c": 0}
+    person = '<person id="p" x="1" y="1" speed="1" pos="2" edge="e"/>\n'
     return [
         step(
             f"{dt * k:.2f}",
-            *(
-                car(v, x0 + 10 * dt * k, lane, attributes)
-                for v, x0 in (("a", 90), ("b", 50), ("c", 0))
-            ),
-            '<person id="p" x="1" y="1" speed="1" pos="2" edge="e"/>\n',
+            *(car(name, x0 + 10 * dt * k, lane, attributes) for name, x0 in starts.items()),
+            person,
         )
         for k in range(n)
     ]
 
 
-def write(path: Path, *parts: str, end: str = "</fcd-export>\n") -> Path:
-    path.write_text(HEAD + "".join(parts) + end)
+def write(path: Path, *elements: str) -> Path:
+    path.write_text(HEAD + "".join(elements) + "</fcd-export>\n")
     return path
 
 
@@ -64,7 +63,7 @@ def test_a_platoon(tmp_path: Path) -> None:
     assert s.length is None
 
 
-def test_length_and_names_of_types(tmp_path: Path) -> None:
+def test_lengths_and_kinds(tmp_path: Path) -> None:
     path = write(tmp_path / "fcd.xml", *steps(attributes=' length="4.5"'))
     (s,) = read(path, kinds={"car": "passenger car"})
     assert s.kind == ("passenger car",) * 3
@@ -72,32 +71,32 @@ def test_length_and_names_of_types(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["fcd.xml.gz", "fcd.xml"])
-def test_packed_files_are_known_by_their_content(tmp_path: Path, name: str) -> None:
+def test_compressed_files_are_recognised_by_content(tmp_path: Path, name: str) -> None:
     plain = write(tmp_path / "plain.xml", *steps())
     path = tmp_path / name
     path.write_bytes(gzip.compress(plain.read_bytes()))
     assert list(sumo_files(SumoOptions(path=str(path)))) == ["fcd"]
-    (s,), (same,) = read(path), read(plain)
-    np.testing.assert_array_equal(s.x, same.x)
+    (s,), (expected,) = read(path), read(plain)
+    np.testing.assert_array_equal(s.x, expected.x)
     assert s.recording == "fcd_e_0"
 
 
-def test_a_new_edge_ends_a_stay(tmp_path: Path) -> None:
-    def later(k: int) -> str:
-        return step(
+def test_new_edge_divides_a_platoon(tmp_path: Path) -> None:
+    later = [
+        step(
             f"{2.2 + 0.2 * k:.2f}",
             car("a", 2 * k, "f_0"),
             car("b", 72 + 2 * k),
             car("c", 22 + 2 * k),
         )
-
-    path = write(tmp_path / "fcd.xml", *steps(), *map(later, range(5)))
-    first, second = read(path, min_vehicles=2)
+        for k in range(5)
+    ]
+    first, second = read(write(tmp_path / "fcd.xml", *steps(), *later), min_vehicles=2)
     assert (first.agents, second.agents) == (("c", "b", "a"), ("c", "b"))
     assert second.time[0] == pytest.approx(2.2)
 
 
-def test_lanes_of_junctions_only_by_name(tmp_path: Path) -> None:
+def test_lanes_within_junctions_are_read_by_name(tmp_path: Path) -> None:
     path = write(tmp_path / "fcd.xml", *steps(lane=":J_0_0"))
     with pytest.raises(DataError, match=r"all vehicles are on lanes within junctions.*data\.lane"):
         read(path)
@@ -107,13 +106,13 @@ def test_lanes_of_junctions_only_by_name(tmp_path: Path) -> None:
         read(path, lane="e_1")
 
 
-def test_prepared_as_any_other_data(tmp_path: Path) -> None:
+def test_prepare(tmp_path: Path) -> None:
     path = write(tmp_path / "fcd.xml", *steps())
     store = prepare(SumoOptions(path=str(path), faults=Faults.error), tmp_path / "out")
     assert (len(store), store.dims, store.manifest["dt"]) == (1, 1, 0.2)
 
 
-def test_a_grid_finer_than_the_file_is_refused(tmp_path: Path) -> None:
+def test_grid_finer_than_the_file_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "fcd.xml", *steps(dt=1.0))
     with pytest.raises(ConfigError, match=r"data\.dt=1,"):
         read(path)
@@ -128,39 +127,38 @@ ENTITIES = (
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
-        ("", ["line 1", "no element found"]),
-        ("vehicle,time,x\n", ["line 1", "no whole XML document"]),
-        (HEAD + "".join(steps()), ["line 70", "still have been writing"]),
-        ("<netstate/>", ["line 1", "<fcd-export>", "<netstate>"]),
-        (HEAD + "</fcd-export>", ["no vehicle"]),
-        (HEAD + car("a", 1) + "</fcd-export>", ["line 4", "outside <timestep>"]),
-        (HEAD + step("0:00:01", car("a", 1)), ["line 4", "'0:00:01'", "human-readable-time"]),
-        (HEAD + step(0, car("a", 1).replace("pos", "posLat")), ["line 5", "pos", "no such"]),
-        (HEAD + step(0, car("a", float("nan"))), ["line 5", "'nan'"]),
-        (HEAD + step(0, car("a", 1).replace("lane=", "edge=")), ["line 5", "'lane'"]),
+        ("", "line 1.*no element found"),
+        ("vehicle,time,x\n", "line 1.*no whole XML document"),
+        (HEAD + "".join(steps()), "line 70.*still have been writing"),
+        ("<netstate/>", "line 1.*<fcd-export>.*<netstate>"),
+        (HEAD + "</fcd-export>", "no vehicle"),
+        (HEAD + car("a", 1) + "</fcd-export>", "line 4.*outside <timestep>"),
+        (HEAD + step("0:00:01", car("a", 1)), "line 4.*'0:00:01'.*human-readable-time"),
+        (HEAD + step(0, car("a", 1).replace("pos", "posLat")), "line 5.*pos.*no such"),
+        (HEAD + step(0, car("a", float("nan"))), "line 5.*'nan'"),
+        (HEAD + step(0, car("a", 1).replace("lane=", "edge=")), "line 5.*'lane'"),
         (
             HEAD + step(0, car("a", 1), car("a", 2)) + "</fcd-export>",
-            ["line 6", "line 5", "second"],
+            "line 6.*line 5.*second",
         ),
-        (ENTITIES, ["line 1", "document type declaration"]),
-        ('<!DOCTYPE x SYSTEM "file:///etc/passwd"><fcd-export/>', ["document type declaration"]),
+        (ENTITIES, "line 1.*document type declaration"),
+        ('<!DOCTYPE x SYSTEM "file:///etc/passwd"><fcd-export/>', "document type declaration"),
     ],
 )
-def test_one_clear_error(tmp_path: Path, text: str, words: list[str]) -> None:
+def test_invalid_files(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "fcd.xml"
     path.write_text(text)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=f"(?s){message}") as error:
         read(path)
-    assert str(path) in str(caught.value)
-    assert all(word in str(caught.value) for word in words), str(caught.value)
+    assert str(path) in str(error.value)
 
 
-def test_a_torn_gzip_file(tmp_path: Path) -> None:
-    whole = gzip.compress(write(tmp_path / "plain.xml", *steps()).read_bytes())
+def test_incomplete_gzip_file(tmp_path: Path) -> None:
+    content = gzip.compress(write(tmp_path / "plain.xml", *steps()).read_bytes())
     path = tmp_path / "fcd.xml.gz"
-    path.write_bytes(whole[: len(whole) // 2])
+    path.write_bytes(content[: len(content) // 2])
     with pytest.raises(DataError, match=r"fcd\.xml\.gz cannot be read"):
         read(path)
 
@@ -169,11 +167,11 @@ def test_a_torn_gzip_file(tmp_path: Path) -> None:
 @settings(
     max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-def test_damage_ends_in_an_error_of_the_package(tmp_path: Path, data: st.DataObject) -> None:
-    whole = write(tmp_path / "whole.xml", *steps()).read_bytes()
-    whole = gzip.compress(whole) if data.draw(st.booleans()) else whole
+def test_damaged_file_is_read_or_refused(tmp_path: Path, data: st.DataObject) -> None:
+    content = write(tmp_path / "valid.xml", *steps()).read_bytes()
+    content = gzip.compress(content) if data.draw(st.booleans()) else content
     path = tmp_path / "damaged.xml"
-    path.write_bytes(damaged(data, whole, 0, 16))
+    path.write_bytes(damaged(data, content, 0, 16))
     try:
         result = read(path)
     except NNodeError:

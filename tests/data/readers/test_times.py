@@ -1,4 +1,4 @@
-"""Times that are no seconds: dates, clock times, durations, and numbers in other units."""
+"""Times other than seconds: dates, clock times, durations, and numbers in other units."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def stamps(time: pd.Series) -> pd.Series:
     return START + pd.to_timedelta(time, unit="s")
 
 
-#: Times of the same rows that say themselves that they are no numbers.
+#: The same times as dates, clock times and durations.
 DATES: dict[str, Callable[[pd.Series], pd.Series]] = {
     "datetimes": stamps,
     "with a time zone": lambda t: stamps(t).dt.tz_localize("Europe/Berlin"),
@@ -67,17 +67,23 @@ DATES: dict[str, Callable[[pd.Series], pd.Series]] = {
 UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9}
 
 
+def assert_equal_paths(
+    result: Sequences, expected: Sequences, *, times: bool = False, atol: float = 1e-9
+) -> None:
+    assert len(result) == len(expected)
+    for actual, desired in zip(result, expected, strict=True):
+        np.testing.assert_allclose(actual.x, desired.x, rtol=0, atol=atol)
+        if times:
+            np.testing.assert_allclose(actual.time, desired.time, rtol=0, atol=atol)
+
+
 @pytest.mark.parametrize("kind", DATES)
 @pytest.mark.parametrize("make", SOURCES)
-def test_dates_become_seconds_since_the_first(make: Callable[[], pd.DataFrame], kind: str) -> None:
+def test_dates_become_seconds(make: Callable[[], pd.DataFrame], kind: str) -> None:
     table = make()
     result = sequences(table.assign(time=DATES[kind](table.time)))
-    expected = sequences(table)
     assert result.manifest["dt"] == STEP
-    assert len(result) == len(expected)
-    for actual, other in zip(result, expected, strict=True):
-        np.testing.assert_allclose(actual.time, other.time, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(actual.x, other.x, rtol=0, atol=1e-9)
+    assert_equal_paths(result, sequences(table), times=True)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -89,67 +95,62 @@ def test_dates_in_files(tmp_path: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("make", SOURCES)
-def test_epochs_are_recognised_or_refused_with_the_unit_that_reads_them(
-    make: Callable[[], pd.DataFrame], unit: str
-) -> None:
+def test_epochs_are_recognised_or_refused(make: Callable[[], pd.DataFrame], unit: str) -> None:
+    """The error of a refused table states the unit."""
     table, scale = make(), int(UNITS[unit])
     epoch = table.assign(time=1_577_865_600 * scale + (table.time * scale).round().astype("int64"))
     if make in (vehicles, pairs):
         assert sequences(epoch).manifest["dt"] == pytest.approx(STEP, rel=1e-6)
-    else:  # the units of a tidy table are those that are documented, or given
+    else:
         with pytest.raises(DataError, match=rf"time_unit={unit}"):
             sequences(epoch)
     result = sequences(epoch, time_unit=unit)
     assert result.manifest["dt"] == pytest.approx(STEP, rel=1e-6)
-    x = [s.x for s in sequences(table)]
-    # the grid of vehicles begins at a whole number of steps since 1970
-    shift = 1e-5 if make is vehicles else 1e-9
-    for actual, other in zip(result, x, strict=True):
-        np.testing.assert_allclose(actual.x, other, rtol=0, atol=shift)
+    # the time grid of vehicles starts at a multiple of the step since 1970
+    assert_equal_paths(result, sequences(table), atol=1e-5 if make is vehicles else 1e-9)
 
 
-def test_seconds_stay_as_they_are() -> None:
-    """Predictions have the times of the table, so that both can be joined."""
-    table = tidy().assign(time=1_577_865_600.0 + tidy().time)
+def test_seconds_are_kept() -> None:
+    """Predictions have the times of the table, so that the two can be joined."""
+    table = tidy()
+    table["time"] += 1_577_865_600.0
     predicted = Calibrator("lin", epochs=1).fit(table).predict(table).to_dataframe()
     assert set(predicted.time) == set(table.time)
 
 
-def test_short_sequences_since_1970_have_one_interval() -> None:
-    """Seconds since 1970 are rounded to 2e-7 s: intervals of 0.02 s would differ by 1e-5."""
-    parts = []
-    for i in range(20):
-        rows = tidy()[tidy().time < 0.5]
-        time = rows.time / 10 + 7.31 * i
-        parts.append(rows.assign(sequence=f"s{i}", time=time, x=rows.x / 10))
+def test_epochs_of_short_sequences_have_one_interval() -> None:
+    """Seconds since 1970 are rounded to 2e-7 s, which is 1e-5 of an interval of 0.02 s."""
+    rows = tidy()[tidy().time < 0.5]
+    parts = [
+        rows.assign(sequence=f"s{i}", time=rows.time / 10 + 7.31 * i, x=rows.x / 10)
+        for i in range(20)
+    ]
     table = pd.concat(parts)
     epoch = table.assign(time=(1_577_865_600_000 + 1000 * table.time).round().astype("int64"))
     assert len(sequences(epoch, time_unit="ms")) == 20
 
 
 @pytest.mark.parametrize("scale", [1e3, 1e6, 1e9, 1 / 3600, 1 / 86400])
-def test_whatever_takes_data_refuses_times_in_another_unit(scale: float) -> None:
+def test_times_in_another_unit_are_refused(scale: float) -> None:
     table = tidy().assign(time=tidy().time * scale)
-    read = r"data=table: samples are .* s apart; expected at least 0\.001 s"
-    with pytest.raises(DataError, match=read):
-        Calibrator("lin").fit(table)
-    with pytest.raises(DataError, match=read):
-        diagnose(table)
-    # sequences of one's own, which no reader has seen
-    (good,) = sequences(tidy())
-    bad = [Sequence(name=n, recording=n, time=good.time * scale, x=good.x) for n in "abcd"]
-    message = r"sequence [abcd]: samples are .* s apart"
-    with pytest.raises(DataError, match=message):
-        collate(bad)
-    with pytest.raises(DataError, match=message):
-        Calibrator("lin").fit(bad)
-    with pytest.raises(DataError, match=message):
-        Sequences(bad)
+    (valid,) = sequences(tidy())
+    items = [Sequence(name=n, recording=n, time=valid.time * scale, x=valid.x) for n in "abcd"]
+    for function, data, subject in (
+        (Calibrator("lin").fit, table, "data=table"),
+        (diagnose, table, "data=table"),
+        # sequences that no reader has checked
+        (collate, items, "sequence [abcd]"),
+        (Calibrator("lin").fit, items, "sequence [abcd]"),
+        (Sequences, items, "sequence [abcd]"),
+    ):
+        with pytest.raises(DataError, match=rf"{subject}: samples are .* s apart") as error:
+            function(data)
+        assert data is items or r"expected at least 0.001 s" in str(error.value)
 
 
-def test_dates_of_several_files_count_from_one_start(tmp_path: Path) -> None:
-    for name, later in (("a", 0.0), ("b", 90.0)):
-        pairs().assign(time=stamps(pairs().time + later)).to_csv(tmp_path / f"{name}.csv")
+def test_dates_of_several_files_have_one_origin(tmp_path: Path) -> None:
+    for name, delay in (("a", 0.0), ("b", 90.0)):
+        pairs().assign(time=stamps(pairs().time + delay)).to_csv(tmp_path / f"{name}.csv")
     starts = {s.name: s.time[0] for s in sequences(tmp_path, data="pairs")}
     assert starts == {"pairs/a": 0.0, "pairs/b": 90.0}
 
@@ -165,20 +166,21 @@ def test_dates_of_several_files_count_from_one_start(tmp_path: Path) -> None:
         (["0001-01-01"] * 3, "holds no dates of our time"),
     ],
 )
-def test_what_is_no_time_names_its_row(cells: list[str | None], message: str) -> None:
+def test_invalid_times(cells: list[str | None], message: str) -> None:
     with pytest.raises(DataError, match=message):
         Table(pd.DataFrame({"time": cells, "x": 1.0})).times("time")
 
 
-def test_positions_are_no_dates() -> None:
+def test_dates_as_positions_are_refused() -> None:
     table = tidy().assign(x=stamps(tidy().time))
     with pytest.raises(DataError, match="column 'x' holds dates or durations; expected numbers"):
         sequences(table, data="table", domain="traffic")
 
 
-@pytest.mark.parametrize("data", ["table", "pairs"])
-def test_an_unknown_unit_lists_the_known_ones(data: str) -> None:
-    table = tidy() if data == "table" else pairs()
-    options = {"domain": "traffic"} if data == "table" else {}
+@pytest.mark.parametrize(
+    ("make", "options"),
+    [(tidy, {"data": "table", "domain": "traffic"}), (pairs, {"data": "pairs"})],
+)
+def test_unknown_time_unit(make: Callable[[], pd.DataFrame], options: dict[str, str]) -> None:
     with pytest.raises(ConfigError, match="time_unit=h: expected one of s, ms, us, ns"):
-        sequences(table, data=data, time_unit="h", **options)
+        sequences(make(), time_unit="h", **options)

@@ -1,30 +1,32 @@
-"""Reading vehicle tables: units, lanes, time grid, and the cutting into sequences."""
+"""Vehicle tables: units, lanes, time grid, and the division into sequences."""
 
 from __future__ import annotations
 
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from nnode.data.readers.vehicles import VehicleTableOptions, read_vehicles, vehicle_files
+from nnode.data.readers.vehicles import VehicleTableOptions, vehicle_files
+from nnode.data.sequence import Sequence
 from nnode.errors import ConfigError, DataError
 from tests.data import tables
 from tests.data.tables import saved
 
 
-def drive(vehicle: object, start: float, end: float, x0: float, **further: object) -> pd.DataFrame:
-    """A vehicle in view from ``start`` to ``end`` s at 10 m/s, at x0 + 10 t, every 0.1 s."""
+def drive(vehicle: object, start: float, end: float, x0: float, **columns: object) -> pd.DataFrame:
+    """A vehicle observed from ``start`` to ``end`` s at 10 m/s, at x0 + 10 t, every 0.1 s."""
     time = np.round(np.arange(start, end + 0.05, 0.1), 6)
-    return pd.DataFrame({"vehicle": vehicle, "time": time, "x": x0 + 10 * time, **further})
+    return pd.DataFrame({"vehicle": vehicle, "time": time, "x": x0 + 10 * time, **columns})
 
 
-def cars(end: float, **further: object) -> pd.DataFrame:
-    """Three vehicles in view from the start, 30 m apart."""
+def cars(end: float, **columns: object) -> pd.DataFrame:
+    """Three vehicles observed from the start, 30 m apart."""
     places = (("a", 60), ("b", 30), ("c", 0))
-    return pd.concat([drive(name, 0, end, x0, **further) for name, x0 in places])
+    return pd.concat([drive(name, 0, end, x0, **columns) for name, x0 in places])
 
 
 read = partial(tables.read, VehicleTableOptions)
@@ -35,6 +37,11 @@ def platoon(tmp_path: Path) -> Path:
     return saved(tmp_path / "road.csv", cars(4))
 
 
+def spans(sequences: list[Sequence]) -> list[tuple[tuple[str, ...], float, float]]:
+    """The agents, the first and the last time of each sequence."""
+    return [(s.agents, round(s.time[0], 6), round(s.time[-1], 6)) for s in sequences]
+
+
 def test_order_times_and_positions(platoon: Path) -> None:
     (s,) = read(platoon)
     assert s.name == "road/000"
@@ -43,7 +50,7 @@ def test_order_times_and_positions(platoon: Path) -> None:
     np.testing.assert_allclose(s.x[:, :, 0], s.time[:, None] * 10 + [0, 30, 60], atol=1e-9)
 
 
-def test_the_order_of_rows_changes_nothing(platoon: Path) -> None:
+def test_row_order_does_not_matter(platoon: Path) -> None:
     result = read(platoon, window=1.0)
     saved(platoon, pd.read_csv(platoon).sample(frac=1.0, random_state=0))
     for actual, other in zip(read(platoon, window=1.0), result, strict=True):
@@ -52,7 +59,7 @@ def test_the_order_of_rows_changes_nothing(platoon: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_units_map_and_attributes(tmp_path: Path, suffix: str) -> None:
+def test_units_columns_and_attributes(tmp_path: Path, suffix: str) -> None:
     names = {"vehicle": "id", "time": "frame", "x": "pos", "length": "len", "kind": "cls"}
     parts = [
         drive(name, 0, 4, x0, length=15.0, kind=kind)
@@ -77,34 +84,31 @@ def test_units_map_and_attributes(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(s.v, 10.0)
 
 
-def test_interpolates_and_never_extrapolates(tmp_path: Path) -> None:
+def test_interpolation_without_extrapolation(tmp_path: Path) -> None:
     parts = [drive(n, 0.13, 1.93, x0) for n, x0 in (("a", 0), ("b", 20))]
     (s,) = read(saved(tmp_path / "t.csv", *parts), min_vehicles=2)
     assert (s.time[0], s.time[-1]) == (pytest.approx(0.2), pytest.approx(1.8))
     np.testing.assert_allclose(s.x[:, 0, 0], 10 * s.time)
 
 
-def test_uneven_times_are_told_and_a_coarser_grid_is_not(tmp_path: Path) -> None:
+def test_uneven_times_and_a_fine_grid_are_noted(tmp_path: Path) -> None:
     table = cars(4)
-    assert read(saved(tmp_path / "even.csv", table)).notes == []
-    late = np.random.default_rng(1).uniform(-0.02, 0.02, len(table))
-    (note,) = read(saved(tmp_path / "road.csv", table.assign(time=table.time + late))).notes
+    path = saved(tmp_path / "road.csv", table)
+    assert read(path).notes == []  # the grid of 0.2 s is coarser than the file
+    assert "no multiples of 0.05 s" in read(path, dt=0.05).notes[0]
+    jitter = np.random.default_rng(1).uniform(-0.02, 0.02, len(table))
+    (note,) = read(saved(path, table.assign(time=table.time + jitter))).notes
     assert note.startswith("road: times are uneven")
     assert note.endswith("are interpolated to steps of 0.2 s")
 
 
-def test_a_grid_that_is_finer_than_the_file_is_told(tmp_path: Path) -> None:
-    result = read(saved(tmp_path / "road.csv", cars(9)), dt=0.05)
-    assert "no multiples of 0.05 s" in result.notes[0]
-
-
-def test_recordings_and_sequences_together_tell_rows_apart(tmp_path: Path) -> None:
+def test_recording_and_sequence_columns(tmp_path: Path) -> None:
     parts = [cars(4, recording=r, sequence=s) for r in "xy" for s in (1, 2)]
     result = read(saved(tmp_path / "road.csv", *parts))
     assert [s.recording for s in result] == ["x 1", "x 2", "y 1", "y 2"]
 
 
-def test_maximal_intervals(tmp_path: Path) -> None:
+def test_sequences_are_maximal_intervals(tmp_path: Path) -> None:
     path = saved(
         tmp_path / "t.csv",
         drive("lead", 0, 6, 60),
@@ -112,46 +116,39 @@ def test_maximal_intervals(tmp_path: Path) -> None:
         drive("late", 2, 6, 0),
         drive("later", 4.1, 6, -30),
     )
-    three, four = read(path)
-    assert three.agents == ("late", "mid", "lead")
-    assert (three.time[0], three.time[-1]) == (pytest.approx(2.0), pytest.approx(4.0))
-    assert four.agents == ("later", "late", "mid", "lead")
-    assert (four.time[0], four.time[-1]) == (pytest.approx(4.2), pytest.approx(6.0))
+    assert spans(read(path)) == [
+        (("late", "mid", "lead"), 2.0, 4.0),
+        (("later", "late", "mid", "lead"), 4.2, 6.0),
+    ]
     assert len(read(path, min_vehicles=2)) == 3
 
 
-def test_lanes_are_kept_apart(tmp_path: Path) -> None:
+def test_lanes_are_recordings(tmp_path: Path) -> None:
     path = saved(
         tmp_path / "t.csv",
         *(drive(f"l{i}", 0, 2, 30 * i, lane=1) for i in range(3)),
         *(drive(f"r{i}", 0, 2, 30 * i + 10, lane=2) for i in range(4)),
     )
-    left, right = read(path)
-    assert (left.recording, right.recording) == ("t_lane1", "t_lane2")
-    assert (left.n_agents, right.n_agents) == (3, 4)
-    (only,) = read(path, lane=2)
-    assert only.recording == "t_lane2"
-    (only,) = read(path, recording="t_lane1")
-    assert only.recording == "t_lane1"
+    assert [(s.recording, s.n_agents) for s in read(path)] == [("t_lane1", 3), ("t_lane2", 4)]
+    assert [s.recording for s in read(path, lane=2)] == ["t_lane2"]
+    assert [s.recording for s in read(path, recording="t_lane1")] == ["t_lane1"]
     with pytest.raises(ConfigError, match=r"lane=7: .* has the lanes 1, 2"):
         read(path, lane=[1, 7])
     with pytest.raises(ConfigError, match="recording=t_lane3: unknown recording"):
         read(path, recording="t_lane3")
 
 
-def test_a_change_of_lane_ends_a_stay(tmp_path: Path) -> None:
+def test_lane_changes_divide_sequences(tmp_path: Path) -> None:
     changer = drive("x", 0, 4, 30).assign(lane=lambda d: np.where(d.time.between(1.95, 3), 2, 1))
     others = [drive(n, 0, 4, x0, lane=1) for n, x0 in (("a", 0), ("b", 60), ("c", 90))]
-    sequences = read(saved(tmp_path / "t.csv", changer, *others))
-    spans = [(s.agents, round(s.time[0], 1), round(s.time[-1], 1)) for s in sequences]
-    assert spans == [
+    assert spans(read(saved(tmp_path / "t.csv", changer, *others))) == [
         (("a", "x", "b", "c"), 0.0, 1.8),
         (("a", "b", "c"), 2.0, 3.0),
         (("a", "x", "b", "c"), 3.2, 4.0),
     ]
 
 
-def test_long_holes_are_not_interpolated(tmp_path: Path) -> None:
+def test_long_holes_divide_sequences(tmp_path: Path) -> None:
     table = cars(4)
     hole = (table.vehicle == "b") & table.time.between(1.05, 2.95)
     path = saved(tmp_path / "t.csv", table[~hole])
@@ -159,14 +156,14 @@ def test_long_holes_are_not_interpolated(tmp_path: Path) -> None:
     assert [s.n_samples for s in read(path, fill=2.0)] == [21]
 
 
-def test_an_empty_position_is_a_missing_sample(platoon: Path) -> None:
+def test_empty_position_is_a_missing_sample(platoon: Path) -> None:
     table = pd.read_csv(platoon)
-    whole = read(platoon)[0]
+    expected = read(platoon)[0]
     table.loc[[10, 12, 61], "x"] = np.nan
     saved(platoon, table)
     (s,) = read(platoon)
     assert s.filled == 3
-    np.testing.assert_allclose(s.x, whole.x, atol=1e-9)
+    np.testing.assert_allclose(s.x, expected.x, atol=1e-9)
     (*_, last) = read(platoon, fill=0.0)
     assert last.filled == 0
 
@@ -177,43 +174,36 @@ def test_windows_share_their_boundary_sample(platoon: Path) -> None:
     assert first.time[-1] == second.time[0] == pytest.approx(2.0)
 
 
-def test_a_window_is_cut_where_a_vehicle_is_in_view_for_a_part(tmp_path: Path) -> None:
-    whole = [drive(f"v{i}", 0, 4, 30 * i) for i in range(7)]
+def test_vehicle_present_for_a_part_divides_a_window(tmp_path: Path) -> None:
+    complete = [drive(f"v{i}", 0, 4, 30 * i) for i in range(7)]
     entering = drive("x", 2.5, 4, 30 * 2 + 15)  # between v2 and v3
-    ahead = drive("y", 0, 1, 30 * 6 + 15)  # ahead of everyone
-    path = saved(tmp_path / "t.csv", *whole, entering, ahead)
-    low, high = read(path, window=4.0)
-    assert low.agents == ("v0", "v1", "v2")
-    assert high.agents == ("v3", "v4", "v5", "v6")
-    (high,) = read(path, window=4.0, min_vehicles=4)
-    assert high.agents == ("v3", "v4", "v5", "v6")
+    ahead = drive("y", 0, 1, 30 * 6 + 15)  # ahead of all others
+    path = saved(tmp_path / "t.csv", *complete, entering, ahead)
+    rear, front = ("v0", "v1", "v2"), ("v3", "v4", "v5", "v6")
+    assert [s.agents for s in read(path, window=4.0)] == [rear, front]
+    assert [s.agents for s in read(path, window=4.0, min_vehicles=4)] == [front]
 
 
 @pytest.mark.real
 def test_reconstructed_motorway(real_data: Path) -> None:
-    options = VehicleTableOptions(
-        source=str(real_data),
-        path="ngsim/i80_lanes_1_2.csv",
-        columns={"vehicle": "veh", "time": "t", "speed": "v", "kind": "cls"},
-        window=10.0,
-    )
-    (path,) = vehicle_files(options).values()
-    sequences = read_vehicles(path, options)
+    path = real_data / "ngsim/i80_lanes_1_2.csv"
+    columns = {"vehicle": "veh", "time": "t", "speed": "v", "kind": "cls"}
+    sequences = read(path, columns=columns, window=10.0)
     raw = pd.read_csv(path)
     assert len(sequences) > 20
     for s in sequences:
-        lane = int(s.recording[-1])
-        rows = raw[raw.lane == lane]
-        inside = rows[(rows.t > s.time[0] - 1e-6) & (rows.t < s.time[-1] + 1e-6)]
-        # Nobody in the raw table ever drives between a follower and its leader.
-        for follower, leader in zip(s.agents, s.agents[1:], strict=False):
-            paths = inside.pivot(index="t", columns="veh", values="x")
-            back, front = paths[int(follower)], paths[int(leader)]
-            between = paths.gt(back, axis=0) & paths.lt(front, axis=0)
-            assert not between.to_numpy().any()
-        rearmost = inside[inside.veh == int(s.agents[0])]
-        expected = np.interp(s.time, rearmost.t, rearmost.x)
-        np.testing.assert_allclose(s.x[:, 0, 0], expected, atol=1e-6)
+        inside = raw[
+            (raw.lane == int(s.recording[-1]))
+            & (raw.t > s.time[0] - 1e-6)
+            & (raw.t < s.time[-1] + 1e-6)
+        ]
+        # No vehicle of the raw table is ever between a follower and its leader.
+        paths = inside.pivot(index="t", columns="veh", values="x")
+        for follower, leader in pairwise(s.agents):
+            rear, front = paths[int(follower)], paths[int(leader)]
+            assert not (paths.gt(rear, axis=0) & paths.lt(front, axis=0)).to_numpy().any()
+        last = inside[inside.veh == int(s.agents[0])]
+        np.testing.assert_allclose(s.x[:, 0, 0], np.interp(s.time, last.t, last.x), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -234,7 +224,7 @@ def test_reconstructed_motorway(real_data: Path) -> None:
         ({"columns": {"x": None}}, "data.columns.x is null, but x is needed"),
     ],
 )
-def test_bad_options(platoon: Path, options: dict, message: str) -> None:
+def test_invalid_options(platoon: Path, options: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         read(platoon, **options)
 
@@ -257,38 +247,48 @@ def test_bad_options(platoon: Path, options: dict, message: str) -> None:
         ("vehicle,time,x\n1,0,0,5,6\n1,0\n1,2,3,4,5,6,7\n", "cannot be read as a comma-separated"),
     ],
 )
-def test_bad_tables(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_tables(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "t.csv"
     path.write_text(text)
     with pytest.raises(DataError, match=message):
         read(path)
 
 
-def test_damaged_parquet_and_missing_table(tmp_path: Path) -> None:
+def test_damaged_parquet_table(tmp_path: Path) -> None:
     path = tmp_path / "t.parquet"
     path.write_bytes(b"PAR1 no table")
     with pytest.raises(DataError, match="cannot be read as a Parquet table"):
         read(path)
-    with pytest.raises(DataError, match=r"data\.path: .* is not there"):
-        vehicle_files(VehicleTableOptions(path=str(tmp_path / "none.csv")))
-    with pytest.raises(ConfigError, match=r"data\.path is not set"):
-        vehicle_files(VehicleTableOptions())
-    with pytest.raises(ConfigError, match="tables are read from a folder"):
-        vehicle_files(VehicleTableOptions(path="t.csv", source="https://example.org"))
 
 
-def test_two_vehicles_where_three_are_asked_for(platoon: Path) -> None:
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"path": "none.csv"}, DataError, r"data\.path: .* is not there"),
+        ({}, ConfigError, r"data\.path is not set"),
+        (
+            {"path": "t.csv", "source": "https://example.org"},
+            ConfigError,
+            "tables are read from a folder",
+        ),
+    ],
+)
+def test_missing_table(options: dict[str, str], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        vehicle_files(VehicleTableOptions(**options))
+
+
+def test_too_few_vehicles(platoon: Path) -> None:
     with pytest.raises(DataError, match=r"4 vehicles in one lane .*\(3 vehicles, 1 lanes\)"):
         read(platoon, min_vehicles=4)
 
 
-def test_pairs_end_where_somebody_comes_between(tmp_path: Path) -> None:
-    # d is in lane 2 but from 4 s to 6 s between b and a, e comes late
+def test_pairs_end_where_a_vehicle_cuts_in(tmp_path: Path) -> None:
+    # d is in lane 2 except from 4 s to 6 s, between b and a; e enters late
     d = drive("d", 0, 10, 45, lane=2)
     d.loc[(d.time > 3.95) & (d.time < 6.05), "lane"] = 1
     path = saved(tmp_path / "road.csv", cars(10, lane=1), d, drive("e", 8, 10, -30, lane=1))
-    result = {(s.agents, round(s.time[0], 6), round(s.time[-1], 6)) for s in read(path, pairs=True)}
-    assert result == {
+    assert set(spans(read(path, pairs=True))) == {
         (("b", "a"), 0.0, 3.8),
         (("c", "b"), 0.0, 10.0),
         (("b", "d"), 4.0, 6.0),
@@ -298,15 +298,17 @@ def test_pairs_end_where_somebody_comes_between(tmp_path: Path) -> None:
     }
     windows = read(path, pairs=True, window=3.0)
     assert {s.n_samples for s in windows} == {16}
-    assert [s.agents for s in windows].count(("c", "b")) == 3
-    assert [s.agents for s in windows].count(("b", "a")) == 2
+    agents = [s.agents for s in windows]
+    assert (agents.count(("c", "b")), agents.count(("b", "a"))) == (3, 2)
 
 
-def test_a_lane_changer_parts_its_platoon(tmp_path: Path) -> None:
+def test_lane_changer_divides_its_platoon(tmp_path: Path) -> None:
     d = drive("d", 0, 10, 45, lane=2)
     d.loc[d.time > 5.95, "lane"] = 1
     path = saved(tmp_path / "road.csv", cars(10, lane=1), d)
-    spans = [(s.agents, round(s.time[0], 6), round(s.time[-1], 6)) for s in read(path, lane=1)]
-    assert spans == [(("c", "b", "a"), 0.0, 5.8), (("c", "b", "d", "a"), 6.0, 10.0)]
+    assert spans(read(path, lane=1)) == [
+        (("c", "b", "a"), 0.0, 5.8),
+        (("c", "b", "d", "a"), 6.0, 10.0),
+    ]
     windows = read(path, lane=1, window=5.0, min_vehicles=2)
     assert [s.agents for s in windows] == [("c", "b", "a"), ("c", "b")]

@@ -1,9 +1,8 @@
-"""Crowd effects against loops over people written from their formulas."""
+"""Crowd effects against loops over people, written from the effects' formulas."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +11,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch.func import functional_call
 
-from nnode.data.sequence import Sequence, collate
-from nnode.errors import ConfigError
+from nnode.data.sequence import Batch, Sequence, collate
 from nnode.model import Crowd, Scene, State, make_law
 from nnode.model.build import add_effects
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect
@@ -72,20 +70,23 @@ def system(name: str) -> Crowd:
     return model
 
 
-def state(model: Crowd, x: torch.Tensor | None = None, v: torch.Tensor | None = None) -> State:
-    x = BATCH.x[0] if x is None else x
-    v = BATCH.v[0] if v is None else v
-    return State(torch.tensor(0.2), x, v, Scene.of(BATCH), terms=list(model.terms))
+def state(
+    model: Crowd,
+    x: torch.Tensor | None = None,
+    v: torch.Tensor | None = None,
+    batch: Batch = BATCH,
+) -> State:
+    x = batch.x[0] if x is None else x
+    v = batch.v[0] if v is None else v
+    return State(torch.tensor(0.2), x, v, Scene.of(batch), terms=list(model.terms))
 
 
 def effect_of(name: str) -> tuple[Effect, Crowd]:
     model = system(name)
-    effect = model.terms[-1]
-    assert isinstance(effect, Effect)
-    return effect, model
+    return model.terms[-1], model
 
 
-# -- the formulas once more, person by person ------------------------------------------------
+# -- the formulas for each person ----------------------------------------------------------------
 
 
 def unit(a: np.ndarray) -> np.ndarray:
@@ -117,7 +118,8 @@ def near_wall(x: np.ndarray, wall: np.ndarray) -> np.ndarray:
     return np.asarray(wall[:2] + share * (wall[2:] - wall[:2]))
 
 
-def expected(name: str, item: Sequence, i: int) -> np.ndarray:
+def formula(name: str, item: Sequence, i: int) -> np.ndarray:
+    """The acceleration of person i by an effect."""
     p = VALUES[name]
     x, v, n = item.x[0], item.v[0], item.n_agents
     others = [j for j in range(n) if j != i]
@@ -164,7 +166,6 @@ def expected(name: str, item: Sequence, i: int) -> np.ndarray:
             met += ahead * facing / (1 + math.exp((math.dist(x[i], x[j]) - 3) / 0.3))
         total = p["c"] * (1 - math.exp(-met)) * right
     elif name == "group_cohesion":
-        assert item.group is not None
         mates = [j for j in others if item.group[j] and item.group[j] == item.group[i]]
         if mates:
             total = p["c"] * (np.mean([x[j] for j in mates], axis=0) - x[i])
@@ -181,7 +182,6 @@ def expected(name: str, item: Sequence, i: int) -> np.ndarray:
         total = p["A_o"] * math.exp(-math.hypot(*away) / p["B_o"]) * unit(away)
         total *= 1 if name == "obstacle" else -1
     elif name == "walker_heterogeneity":
-        assert item.destination is not None
         way = unit(item.destination[i] - x[i])
         eta = NUMBERS[item.name][i]
         total = eta * (math.hypot(*v[i]) * way - v[i]) / 0.5
@@ -191,86 +191,80 @@ def expected(name: str, item: Sequence, i: int) -> np.ndarray:
     return total
 
 
-def test_every_crowd_effect_is_tested_here() -> None:
-    # other tests may register effects of their own
-    own = [e for e in CATALOGUE.of("crowd") if e.__module__.startswith("nnode.")]
-    assert {effect.name for effect in own} == set(VALUES)
+def test_all_crowd_effects_are_in_the_table() -> None:
+    # other tests may register more effects
+    effects = [e for e in CATALOGUE.of("crowd") if e.__module__.startswith("nnode.")]
+    assert {effect.name for effect in effects} == set(VALUES)
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_the_acceleration_is_that_of_the_formula(name: str) -> None:
+def test_acceleration_by_formula(name: str) -> None:
     effect, model = effect_of(name)
-    found = effect(state(model)).detach().numpy()
-    largest = 0.0
+    computed = effect(state(model)).detach().numpy()
+    expected = np.zeros_like(computed)
     for b, item in enumerate(CROWDS):
         for i in range(item.n_agents):
-            wanted = expected(name, item, i)
-            largest = max(largest, float(np.abs(wanted).max()))
-            np.testing.assert_allclose(found[b, i], wanted, rtol=2e-5, atol=2e-6)
-    assert largest > 0.05  # the situations show the effect
-    assert np.isfinite(found).all()
+            expected[b, i] = formula(name, item, i)
+    real = BATCH.agent.numpy()
+    np.testing.assert_allclose(computed[real], expected[real], rtol=2e-5, atol=2e-6)
+    assert np.abs(expected).max() > 0.05
+    assert np.isfinite(computed).all()
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_a_neutral_effect_does_nothing(name: str) -> None:
+def test_neutral_strengths_change_nothing(name: str) -> None:
     effect, model = effect_of(name)
     for key, strength in effect.strengths.items():
         getattr(effect, key).data.fill_(strength.neutral)
     if name == "walker_heterogeneity":
-        effect.people = {key: [0.0] * len(own) for key, own in NUMBERS.items()}
+        effect.people = {key: [0.0] * len(values) for key, values in NUMBERS.items()}
     torch.testing.assert_close(effect(state(model)), torch.zeros_like(BATCH.x[0]))
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_derivatives_are_those_of_differences(name: str) -> None:
+def test_derivatives(name: str) -> None:
     effect, model = effect_of(name)
     names = list(dict(effect.named_parameters()))
     x, v = BATCH.x[0].clone().requires_grad_(), BATCH.v[0].clone().requires_grad_()
     values = [p.detach().clone().requires_grad_() for p in effect.parameters()]
 
     def run(x: torch.Tensor, v: torch.Tensor, *values: torch.Tensor) -> torch.Tensor:
-        now = state(model, x, v)
-        found: torch.Tensor = functional_call(effect, dict(zip(names, values, strict=True)), (now,))
-        return found[BATCH.agent]
+        parameters = dict(zip(names, values, strict=True))
+        return functional_call(effect, parameters, (state(model, x, v),))[BATCH.agent]
 
     assert torch.autograd.gradcheck(run, (x, v, *values), eps=1e-6, atol=1e-5)
 
 
-def moved(angle: float, shift: tuple[float, float]) -> Callable[[np.ndarray], np.ndarray]:
-    c, s = math.cos(angle), math.sin(angle)
-    turn = np.array([[c, -s], [s, c]])
-    return lambda a: a @ turn.T + np.array(shift)
-
-
 @pytest.mark.parametrize("name", sorted(set(VALUES) - {"drift", "obstacle", "attraction"}))
-def test_turning_and_moving_everything_turns_the_acceleration(name: str) -> None:
-    place, turn = moved(0.7, (31.0, -12.0)), moved(0.7, (0.0, 0.0))
-    items = []
-    for item in CROWDS:
-        assert item.v is not None
-        assert item.destination is not None
-        items.append(
-            replace(
-                item,
-                x=place(item.x),
-                v=turn(item.v),
-                destination=place(item.destination),
-                walls=np.concatenate([place(WALLS[:, :2]), place(WALLS[:, 2:])], 1),
-            )
+def test_rotation_and_translation(name: str) -> None:
+    """A rotated and shifted scene has rotated accelerations."""
+    turn = np.array([[math.cos(0.7), -math.sin(0.7)], [math.sin(0.7), math.cos(0.7)]])
+
+    def place(x: np.ndarray) -> np.ndarray:
+        return x @ turn.T + [31.0, -12.0]
+
+    walls = place(WALLS.reshape(-1, 2)).reshape(-1, 4)
+    items = [
+        replace(
+            item,
+            x=place(item.x),
+            v=item.v @ turn.T,
+            destination=place(item.destination),
+            walls=walls,
         )
-    other = collate(items)
+        for item in CROWDS
+    ]
     effect, model = effect_of(name)
-    turned = State(
-        torch.tensor(0.2), other.x[0], other.v[0], Scene.of(other), terms=list(model.terms)
+    turned, original = (
+        effect(state(model, batch=batch))[BATCH.agent].detach().numpy()
+        for batch in (collate(items), BATCH)
     )
-    found, here = effect(turned).detach().numpy(), effect(state(model)).detach().numpy()
-    real = BATCH.agent.numpy()
-    np.testing.assert_allclose(found[real], turn(here[real]), rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(turned, original @ turn.T, rtol=1e-8, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", sorted(set(VALUES) - {"drift"}))
-def test_others_are_where_they_were_measured(name: str) -> None:
-    """Moving the others' simulated states changes nothing once they are measured."""
+def test_measured_others(name: str) -> None:
+    """The others' simulated states do not matter if their states are measured."""
     effect, model = effect_of(name)
     now = state(model)
     now.measured_others = (BATCH.x[0], BATCH.v[0])
@@ -282,7 +276,7 @@ def test_others_are_where_they_were_measured(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_probes_build_effects_that_show(name: str) -> None:
+def test_probes(name: str) -> None:
     effect = CATALOGUE.effects[name]
     probes = effect.probes(BATCH, system(name))
     assert probes
@@ -290,12 +284,12 @@ def test_probes_build_effects_that_show(name: str) -> None:
         assert set(probe.steps) <= set(effect.strengths)
         built = effect(**probe.options)
         for key, step in probe.steps.items():
-            low, high = effect.strengths[key].range.low, effect.strengths[key].range.high
-            assert low <= effect.strengths[key].neutral + step <= high
-            assert getattr(built, key) == effect.strengths[key].neutral
+            strength = effect.strengths[key]
+            assert strength.range.low <= strength.neutral + step <= strength.range.high
+            assert getattr(built, key) == strength.neutral
 
 
-def test_effects_that_cannot_act_have_no_probes() -> None:
+def test_effects_on_missing_others_have_no_probes() -> None:
     alone = collate([people(1, 3)])
     model = Crowd([make_law("relaxation", tau=0.5)])
     empty = {name for name in VALUES if not CATALOGUE.effects[name].probes(alone, model)}
@@ -312,7 +306,7 @@ def test_effects_that_cannot_act_have_no_probes() -> None:
     }
 
 
-def test_an_effect_on_a_force_that_is_not_there() -> None:
+def test_effect_on_a_missing_force() -> None:
     model = Crowd([make_law("relaxation", tau=0.5)])
     add_effects(model, [{"name": "field_of_view", "lambda_": 0.5}])
     with pytest.raises(ValueError, match="social_force or network_force"):
@@ -320,24 +314,17 @@ def test_an_effect_on_a_force_that_is_not_there() -> None:
 
 
 @pytest.mark.parametrize("name", ["walker_heterogeneity", "gait_sway"])
-def test_people_of_other_sequences_are_left_alone(name: str) -> None:
+def test_individual_effects_without_a_sequence(name: str) -> None:
     effect, model = effect_of(name)
     before = effect(state(model))
-    again = CATALOGUE.effects[name](**effect.options())
-    torch.testing.assert_close(again(state(model)), before)
-    del again.people[CROWDS[0].name]
-    found = again(state(model))
-    torch.testing.assert_close(found[1:], before[1:])
-    assert bool((found[0] == 0).all())
+    copy = CATALOGUE.effects[name](**effect.options())
+    torch.testing.assert_close(copy(state(model)), before)
+    del copy.people[CROWDS[0].name]
+    changed = copy(state(model))
+    torch.testing.assert_close(changed[1:], before[1:])
+    assert bool((changed[0] == 0).all())
 
 
-def test_nobody_runs_away_from_his_destination() -> None:
-    walkers = CATALOGUE.effects["walker_heterogeneity"]
-    assert issubclass(walkers, IndividualEffect)
-    for fitted, eta in ((0.4, 0.4), (-0.9, -0.9), (-2.1, -1.0)):
-        assert walkers.person(np.array([fitted]), {}) == eta
-
-
-def test_a_misspelt_parameter_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no parameter A_2x"):
-        add_effects(Crowd([]), [{"name": "pair_repulsion", "A_2x": 1.0}])
+@pytest.mark.parametrize(("fitted", "eta"), [(0.4, 0.4), (-0.9, -0.9), (-2.1, -1.0)])
+def test_walker_heterogeneity_is_at_least_minus_one(fitted: float, eta: float) -> None:
+    assert CATALOGUE.effects["walker_heterogeneity"].person(np.array([fitted]), {}) == eta

@@ -1,7 +1,8 @@
-"""What the tests of the fused solver compare: a trajectory and all its gradients."""
+"""Comparisons of trajectories and gradients."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
@@ -15,10 +16,10 @@ from nnode.simulation.ode import Rates
 
 
 class RungeKutta:
-    """The classic Runge-Kutta method, written out; torchdiffeq's ``rk4`` is the 3/8 rule.
+    """The classic Runge-Kutta method; torchdiffeq's ``rk4`` is the 3/8 rule.
 
     Args:
-        substeps: in a sampling interval.
+        substeps: number of steps in a sampling interval.
     """
 
     def __init__(self, substeps: int = 1) -> None:
@@ -41,24 +42,29 @@ class RungeKutta:
 
 
 def single(items: list[Sequence]) -> Batch:
-    """A batch whose numbers are float32 numbers, in float64: the same problem in both."""
+    """A float64 batch whose numbers are exact in float32."""
     return collate(items).to(dtype=torch.float32).to(dtype=torch.float64)
 
 
+def flat_gradient(parameters: Iterable[Tensor]) -> Tensor:
+    """The gradients of all parameters, with zeros of those without a gradient."""
+    parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+    return torch.cat([part.flatten() for part in parts]).detach()
+
+
 def gradient(model: System, solver: Solver, batch: Batch) -> tuple[Trajectory, Tensor]:
-    """A trajectory, and the gradient of a function of all its numbers by parameters and start."""
+    """A trajectory, and the gradient of a function of all its states by parameters and start."""
     model.zero_grad()
     free = getattr(model, "leader", "") != "measured"  # compiled code refuses this gradient
     start = {name: getattr(batch, name).clone().requires_grad_(free) for name in "xv"}
     path = solver(model, replace(batch, **start))
-    # the measured positions of the cost carry no gradient, the first ones of the start do
     cost = sequence_costs(path, batch).sum()
     if path.v is not None:
         cost = cost + 0.02 * path.v.masked_fill(~batch.valid[..., None], 0.0).square().sum()
     cost.backward()
-    parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()]
-    parts += [t.grad[0] for t in start.values() if t.grad is not None]
-    return path, torch.cat([part.flatten() for part in parts]).detach()
+    parts = [flat_gradient(model.parameters())]
+    parts += [t.grad[0].flatten() for t in start.values() if t.grad is not None]
+    return path, torch.cat(parts)
 
 
 def difference(gradient: Tensor, exact: Tensor) -> float:
@@ -78,7 +84,7 @@ def compare(
     """Compare states and gradients with those of torchdiffeq in float64.
 
     Args:
-        limit: of the gradient's relative difference.
+        limit: largest relative difference of the gradient.
         close: tolerances of states.
     """
     exact, expected = gradient(model, TorchdiffeqSolver("euler", "discrete", dt), batch)
@@ -86,10 +92,10 @@ def compare(
     if single_precision:
         model, batch = model.to(torch.float32), batch.to(dtype=torch.float32)
     for solver in solvers:
-        path, own = gradient(model, solver, batch)
+        path, computed = gradient(model, solver, batch)
         assert {p.grad.dtype for p in model.parameters() if p.grad is not None} == {batch.dtype}
-        for states, wanted in zip((path.x, path.v), (exact.x, exact.v), strict=True):
-            if wanted is not None and states is not None:
-                pair = states[batch.valid].double(), wanted[batch.valid]
+        for states, reference in ((path.x, exact.x), (path.v, exact.v)):
+            if reference is not None and states is not None:
+                pair = states[batch.valid].double(), reference[batch.valid]
                 torch.testing.assert_close(*pair, **({"rtol": 1e-12, "atol": 1e-12} | close))
-        assert difference(own, expected) < limit
+        assert difference(computed, expected) < limit

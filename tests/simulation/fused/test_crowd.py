@@ -8,47 +8,38 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, SimulationError
-from nnode.model import Crowd, InteractionForce, Law, Traffic, make_law
+from nnode.model import Crowd, Law, Traffic, make_law
 from nnode.model.effects import CATALOGUE
 from nnode.model.network import FeedForward
-from nnode.simulation import FusedSolver, fused
+from nnode.simulation import FusedSolver
 from nnode.simulation.kernels import crowds as compiled
 from nnode.simulation.kernels.crowds import SIZE, CrowdSource
 from tests import builders
 from tests.builders import social_forces
 from tests.simulation.fused.compare import compare, gradient, single
 from tests.simulation.fused.test_fallback import Sway
-from tests.simulation.scenes import crowd
+from tests.simulation.fused.test_neighbours import Weaker
+from tests.simulation.kernels.test_lane_code import PACKED, platform
+from tests.simulation.scenes import crowd, network_force
+
+pytestmark = pytest.mark.usefixtures("without_fallback")
 
 DT = 0.05
 
 
-def network(hidden: int = 4, **options: object) -> Law:
-    return make_law(
-        "network_force", hidden=hidden, generator=torch.Generator().manual_seed(3), **options
-    )  # type: ignore[arg-type]
-
-
 MODELS = {
     "sf": lambda: social_forces(B=0.1),
-    "nn": lambda: [make_law("relaxation"), network()],
-    "nn_self": lambda: [make_law("relaxation"), network(self_interaction=True)],
+    "nn": lambda: [make_law("relaxation"), network_force()],
+    "nn_self": lambda: [make_law("relaxation"), network_force(self_interaction=True)],
 }
-
-
-@pytest.fixture(autouse=True)
-def compiled_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No test here may pass because the fallback is right."""
-    monkeypatch.delattr(fused, "TorchdiffeqSolver")
 
 
 @pytest.fixture
 def people() -> list[Sequence]:
-    """Crowds of one to eight people, of different duration, with none, one and two walls."""
+    """Crowds of one to eight people with different durations, and zero to two walls."""
     return [
         crowd(4, samples=4, name="a"),
         crowd(2, samples=3, name="b"),
@@ -58,7 +49,7 @@ def people() -> list[Sequence]:
     ]
 
 
-@pytest.mark.thorough  # each precision is compiled for
+@pytest.mark.thorough  # each precision has its own compilation
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_single_precision(name: str, people: list[Sequence]) -> None:
     model = Crowd(MODELS[name]()).to(torch.float32).to(torch.float64)
@@ -69,7 +60,7 @@ def test_single_precision(name: str, people: list[Sequence]) -> None:
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_many_blocks_and_threads(name: str) -> None:
-    # more than fit into one block, and rows that are cut into pieces
+    # several blocks, and rows that are cut into pieces
     items = [crowd(3 + i % 5, samples=3, name=f"m{i}") for i in range(150)]
     solvers = [FusedSolver(DT, threads) for threads in (1, 2, 3)]
     compare(Crowd(MODELS[name]()), single(items), DT, *solvers)
@@ -121,27 +112,25 @@ def test_padding_stands_still(name: str, options: dict[str, float], people: list
     moving = replace(batch, x=x0)
     model = Crowd(MODELS[name]())
     law = compiled.supports(model, moving)
-    assert law is not None
     x = compiled.simulate(model, law, moving, 2, **options)[..., :2]
     padding = ~batch.agent
     assert padding.any()
     assert (x[:, padding] == batch.x[0, padding]).all()
     x[:, padding].sum().backward()
-    assert x0.grad is not None
     assert (x0.grad[0, padding] == len(x)).all()
     assert not x0.grad[0, ~padding].any()
 
 
-def test_without_gradient_nothing_changes(people: list[Sequence]) -> None:
-    for name in ("sf", "nn"):
-        batch, model = collate(people), Crowd(MODELS[name]())
-        with torch.no_grad():
-            x = FusedSolver(DT)(model, batch).x
-        assert not x.requires_grad
-        torch.testing.assert_close(x, FusedSolver(DT)(model, batch).x, rtol=1e-14, atol=1e-14)
+@pytest.mark.parametrize("name", ["sf", "nn"])
+def test_states_without_gradient(name: str, people: list[Sequence]) -> None:
+    batch, model, solver = collate(people), Crowd(MODELS[name]()), FusedSolver(DT)
+    with torch.no_grad():
+        x = solver(model, batch).x
+    assert not x.requires_grad
+    torch.testing.assert_close(x, solver(model, batch).x, rtol=1e-14, atol=1e-14)
 
 
-def test_a_blow_up_is_reported() -> None:
+def test_divergence_is_reported() -> None:
     items = [crowd(1, name="alone"), crowd(3, name="crushed", apart=0.1)]
     model = Crowd(social_forces(A=1e300, k=0.0, kappa=0.0, B=1e-4))
     with pytest.raises(SimulationError, match="crushed blew up"):
@@ -149,42 +138,35 @@ def test_a_blow_up_is_reported() -> None:
 
 
 def test_one_compilation_for_all_shapes(people: list[Sequence]) -> None:
-    # arrays of another layout would be compiled for again, unnoticed but for the seconds
+    # another layout of arrays would need another compilation
     for items in (people, people[3:4], [crowd(2, samples=2)], [crowd(3)] * 70):
         gradient(Crowd(MODELS["sf"]()), FusedSolver(DT), collate(items))
-    law = compiled.supports(Crowd(MODELS["sf"]()))
-    assert law is not None
-    module = compiled.compiled(CrowdSource(law))
+    module = compiled.compiled(CrowdSource(compiled.supports(Crowd(MODELS["sf"]()))))
     for function in (module.forward, module.backward):
-        assert 1 <= len(function.signatures) <= 2  # of two precisions
+        assert 1 <= len(function.signatures) <= 2  # two precisions
 
 
-def test_what_is_covered(people: list[Sequence]) -> None:
-    class Weaker(InteractionForce):
-        def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
-            return 0.5 * super().pair_force(dx, dv)
-
-    batch = collate(people)
-    assert compiled.supports(Crowd(MODELS["sf"]()), batch)
-    assert compiled.supports(Crowd(MODELS["nn"]()))
-    assert not compiled.supports(Traffic([make_law("lin")]))
-    assert not compiled.supports(Crowd([make_law("relaxation")]))
-    assert not compiled.supports(Crowd([make_law("relaxation"), Weaker(entry="social_force")]))
-    assert not compiled.supports(Crowd([*MODELS["sf"](), Sway()]))
-    deep = Crowd(MODELS["nn"]())
+def test_supported_models(people: list[Sequence]) -> None:
+    batch, deep, measured = collate(people), Crowd(MODELS["nn"]()), Crowd(MODELS["sf"]())
     deep.find_law("network_force").pair = FeedForward((4, 3, 3, 2))
+    measured.neighbours = "measured"
+    assert compiled.supports(Crowd(MODELS["sf"]()), batch)
     assert compiled.supports(deep)
-    alone = Crowd(MODELS["sf"]())
-    alone.neighbours = "measured"
-    assert not compiled.supports(alone)
-    # what sums run over is one for all of them, and only networks' may be over oneself
-    terms = [*MODELS["nn_self"](), CATALOGUE.effects["alignment"](c=0.2)]
-    assert not compiled.supports(Crowd(terms))
+    for model in (
+        Traffic([make_law("lin")]),
+        Crowd([make_law("relaxation")]),
+        Crowd([make_law("relaxation"), Weaker(entry="social_force")]),
+        Crowd([*MODELS["sf"](), Sway()]),
+        measured,
+        # all sums have the same range, which includes oneself only for networks
+        Crowd([*MODELS["nn_self"](), CATALOGUE.effects["alignment"](c=0.2)]),
+    ):
+        assert not compiled.supports(model)
     batch.destination.requires_grad_()
     assert not compiled.supports(Crowd(MODELS["sf"]()), batch)
 
 
-def test_a_cutoff_that_leaves_out_contacts(people: list[Sequence]) -> None:
+def test_cutoff_below_the_contact_distance(people: list[Sequence]) -> None:
     message = r"solver\.cutoff=0\.4 m must be larger than 0\.5 m, the distance of people who touch"
     with pytest.raises(ConfigError, match=message):
         FusedSolver(DT, cutoff=0.4)(Crowd(MODELS["sf"]()), collate(people))
@@ -193,21 +175,16 @@ def test_a_cutoff_that_leaves_out_contacts(people: list[Sequence]) -> None:
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["sf", "nn"])
 def test_loops_are_vector_code(name: str) -> None:
-    # losing this makes everything ten times slower and nothing else would tell
-    from tests.simulation.kernels.test_lane_code import PACKED, platform
-
     if platform.machine() not in PACKED:
         pytest.skip("unknown instruction set")
-    law = compiled.supports(Crowd(MODELS[name]()))
-    assert law is not None
-    source = CrowdSource(law)
+    source = CrowdSource(compiled.supports(Crowd(MODELS[name]())))
     module = compiled.compiled(source)
     for kind in (np.float64, np.float32):
         buffer, q = np.ones(module.ROWS * SIZE, kind), np.ones(len(source.uniform), kind)
-        loops = ("law_others_vjp", "law_points_vjp", "slopes_others", "slopes_points")
-        divide = [getattr(module, name) for name in loops if hasattr(module, name)]
-        assert len(divide) == 2
-        for function in divide:
+        names = ("law_others_vjp", "law_points_vjp", "slopes_others", "slopes_points")
+        loops = [getattr(module, name) for name in names if hasattr(module, name)]
+        assert len(loops) == 2
+        for function in loops:
             if function.__name__.startswith("law"):
                 function(buffer, 0, 32, q, kind(0), kind(1), 0, np.zeros(len(q)))
             else:
@@ -216,7 +193,7 @@ def test_loops_are_vector_code(name: str) -> None:
             assert re.findall(PACKED[platform.machine()], text), function.__name__
 
 
-#: What changes each part of a formula: sums over others, wall points and walls, inputs, clocks.
+#: Effects on each part of a formula.
 EFFECTS = {
     "sums": {
         "alignment": {"c": 0.4},
@@ -234,7 +211,7 @@ EFFECTS = {
 
 
 def with_effects(base: str, *chosen: str) -> Crowd:
-    """A model, and the effects of some of the parts."""
+    """A model with the effects on some parts."""
     effects = {name: values for part in chosen for name, values in EFFECTS[part].items()}
     return Crowd([*MODELS[base](), *(CATALOGUE.effects[n](**v) for n, v in effects.items())])
 
@@ -244,7 +221,7 @@ def in_groups(people: list[Sequence]) -> list[Sequence]:
     return [replace(item, group=names[: item.x.shape[1]]) for item in people]
 
 
-@pytest.mark.thorough  # many effects at once take long to compile
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("base", "chosen"), [("sf", ("sums", "force", "walls")), ("nn", ("force",))], ids=str
 )
@@ -253,10 +230,9 @@ def test_effects(base: str, chosen: tuple[str, ...], people: list[Sequence]) -> 
 
 
 @pytest.mark.thorough
-def test_effects_among_neighbours(people: list[Sequence]) -> None:
+def test_effects_with_a_cutoff(people: list[Sequence]) -> None:
     model, batch = with_effects("sf", "walls"), single(in_groups(people))
     compare(model, batch, DT, FusedSolver(DT, cutoff=50.0))
-    # one that leaves people out is another model
     with torch.no_grad():
-        whole, near = (FusedSolver(DT, cutoff=c)(model, batch).x[-1] for c in (50.0, 0.6))
-    assert (whole - near)[batch.valid[-1]].abs().max() > 1e-6
+        large, small = (FusedSolver(DT, cutoff=c)(model, batch).x[-1] for c in (50.0, 0.6))
+    assert (large - small)[batch.valid[-1]].abs().max() > 1e-6

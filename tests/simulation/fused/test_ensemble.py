@@ -1,4 +1,4 @@
-"""Runs side by side are the runs one after the other."""
+"""Simultaneous runs against single runs."""
 
 from __future__ import annotations
 
@@ -7,39 +7,35 @@ import torch
 from torch import Tensor
 
 from nnode.errors import ConfigError
-from nnode.model import Crowd, Traffic, make_law
+from nnode.model import Crowd, Traffic
 from nnode.simulation import FusedSolver
 from nnode.simulation.kernels import lanes
 from tests.builders import social_forces
-from tests.simulation.fused.compare import difference, single
+from tests.simulation.fused.compare import difference, flat_gradient, single
 from tests.simulation.fused.test_fallback import Sway
-from tests.simulation.scenes import crowd, platoon
+from tests.simulation.scenes import LAWS, crowd, platoon
 
 DT = 0.02
 
 MODELS = {
-    "lin": lambda: Traffic([make_law("lin", v0=18.0, L=4.0)]),
-    "log": lambda: Traffic([make_law("log", v0=18.0, L=6.0)], leader="measured"),
-    "n4": lambda: Traffic(
-        [make_law("network_speed", hidden=4, v0=18.0, generator=torch.Generator().manual_seed(3))]
-    ),
-    "fallback": lambda: Traffic([make_law("lin", v0=18.0, L=4.0), Sway()]),
+    "lin": lambda: Traffic([LAWS["lin"]()]),
+    "log": lambda: Traffic([LAWS["log"]()], leader="measured"),
+    "n4": lambda: Traffic([LAWS["n4"]()]),
+    "fallback": lambda: Traffic([LAWS["lin"](), Sway()]),
     "crowd": lambda: Crowd(social_forces(B=0.1)),
 }
 
 
 def spread(model: torch.nn.Module, runs: int) -> dict[str, Tensor]:
-    """Parameters scattered around the model's own, as leaves."""
-    draw = torch.Generator().manual_seed(2)
-    return {
-        name: (p * (1 + 0.1 * torch.rand(runs, *p.shape, generator=draw, dtype=p.dtype)))
-        .detach()
-        .requires_grad_()
-        for name, p in model.named_parameters()
-    }
+    """Parameters near those of the model, with gradients."""
+    draw, parameters = torch.Generator().manual_seed(2), {}
+    for name, p in model.named_parameters():
+        factor = 1 + 0.1 * torch.rand(runs, *p.shape, generator=draw, dtype=p.dtype)
+        parameters[name] = (p * factor).detach().requires_grad_()
+    return parameters
 
 
-#: Laws that are compiled like the others, for as long.
+#: Laws with a long compilation.
 LONG = ("log", "n4")
 
 
@@ -48,7 +44,7 @@ LONG = ("log", "n4")
     "name",
     [pytest.param(n, marks=pytest.mark.thorough if n in LONG else ()) for n in MODELS],
 )
-def test_every_run_is_its_own(name, threads, ragged) -> None:  # type: ignore[no-untyped-def]
+def test_states_and_gradients_of_runs(name, threads, ragged) -> None:
     people = [crowd(3, samples=4, name="a"), crowd(2, samples=3, name="b")]
     batch = single(people if name == "crowd" else ragged)
     model, solver = MODELS[name](), FusedSolver(DT, threads)
@@ -65,45 +61,45 @@ def test_every_run_is_its_own(name, threads, ragged) -> None:  # type: ignore[no
                 p.copy_(parameters[key][r])
         model.zero_grad()
         alone = solver(model, batch).x
-        one = together[:, r].detach()[:, batch.agent]
-        torch.testing.assert_close(one, alone.detach()[:, batch.agent], rtol=1e-14, atol=1e-13)
+        states = (path.detach()[:, batch.agent] for path in (together[:, r], alone))
+        torch.testing.assert_close(*states, rtol=1e-14, atol=1e-13)
         ((r + 1) * alone).masked_fill(~batch.valid[..., None], 0.0).square().sum().backward()
         for key, p in model.named_parameters():
-            share = parameters[key].grad
-            assert share is not None
+            assert parameters[key].grad is not None
             if p.grad is not None and p.grad.abs().max() > 0:
-                assert difference(share[r], p.grad) < 1e-10, key
+                assert difference(parameters[key].grad[r], p.grad) < 1e-10, key
 
 
-def test_missing_parameters_are_the_own_ones(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model = single(ragged), Traffic([make_law("lin", v0=18.0, L=4.0)])
+def test_other_parameters_are_those_of_the_model(ragged) -> None:
+    batch, model = single(ragged), MODELS["lin"]()
     lengths = torch.tensor([3.0, 4.0], dtype=torch.float64)
     results = FusedSolver(DT).ensemble(model, {"terms.0.L": lengths}, batch).x
     torch.testing.assert_close(results[:, 1], FusedSolver(DT)(model, batch).x, rtol=0, atol=0)
     assert (results[:, 0] - results[:, 1]).abs().max() > 0.01
 
 
-def test_a_run_that_blows_up_stays_alone() -> None:
-    batch, model = single([platoon([10.0, 6.0])]), Traffic([make_law("lin", v0=18.0, L=4.0)])
+def test_divergent_run_does_not_affect_others() -> None:
+    batch, model = single([platoon([10.0, 6.0])]), MODELS["lin"]()
     v0 = torch.tensor([18.0, float("nan")], dtype=torch.float64, requires_grad=True)
     x = FusedSolver(DT).ensemble(model, {"terms.0.v0": v0}, batch).x
     assert x[:, 0].isfinite().all()
     assert not x[1:, 1].isfinite().any()
     x[:, 0].sum().backward()
-    assert v0.grad is not None
     assert v0.grad[0].isfinite()
 
 
-def test_refusals(ragged) -> None:  # type: ignore[no-untyped-def]
-    batch, model, solver = single(ragged), Traffic([make_law("lin")]), FusedSolver(DT)
-    with pytest.raises(ConfigError, match=r"\['terms\.0\.M'\].*terms\.0\.v0, terms\.0\.L"):
-        solver.ensemble(model, {"terms.0.M": torch.ones(2)}, batch)
-    with pytest.raises(ConfigError, match="found none"):
-        solver.ensemble(model, {}, batch)
-    with pytest.raises(ConfigError, match="shape"):
-        solver.ensemble(model, {"terms.0.L": torch.ones(())}, batch)
-    with pytest.raises(ConfigError, match="same R"):
-        solver.ensemble(model, {"terms.0.L": torch.ones(2), "terms.0.v0": torch.ones(3)}, batch)
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"terms.0.M": torch.ones(2)}, r"\['terms\.0\.M'\].*terms\.0\.v0, terms\.0\.L"),
+        ({}, "found none"),
+        ({"terms.0.L": torch.ones(())}, "shape"),
+        ({"terms.0.L": torch.ones(2), "terms.0.v0": torch.ones(3)}, "same R"),
+    ],
+)
+def test_invalid_parameters(parameters: dict[str, Tensor], message: str, ragged) -> None:
+    with pytest.raises(ConfigError, match=message):
+        FusedSolver(DT).ensemble(MODELS["lin"](), parameters, single(ragged))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +108,7 @@ def test_refusals(ragged) -> None:  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize(
     "name", ["lin", *(pytest.param(law, marks=pytest.mark.thorough) for law in LONG)]
 )
-def test_both_arrangements_agree(name, dtype, equal, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_memory_layouts_agree(name, dtype, equal, monkeypatch) -> None:
     batch, model = single(equal).to(dtype=dtype), MODELS[name]().to(dtype)
     results = []
     for enough in (0, 10_000):
@@ -120,8 +116,8 @@ def test_both_arrangements_agree(name, dtype, equal, monkeypatch) -> None:  # ty
         parameters = spread(model, 5)
         x = FusedSolver(DT).ensemble(model, parameters, batch).x
         (x - batch.x[:, None]).square().sum().backward()
-        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters.values()]
-        results.append((x.detach(), torch.cat([g.flatten() for g in grads])))
-    small = torch.finfo(dtype).eps
-    torch.testing.assert_close(results[0][0], results[1][0], rtol=10 * small, atol=100 * small)
-    assert difference(results[0][1], results[1][1]) < 1e3 * small
+        results.append((x.detach(), flat_gradient(parameters.values())))
+    states, gradients = zip(*results, strict=True)
+    eps = torch.finfo(dtype).eps
+    torch.testing.assert_close(*states, rtol=10 * eps, atol=100 * eps)
+    assert difference(*gradients) < 1e3 * eps

@@ -1,4 +1,4 @@
-"""Cell lists against all pairs, and what a cutoff leaves out against its bound."""
+"""Cell lists against all pairs, and errors of a cutoff against their bound."""
 
 from __future__ import annotations
 
@@ -13,57 +13,58 @@ import pytest
 import torch
 from torch import Tensor
 
-from nnode.data.sequence import Batch, Sequence, collate
+from nnode.data.sequence import Batch, collate
 from nnode.errors import ConfigError
 from nnode.model import Crowd, InteractionForce, Traffic, make_law
 from nnode.model.formula import crowd_of
 from nnode.simulation import FusedSolver, TorchdiffeqSolver
 from nnode.simulation.kernels import crowds
-from tests.builders import social_forces, straight
+from tests.builders import lane, social_forces, straight
 from tests.simulation.fused.compare import compare, difference, gradient
+from tests.simulation.scenes import network_force
 
 DT = 0.02
 
 
 @cache
 def neighbours() -> Any:
-    """The functions of cell lists, of a module that holds them."""
-    law = crowd_of([make_law("social_force")])
-    assert law is not None
-    return crowds.compiled(crowds.CrowdSource(law, near=True))
+    """A compiled module with the functions of cell lists."""
+    return crowds.compiled(crowds.CrowdSource(crowd_of([make_law("social_force")]), near=True))
+
+
+def with_outliers(draw: np.random.Generator, n: int, outliers: Any) -> np.ndarray:
+    return np.concatenate([draw.uniform(0, 10, (n - 2, 2)), outliers])
+
+
+def lattice(n: int) -> np.ndarray:
+    """Positions on the edges of the cells."""
+    side = np.arange(math.ceil(n**0.5), dtype=float)
+    return np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)[:n]
+
+
+PLACES = {
+    "square": lambda draw, n: draw.uniform(0, n**0.5, (n, 2)),
+    "line": lambda draw, n: draw.uniform(0, n, (n, 1)) * [1.0, 0.0],
+    "point": lambda draw, n: np.zeros((n, 2)),
+    "lattice": lambda draw, n: lattice(n),
+    "runaway": lambda draw, n: with_outliers(draw, n, [[1e12, 0], [3, -1e300]]),
+    "nan": lambda draw, n: with_outliers(draw, n, [[np.nan, 0], [3, np.inf]]),
+    "alone": lambda draw, n: np.array([[3.0, 4.0]]),
+}
 
 
 def arrangement(name: str, n: int = 300) -> np.ndarray:
-    draw = np.random.default_rng(7)
-    if name == "square":
-        return draw.uniform(0, n**0.5, (n, 2))
-    if name == "line":
-        return np.stack([draw.uniform(0, n, n), np.zeros(n)], 1)
-    if name == "point":
-        return np.zeros((n, 2))
-    if name == "lattice":  # on the edges of the cells
-        side = math.ceil(n**0.5)
-        return np.stack(np.meshgrid(*2 * [np.arange(side)]), -1).reshape(-1, 2)[:n] * 1.0
-    if name == "runaway":
-        return np.concatenate([draw.uniform(0, 10, (n - 2, 2)), [[1e12, 0], [3, -1e300]]])
-    if name == "nan":
-        return np.concatenate([draw.uniform(0, 10, (n - 2, 2)), [[np.nan, 0], [3, np.inf]]])
-    assert name == "alone"
-    return np.array([[3.0, 4.0]])
+    return PLACES[name](np.random.default_rng(7), n)
 
 
-PLACES = ["square", "line", "point", "lattice", "runaway", "nan", "alone"]
-
-
-def near(a: np.ndarray, b: np.ndarray, cutoff: float) -> set[tuple[int, int]]:
+def all_pairs(a: np.ndarray, b: np.ndarray, cutoff: float) -> set[tuple[int, int]]:
     with np.errstate(all="ignore"):
-        away = ((a[:, None] - b[None]) ** 2).sum(-1)
-    return {(int(i), int(j)) for i, j in np.argwhere(away < cutoff**2)}
+        squares = ((a[:, None] - b[None]) ** 2).sum(-1)
+    return {(int(i), int(j)) for i, j in np.argwhere(squares < cutoff**2)}
 
 
 def pairs_of(x: np.ndarray, cutoff: float) -> tuple[np.ndarray, np.ndarray, int]:
-    """The order of people in the cells, pairs of places in it, and the number of those that
-    count."""
+    """The order of people in the cells, a buffer of pairs in this order, and their number."""
     cells = neighbours().grid(x[:, 0], x[:, 1], cutoff)
     assert cells[4] * cells[5] <= 4 * len(x) + 16
     order, cell, start = neighbours().sort(x[:, 0], x[:, 1], cells)
@@ -74,13 +75,13 @@ def pairs_of(x: np.ndarray, cutoff: float) -> tuple[np.ndarray, np.ndarray, int]
 @pytest.mark.thorough
 @pytest.mark.parametrize("cutoff", [0.7, 1.0, 1.65, 100.0])
 @pytest.mark.parametrize("name", PLACES)
-def test_all_pairs_once(name: str, cutoff: float) -> None:
+def test_pairs_of_people(name: str, cutoff: float) -> None:
     x = arrangement(name)
     order, pairs, number = pairs_of(x, cutoff)
     assert sorted(order) == list(range(len(x)))
     indices = [tuple(sorted((order[i], order[j]))) for i, j in pairs[:, :number].T]
     assert len(set(indices)) == len(indices)
-    assert set(indices) == {pair for pair in near(x, x, cutoff) if pair[0] < pair[1]}
+    assert set(indices) == {(i, j) for i, j in all_pairs(x, x, cutoff) if i < j}
     directed, twice = neighbours().both_ways(pairs, number)
     assert twice == 2 * number
     directed = {(int(i), int(j)) for i, j in directed[:, :twice].T}
@@ -90,7 +91,7 @@ def test_all_pairs_once(name: str, cutoff: float) -> None:
 @pytest.mark.thorough
 @pytest.mark.parametrize("points", ["line", "square", "point", "alone"])
 @pytest.mark.parametrize("name", PLACES)
-def test_people_and_wall_points(name: str, points: str) -> None:
+def test_pairs_of_people_and_wall_points(name: str, points: str) -> None:
     x, wall, cutoff = arrangement(name), arrangement(points, 80) + np.array([1.0, 0.5]), 1.4
     cells = neighbours().grid(wall[:, 0], wall[:, 1], cutoff)
     order, _, start = neighbours().sort(wall[:, 0], wall[:, 1], cells)
@@ -100,26 +101,26 @@ def test_people_and_wall_points(name: str, points: str) -> None:
     )
     indices = [(i, int(order[p])) for i, p in pairs[:, :number].T]
     assert len(set(indices)) == len(indices)
-    assert set(indices) == near(x, wall, cutoff)
+    assert set(indices) == all_pairs(x, wall, cutoff)
 
 
-def test_pairs_grow_with_people() -> None:
-    # at one person per square metre, half of pi cutoff^2 partners each
+def test_number_of_pairs_is_linear_in_people() -> None:
+    # at one person per square metre, half of pi cutoff^2 pairs per person
     few, many = (pairs_of(arrangement("square", n), 1.65)[2] / n for n in (500, 10_000))
     assert many == pytest.approx(math.pi * 1.65**2 / 2, rel=0.05)
     assert many / few < 1.3
 
 
 def hall(n: int, samples: int = 3, dt: float = 0.04, walls: int = 2) -> Batch:
-    """People at one per square metre, of whom many touch, between (two) walls; padding."""
+    """Two crowds at one person per square metre, many in contact, with up to two walls."""
     draw = np.random.default_rng(3)
     side = n**0.5
     items = []
-    for name, count, most in (("a", n, walls), ("b", n - 9, walls // 2)):
+    for name, count, number in (("a", n, walls), ("b", n - 9, walls // 2)):
         x = draw.uniform(0, side, (count, 2))
         v = np.array([1.3, 0.0]) + 0.2 * draw.standard_normal((count, 2))
         goal = x + np.array([20.0, 0.0])
-        lines = np.array([[0, 0, side, 0], [side, side, 0, side]])[:most]
+        lines = np.array([[0, 0, side, 0], [side, side, 0, side]])[:number]
         items.append(straight(x, v, samples, dt, name=name, destination=goal, walls=lines))
     return collate(items)
 
@@ -128,36 +129,33 @@ A, MASS = 3.0, 2.0
 
 
 def omitted(batch: Batch, decay: float = 0.05, **options: float) -> float:
-    """The largest error of a person's acceleration, m/s², by partners beyond a cutoff."""
+    """The largest error of an acceleration, m/s², without partners beyond a cutoff."""
     model = Crowd(social_forces(A=A, k=40.0, kappa=5.0, B=decay, mass=MASS))
     with torch.no_grad():
         v = FusedSolver(batch.dt, **options)(model, batch).v
         exact = TorchdiffeqSolver("euler", "discrete")(model, batch).v
-    assert v is not None
-    assert exact is not None
     return float((v[1] - exact[1])[batch.valid[1]].norm(dim=-1).max() / batch.dt)
 
 
+@pytest.mark.parametrize("walls", [False, True])
 @pytest.mark.parametrize("cutoff_error", [1e-3, 1e-6, 1e-10])
-def test_the_bound_holds(cutoff_error: float) -> None:
-    # wall points would be averaged over their own number: one bound at a time
-    for walls in (False, True):
-        error = omitted(hall(300, walls=2 * walls), cutoff_error=cutoff_error)
-        # pairs and walls are two means, each within the bound
-        assert error <= (1 + walls) * cutoff_error * A / MASS + 1e-12
-        if cutoff_error == 1e-3:
-            assert error > 0  # something was left out
+def test_bound_of_the_error(cutoff_error: float, walls: bool) -> None:
+    error = omitted(hall(300, walls=2 * walls), cutoff_error=cutoff_error)
+    # forces of people and forces of walls are two means, each within the bound
+    assert error <= (1 + walls) * cutoff_error * A / MASS + 1e-12
+    if cutoff_error == 1e-3:
+        assert error > 0  # the cutoff was used
 
 
 @pytest.mark.parametrize("cutoff", [0.8, 1.5])
-def test_the_bound_of_a_given_distance(cutoff: float) -> None:
-    # small crowds have a cutoff where one is given
+def test_bound_of_the_error_of_a_given_cutoff(cutoff: float) -> None:
+    # a given cutoff is used in small crowds too
     error = omitted(hall(40, walls=0), decay=0.1, cutoff=cutoff, cutoff_error=0)
     assert 0 < error < math.exp((0.5 - cutoff) / 0.1) * A / MASS
 
 
-def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
-    # the force on one person, not divided by the number of people
+def test_default_error_is_below_a_millionth_of_a_contact_force() -> None:
+    # the force is not divided by the number of people
     assert omitted(hall(2000, walls=0)) * MASS * 2000 < 1e-6 * A
 
 
@@ -173,45 +171,43 @@ def test_default_error_is_below_a_millionth_of_a_touching_partner() -> None:
         ({"cutoff_error": math.nan}, r"solver\.cutoff_error=nan"),
     ],
 )
-def test_bad_cutoffs_are_refused_before_any_work(options: dict[str, float], message: str) -> None:
+def test_invalid_cutoffs(options: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        FusedSolver(**options)  # type: ignore[arg-type]
+        FusedSolver(**options)
 
 
-def test_models_that_cannot_have_a_cutoff() -> None:
+class Weaker(InteractionForce):
+    """A force in Python code, which is not compiled."""
+
+    def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
+        return 0.5 * super().pair_force(dx, dv)
+
+
+def test_models_without_a_cutoff() -> None:
     batch, solver = hall(12), FusedSolver(cutoff=1.0)
-
-    class Weaker(InteractionForce):
-        """Not compiled."""
-
-        def pair_force(self, dx: Tensor, dv: Tensor) -> Tensor:
-            return 0.5 * super().pair_force(dx, dv)
-
-    with pytest.raises(ConfigError, match=r"solver\.cutoff=1 m works for crowds.*set it to null"):
-        solver(Crowd([make_law("relaxation"), Weaker(entry="social_force")]), batch)
-    x = np.array([0.0, 12.0]) + np.arange(3.0)[:, None]
-    cars = collate([Sequence(name="c", recording="r", time=0.2 * np.arange(3), x=x[..., None])])
-    with pytest.raises(ConfigError, match=r"solver\.cutoff=1 m works for crowds"):
-        solver(Traffic([make_law("lin")]), cars)
-    # the baseline without forces needs none
-    alone = Crowd([make_law("relaxation")])
+    cars = collate([lane(np.array([0.0, 12.0]) + np.arange(3.0)[:, None])])
+    weaker = Crowd([make_law("relaxation"), Weaker(entry="social_force")])
+    for model, data in ((weaker, batch), (Traffic([make_law("lin")]), cars)):
+        with pytest.raises(ConfigError, match=r"solver\.cutoff=1 m works for crowds.*it to null"):
+            solver(model, data)
+    alone = Crowd([make_law("relaxation")])  # has no forces, so that the cutoff does not matter
     with torch.no_grad():
         assert torch.equal(solver(alone, batch).x, FusedSolver()(alone, batch).x)
 
 
-def test_the_formula_of_the_bound() -> None:
-    for reach, decay, error in ((0.5, 0.05, 1e-10), (0.25, 0.1, 1e-3)):
-        c = crowds.cutoff_distance(reach, decay, error)
-        assert math.exp((reach - c) / decay) == pytest.approx(error, rel=1e-9)
-        assert c > reach  # contacts are never left out
+@pytest.mark.parametrize(("reach", "decay", "error"), [(0.5, 0.05, 1e-10), (0.25, 0.1, 1e-3)])
+def test_cutoff_distance(reach: float, decay: float, error: float) -> None:
+    c = crowds.cutoff_distance(reach, decay, error)
+    assert math.exp((reach - c) / decay) == pytest.approx(error, rel=1e-9)
+    assert c > reach  # contacts are within the cutoff
 
 
 @pytest.mark.parametrize("walls", [True, pytest.param(False, marks=pytest.mark.thorough)])
-def test_lists_give_the_gradient(walls: bool) -> None:
+def test_gradient_with_lists(walls: bool) -> None:
     batch = hall(crowds.LISTS_FROM + 20)
     model = Crowd(social_forces(A=3.0, k=40.0, kappa=5.0, walls=walls))
     compare(model, batch, DT, FusedSolver(DT), FusedSolver(DT, 2), limit=1e-8, rtol=0, atol=1e-9)
-    # a cutoff that reaches everybody leaves nothing out
+    # this cutoff includes everybody
     compare(model, batch, DT, FusedSolver(DT, cutoff=100.0))
     with torch.no_grad():  # the lists were used
         assert not torch.equal(
@@ -227,31 +223,21 @@ def test_lists_in_single_precision(walls: bool) -> None:
     compare(model, batch, DT, FusedSolver(DT), single_precision=True, **close)
 
 
-def networks(oneself: bool) -> Crowd:
-    draw = torch.Generator().manual_seed(2)
-    return Crowd(
-        [
-            make_law("relaxation"),
-            make_law("network_force", self_interaction=oneself, generator=draw),
-        ]
-    )
-
-
-# they are compiled for as long as everything above
 @pytest.mark.thorough
 @pytest.mark.parametrize("grad", [False, True])
-@pytest.mark.parametrize("oneself", [False, True])
-def test_networks_with_a_cutoff(oneself: bool, grad: bool) -> None:
-    batch, model = hall(40), networks(oneself)
+@pytest.mark.parametrize("on_self", [False, True])
+def test_networks_with_a_cutoff(on_self: bool, grad: bool) -> None:
+    batch = hall(40)
+    model = Crowd([make_law("relaxation"), network_force(self_interaction=on_self)])
     solvers = [TorchdiffeqSolver("euler", "discrete", DT)]
     solvers += [FusedSolver(DT, cutoff=cutoff) for cutoff in (100.0, 2.0)]
     if grad:
-        exact, same, near = (gradient(model, solver, batch)[1] for solver in solvers)
+        exact, large, small = (gradient(model, solver, batch)[1] for solver in solvers)
     else:
         with torch.no_grad():
-            exact, same, near = (solver(model, batch).x[batch.valid] for solver in solvers)
-    assert difference(same, exact) < 1e-10 if grad else 1e-13
-    assert difference(near, exact) > 1e-10
+            exact, large, small = (solver(model, batch).x[batch.valid] for solver in solvers)
+    assert difference(large, exact) < (1e-10 if grad else 1e-13)
+    assert difference(small, exact) > 1e-10
 
 
 SCALE = """

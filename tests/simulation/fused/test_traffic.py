@@ -8,43 +8,32 @@ import torch
 from nnode.data.sequence import Sequence, collate
 from nnode.errors import ConfigError, DataError
 from nnode.model import Law, Traffic, make_law
-from nnode.simulation import FusedSolver, fused
+from nnode.simulation import FusedSolver
 from nnode.simulation.kernels import lanes
 from tests.simulation.fused.compare import compare, single
-from tests.simulation.scenes import crowd, platoon
+from tests.simulation.scenes import LAWS, crowd, platoon
+
+pytestmark = pytest.mark.usefixtures("without_fallback")
 
 DT = 0.01
-LAWS = {
-    "lin": lambda: make_law("lin", v0=18.0, L=4.0),
-    "log": lambda: make_law("log", v0=18.0, L=6.0),
-    "n4": lambda: make_law(
-        "network_speed", hidden=4, v0=18.0, generator=torch.Generator().manual_seed(3)
-    ),
-}
-
-
-@pytest.fixture(autouse=True)
-def compiled_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No test here may pass because the fallback is right."""
-    monkeypatch.delattr(fused, "TorchdiffeqSolver")
 
 
 @pytest.mark.parametrize("leader", ["constant", "measured"])
 @pytest.mark.parametrize("items", ["ragged", "equal"])
 @pytest.mark.parametrize("law", LAWS)
-def test_states_and_gradient(law, items, leader, request) -> None:  # type: ignore[no-untyped-def]
+def test_states_and_gradient(law, items, leader, request) -> None:
     model = Traffic([LAWS[law]()], leader=leader).to(torch.float32).to(torch.float64)
     solvers = [FusedSolver(DT, threads) for threads in (1, 2, 3)]
     compare(model, single(request.getfixturevalue(items)), DT, *solvers, atol=1e-9)
 
 
-# each precision is compiled for
+# each precision has its own compilation
 @pytest.mark.parametrize("leader", ["constant", "measured"])
 @pytest.mark.parametrize("items", ["ragged", "equal"])
 @pytest.mark.parametrize(
     "law", ["n4", *(pytest.param(law, marks=pytest.mark.thorough) for law in ("lin", "log"))]
 )
-def test_single_precision(law, items, leader, request) -> None:  # type: ignore[no-untyped-def]
+def test_single_precision(law, items, leader, request) -> None:
     batch = single(request.getfixturevalue(items))
     model = Traffic([LAWS[law]()], leader=leader).to(torch.float32).to(torch.float64)
     close = {"limit": 1e-4, "rtol": 3e-7, "atol": 1e-4}
@@ -54,7 +43,7 @@ def test_single_precision(law, items, leader, request) -> None:  # type: ignore[
 @pytest.mark.parametrize(
     ("law", "items"),
     [
-        # the law is held constant below its smallest gap
+        # the law is constant below its smallest gap
         (make_law("log", v0=3.0, L=4.0), [platoon([1e-4, 5.0, -2.0], samples=3)]),
         (LAWS["lin"](), [platoon([15.0] * 30, samples=3, name=f"{i}") for i in range(50)]),
     ],
@@ -64,21 +53,21 @@ def test_unusual_platoons(law: Law, items: list[Sequence]) -> None:
     compare(Traffic([law]), single(items), DT, FusedSolver(DT, 2), atol=1e-9)
 
 
-def test_backward_twice_and_without_gradient(ragged: list[Sequence]) -> None:
+def test_second_backward_pass_and_no_gradient(ragged: list[Sequence]) -> None:
     batch, model, solver = collate(ragged), Traffic([LAWS["n4"]()]), FusedSolver(DT)
     x = solver(model, batch).x
     weights, cost = list(model.parameters()), x.square().sum()
-    once = torch.autograd.grad(cost, weights, retain_graph=True, allow_unused=True)
-    second = torch.autograd.grad(cost, weights, allow_unused=True)
-    for a, b in zip(once, second, strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    first, second = (
+        torch.autograd.grad(cost, weights, retain_graph=True, allow_unused=True) for _ in range(2)
+    )
+    torch.testing.assert_close(first, second, rtol=0, atol=0)
     with torch.no_grad():
-        same = solver(model, batch).x
-    assert not same.requires_grad
-    assert torch.equal(same, x)
+        without_gradient = solver(model, batch).x
+    assert not without_gradient.requires_grad
+    assert torch.equal(without_gradient, x)
 
 
-def test_refusals() -> None:
+def test_invalid_options_and_data() -> None:
     model = Traffic([make_law("lin")])
     with pytest.raises(ConfigError, match="threads=0"):
         FusedSolver(threads=0)
@@ -88,7 +77,7 @@ def test_refusals() -> None:
         FusedSolver(DT)(model, collate([crowd(2)]))
 
 
-def test_code_of_one_s_own_is_not_taken_for_the_formula() -> None:
+def test_subclass_with_code_is_not_compiled() -> None:
     class Slower(Law):
         def speed(self, gap: torch.Tensor) -> torch.Tensor:
             return super().speed(gap) / 2

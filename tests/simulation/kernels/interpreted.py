@@ -1,8 +1,4 @@
-"""Generated source of lanes, run by Python's interpreter.
-
-Compiling a law takes seconds, and interpreting its source for a few steps takes a fraction of one:
-the text of every law and method can be tested this way in the time of a handful of compilations.
-"""
+"""Generated source of lanes in Python's interpreter, which is faster than a compilation."""
 
 from __future__ import annotations
 
@@ -17,7 +13,7 @@ import numpy as np
 from nnode.model.operations import LIBRARIES
 from nnode.simulation.kernels.lanes import LaneSource
 
-#: Rows are computed in multiples of this, so that they reach into the rows of the next vehicle.
+#: Rows are computed in multiples of this number.
 CHUNK = 8
 
 
@@ -30,8 +26,7 @@ def _undecorated(*_: Any, **__: Any) -> Any:
 
 
 def _float(operation: Any, otherwise: float) -> Any:
-    """A function of the mathematical library that gives what compiled code gives outside its
-    domain."""
+    """A library function with the results of compiled code outside its domain."""
 
     def checked(x: float) -> float:
         try:
@@ -42,7 +37,7 @@ def _float(operation: Any, otherwise: float) -> Any:
     return checked
 
 
-#: What the generated source imports, for numbers in float64.
+#: The names that the generated source imports, for float64.
 _NAMES: dict[str, Any] = {
     **LIBRARIES["number"],
     "njit": _undecorated,
@@ -54,7 +49,7 @@ _NAMES: dict[str, Any] = {
     "exp": _float(math.exp, math.inf),
     "log": _float(math.log, math.nan),
     "sqrt": _float(math.sqrt, math.nan),
-    # indices are Python's numbers, which are faster than NumPy's
+    # Python's integers are faster than NumPy's
     "np": SimpleNamespace(uint64=int, zeros=np.zeros, array=np.array),
 }
 #: Imports of the generated source.

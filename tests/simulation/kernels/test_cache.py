@@ -1,4 +1,4 @@
-"""The folder of kept modules: only files that this user wrote are run."""
+"""The cache of compiled modules, which runs only files of the user."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def mode(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def no_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def fill_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -37,14 +37,14 @@ def no_room(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", TEXT[:30], b"def plus(a):\n    return 41\n"])
-def test_a_file_of_another_content_is_written_again(folder: Path, content: bytes) -> None:
+def test_file_with_other_content_is_replaced(folder: Path, content: bytes) -> None:
     folder.mkdir(parents=True, mode=0o700)
     (folder / "nnode_one.py").write_bytes(content)
     assert cache.keep("nnode_one", TEXT).plus(1) == 2
     assert (folder / "nnode_one.py").read_bytes() == TEXT
 
 
-def test_the_folder_is_its_owners_alone(folder: Path) -> None:
+def test_mode_of_the_folder(folder: Path) -> None:
     before = os.umask(0)
     try:
         assert cache.keep("nnode_mode", TEXT).plus(1) == 2
@@ -56,7 +56,7 @@ def test_the_folder_is_its_owners_alone(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("place", "bits"), [("", 0o770), ("", 0o707), ("__pycache__", 0o777)])
-def test_a_folder_that_others_may_write_to_is_refused(folder: Path, place: str, bits: int) -> None:
+def test_folder_writable_by_others(folder: Path, place: str, bits: int) -> None:
     (folder / place).mkdir(parents=True, mode=0o700)
     (folder / place).chmod(bits)
     with pytest.raises(ConfigError, match=r"others may write to.*NNODE_CACHE"):
@@ -64,55 +64,53 @@ def test_a_folder_that_others_may_write_to_is_refused(folder: Path, place: str, 
     assert not list(folder.glob("*.py"))
 
 
-def test_a_folder_in_one_that_everybody_may_write_to(folder: Path) -> None:
+def test_parent_folder_writable_by_everybody(folder: Path) -> None:
     folder.mkdir(parents=True, mode=0o700)
     folder.parent.chmod(0o777)
     with pytest.raises(ConfigError, match="others may write to"):
         cache.keep("nnode_among", TEXT)
-    folder.parent.chmod(0o1777)  # as /tmp, where only the owner replaces what is there
+    folder.parent.chmod(0o1777)  # as /tmp, where only owners can replace their files
     assert cache.keep("nnode_among", TEXT).plus(1) == 2
 
 
-@pytest.mark.skipif("os.getuid() != 0", reason="only root gives folders to others")
+@pytest.mark.skipif("os.getuid() != 0", reason="only root can change owners")
 @pytest.mark.parametrize("place", ["", "..", "__pycache__"])
-def test_a_folder_of_another_user_is_refused(folder: Path, place: str) -> None:
+def test_folder_of_another_user(folder: Path, place: str) -> None:
     (folder / "__pycache__").mkdir(parents=True, mode=0o700)
     os.chown(folder / place, 65534, 65534)
     with pytest.raises(ConfigError, match=r"user 65534 owns.*NNODE_CACHE"):
         cache.keep("nnode_other", TEXT)
 
 
-def test_a_full_disk_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    no_room(monkeypatch)
+def test_full_disk_leaves_no_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill_disk(monkeypatch)
     with pytest.raises(ConfigError, match=r"No space left on device.*NNODE_CACHE"):
         cache.keep("nnode_full", TEXT)
     assert not [path for path in folder.rglob("*") if path.is_file()]
 
 
-def test_no_room_for_compiled_code(
+def test_full_disk_during_compilation(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    module = cache.keep("nnode_roomless", TEXT)
-    no_room(monkeypatch)
+    module = cache.keep("nnode_full_later", TEXT)
+    fill_disk(monkeypatch)
     assert module.plus(1) == 2
     assert "No space left on device" in caplog.text
 
 
 @pytest.mark.parametrize("ending", [".nbi", ".nbc"])
 @pytest.mark.parametrize("size", [0, 40])
-def test_damaged_compiled_code_is_made_again(folder: Path, ending: str, size: int) -> None:
+def test_damaged_compiled_code_is_replaced(folder: Path, ending: str, size: int) -> None:
     assert cache.keep("nnode_damaged", TEXT).plus(1) == 2
     (path,) = folder.rglob(f"*{ending}")
     path.write_bytes(path.read_bytes()[:size])
-    second = cache.keep("nnode_damaged", TEXT)
-    assert second.plus(1) == 2
-    assert sum(second.plus.stats.cache_misses.values()) == 1
-    once_more = cache.keep("nnode_damaged", TEXT)
-    assert once_more.plus(1) == 2
-    assert sum(once_more.plus.stats.cache_hits.values()) == 1
+    for statistic in ("cache_misses", "cache_hits"):
+        module = cache.keep("nnode_damaged", TEXT)
+        assert module.plus(1) == 2
+        assert sum(getattr(module.plus.stats, statistic).values()) == 1
 
 
-def test_numba_that_may_write_nowhere(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numba_without_a_cache_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from numba.core.caching import CacheImpl
 
     monkeypatch.setattr(CacheImpl, "_locator_classes", [])
@@ -131,8 +129,8 @@ for name in ("nnode_a", "nnode_b"):
 """
 
 
-@pytest.mark.skipif("sys.platform != 'linux'", reason="the cache of Linux is meant")
-def test_a_home_that_cannot_be_used(tmp_path: Path) -> None:
+@pytest.mark.skipif("sys.platform != 'linux'", reason="the folder is that of Linux")
+def test_home_that_cannot_be_used(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     scratch = tmp_path / "scratch"
     scratch.mkdir()

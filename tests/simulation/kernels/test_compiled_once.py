@@ -1,4 +1,4 @@
-"""A law is compiled once on a machine, not once in every process."""
+"""A law is compiled once per machine, and not in every process."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ CROWD = {
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("case", [LANE, CROWD], ids=["lane", "crowd"])
-def test_a_second_process_does_not_compile(case: dict[str, Any], tmp_path: Path) -> None:
+def test_second_process_does_not_compile(case: dict[str, Any], tmp_path: Path) -> None:
     runs = []
     for _ in range(2):
         done = subprocess.run(

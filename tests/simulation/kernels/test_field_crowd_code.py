@@ -1,30 +1,31 @@
-"""Smallest and largest values over others, against plain loops."""
+"""Laws with smallest and largest values over others."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from nnode.app.python.inputs import model_options
-from nnode.data.sequence import Sequence, collate
+from nnode.data.sequence import collate
 from nnode.errors import ConfigError
 from nnode.model import System, build_model
 from nnode.simulation import FusedSolver
+from tests.builders import people
+from tests.model.following import rates
 from tests.simulation.test_engines import OWN_FORCES, room
 
 
-def many() -> System:
-    """Of second order, with two smallest values and a largest that names the former's inputs."""
+def formula(law: dict[str, Any]) -> System:
     options = {"term": "formula", "name": "mine", "leader": "measured", "effects": []}
-    return build_model({**options, "law": OWN_FORCES["smallest"]})
+    return build_model({**options, "law": law})
 
 
-def test_a_smallest_value_by_loops() -> None:
-    model, batch = many(), room().select([0])
-    rates = (
-        model(torch.zeros(()), model.initial(batch), model.scene(batch))[0, :, 2].detach().numpy()
-    )
+def test_acceleration_by_loops() -> None:
+    batch = room().select([0])
+    acceleration = rates(formula(OWN_FORCES["smallest"]), batch)[0, :, 2]
     x, v = batch.x[0, 0].numpy(), batch.v[0, 0].numpy()
     goal = batch.destination[0].numpy()
     for i in range(6):
@@ -35,26 +36,20 @@ def test_a_smallest_value_by_loops() -> None:
         way = (goal[i] - x[i]) / np.hypot(*(goal[i] - x[i]))
         drive = (np.hypot(*v[i]) * way[0] - v[i, 0]) / 0.7
         push = 0.6 * max(1.0 - closest, 0) / 0.7
-        np.testing.assert_allclose(rates[i], drive + push + 0.3 * max(right, -0.5), rtol=1e-4)
+        expected = drive + push + 0.3 * max(right, -0.5)
+        np.testing.assert_allclose(acceleration[i], expected, rtol=1e-4)
 
 
-def test_the_first_of_several_has_the_slope() -> None:
-    # two others at the same distance: the slope by x is that of the first of them alone
+def test_slope_of_equal_smallest_values_is_of_the_first() -> None:
     law = {
         "parameters": {"A": "1 1/s"},
         "smallest": {"closest": "d"},
         "rate": {"x": "A*closest", "y": "0*A*closest"},
     }
-    options = {"term": "formula", "name": "mine", "leader": "measured", "effects": []}
-    model = build_model({**options, "law": law})
-    place = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]], dtype=torch.float64)
-    still = Sequence(
-        name="a", recording="a", time=0.04 * np.arange(2.0), x=place.repeat(2, 1, 1).numpy()
-    )
-    batch = collate([still])
-    y = place.clone().requires_grad_()
+    model, place = formula(law), [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
+    batch = collate([people(np.array([place, place]), 0.04)])
+    y = batch.x[0].clone().requires_grad_()
     model(torch.zeros(()), y, model.scene(batch))[0, 0, 0].backward()
-    assert y.grad is not None
     np.testing.assert_allclose(y.grad[0], [[-1, 0], [1, 0], [0, 0]], atol=1e-5)
 
 
@@ -66,6 +61,6 @@ def test_derivatives_of_a_law_with_a_smallest_value() -> None:
     assert torch.autograd.gradcheck(lambda y: model(zero, y, scene), (y,), eps=1e-7, atol=1e-5)
 
 
-def test_a_cutoff_is_refused() -> None:
+def test_cutoff_and_smallest_values() -> None:
     with pytest.raises(ConfigError, match="smallest values"):
-        FusedSolver(cutoff=3.0)(many(), room())
+        FusedSolver(cutoff=3.0)(formula(OWN_FORCES["smallest"]), room())

@@ -1,4 +1,4 @@
-"""Followers behind measured paths in compiled code, against the same formulas in NumPy."""
+"""Compiled simulations of followers behind measured paths, against formulas in NumPy."""
 
 from __future__ import annotations
 
@@ -16,23 +16,26 @@ from nnode.simulation.kernels.followers import WIDTH
 @pytest.mark.parametrize(
     ("law", "effects", "step"),
     [
-        ("lin", {}, 0.4),  # a step is two sampling intervals, with interpolation between
+        ("lin", {}, 0.4),  # two sampling intervals per step
         ("idm", {"speed_zone": {}, "multi_anticipation": {}}, 0.2),
-        ("gipps", {}, 0.05),  # the sampling interval is four steps
-        ("lin", {"inertia": {"tau_v": 0.5}}, 0.2),  # a state starts at a rate
+        ("gipps", {}, 0.05),  # four steps per sampling interval
+        ("lin", {"inertia": {"tau_v": 0.5}}, 0.2),  # a state that starts at a rate
         ("lin", {"reaction_delay": {"T": 0.5}}, 0.2),
     ],
 )
-def test_compiled_runs_are_those_of_the_formulas(
+def test_compiled_simulation_equals_formulas(
     law: str, effects: dict[str, dict[str, float]], step: float
 ) -> None:
     table = platoons("lin", "none", 0.1, 1, number=4, vehicles=4)
-    terms = [make_law(law), *(CATALOGUE.effects[name](**given) for name, given in effects.items())]
+    terms = [
+        make_law(law),
+        *(CATALOGUE.effects[name](**values) for name, values in effects.items()),
+    ]
     model = Followers(
         Traffic(terms, leader="measured").double(), paths_of(list(nnode.sequences(table)), step)
     )
     followers, rng = len(model.paths.agent), np.random.default_rng(2)
-    runs = WIDTH // followers + 1  # more than a block
+    runs = WIDTH // followers + 1  # more than one block
     theta = model.start[:, None] + 0.01 * rng.normal(size=(runs, len(model.names), followers))
     start = 0.1 * rng.normal(size=(runs, model.starts, followers))
     push = 0.05 * rng.normal(size=(len(model.paths.ahead), followers))
