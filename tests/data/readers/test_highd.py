@@ -99,7 +99,7 @@ def test_path_of_another_table_of_the_recording(recording: Path) -> None:
         ("07_tracksMeta.csv", "4,Car,1", "4,Car,3", "line 5.*drivingDirection is 3"),
         ("07_tracksMeta.csv", "2,Truck,2\n", "", "line 103.*track 2.*tracksMeta"),
         ("07_tracksMeta.csv", "drivingDirection", "way", "drivingDirection.*way"),
-        ("07_recordingMeta.csv", "7,25,-1", "7,0,-1", "frameRate.*positive"),
+        ("07_recordingMeta.csv", "7,25,-1", "7,0,-1", "one row with a positive frameRate"),
         ("07_recordingMeta.csv", "7,25,-1\n", "7,25,-1\n8,25,-1\n", "one row.*2 rows"),
         ("07_tracks.csv", "1,1,0.0,8.0", "1,1,here,8.0", "line 2.*'here'"),
         ("07_tracks.csv", "2,1,0.8,8.0", "1,1,0.8,8.0", "line 3.*agent 1.*second time"),

@@ -141,7 +141,7 @@ ENTITIES = (
         (HEAD + step(0, car("a", 1).replace("lane=", "edge=")), "line 5.*'lane'"),
         (
             HEAD + step(0, car("a", 1), car("a", 2)) + "</fcd-export>",
-            "line 6.*line 5.*second",
+            "line 6.*second time.*line 5",
         ),
         (ENTITIES, "line 1.*document type declaration"),
         ('<!DOCTYPE x SYSTEM "file:///etc/passwd"><fcd-export/>', "document type declaration"),
