@@ -310,7 +310,7 @@ def made_by(store: Store) -> type[DataOptions]:
     kind_of_options = next((kind for kind in FORMATS if kind.__name__ == name), None)
     if kind_of_options is None:
         raise ConfigError(
-            f"{store.folder} does not tell which of nnode's readers prepared it (found {name!r}); "
+            f"{store.folder} does not state which of nnode's readers prepared it (found {name!r}); "
             "prepare the data again, or set data.prepared=null to prepare on the fly"
         )
     return kind_of_options

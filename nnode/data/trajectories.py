@@ -290,7 +290,7 @@ def _once(table: Trajectories, order: np.ndarray, code: np.ndarray) -> None:
         i, j = sorted(order[twice[0] : twice[0] + 2].tolist())
         whose = "" if table.sequence is None else f" of {table.sequence[j]}"
         raise DataError(
-            f"{table.path}, {table.where(j)}: agent {table.agent[j]}{whose} stands there a second "
+            f"{table.path}, {table.where(j)}: agent {table.agent[j]}{whose} occurs a second "
             f"time at {table.time[j]:g} s (first in {table.where(i)}); expected one row per agent "
             "and time: name the column that distinguishes agents of one name (data.columns)"
         )

@@ -190,7 +190,7 @@ def test_folder_without_the_name_of_its_reader(tmp_path: Path, options: EsimasOp
     prepare(options, tmp_path / "out")
     manifest = tmp_path / "out" / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"reader"', '"earlier"'))
-    with pytest.raises(ConfigError, match=r"does not tell which of nnode's readers .* again"):
+    with pytest.raises(ConfigError, match=r"does not state which of nnode's readers .* again"):
         open_data(EsimasOptions(prepared=str(tmp_path / "out")), tmp_path / "unused")
 
 

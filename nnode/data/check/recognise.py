@@ -270,7 +270,9 @@ def _line(raw: Raw, columns: Mapping[str, Meaning], measured: Scaled, group: str
     named = ", ".join(f"{meaning} = {column.column}" for meaning, column in columns.items())
     words, scale = f"{measured.scale} ({certainty(measured.share)})", measured.scale
     if scale.rate is not None and raw.rate not in (None, scale.rate):
-        words = f"{replace(scale, rate=raw.rate)} as it tells; {scale.rate:g} frames/s fit"
+        words = (
+            f"{replace(scale, rate=raw.rate)} as stated in the file; {scale.rate:g} frames/s fit"
+        )
     return f"{raw.path}: recognised {named}; {words}; read as data={group}"
 
 

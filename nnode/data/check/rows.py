@@ -77,7 +77,7 @@ class Scaled:
         if rates := self.rates(stated):
             fit = " or ".join(f"{rate:g}" for rate in rates)
             sentences["rate"] = (
-                f"times are frames of a rate that the file does not tell; {fit} frames/s fit: say "
+                f"times are frames, whose rate the file does not state; {fit} frames/s fit: set "
                 f"the right one, as in data.frame_rate={best.rate:g}"
             )
         return sentences

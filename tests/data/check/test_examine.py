@@ -190,7 +190,7 @@ def test_missing_rate_is_estimated_from_gait(tmp_path: Path) -> None:
     assert file.source.options.unit == "cm"
     assert file.source.options.frame_rate == pytest.approx(16, rel=0.15)
     warning = findings(file, "warning")["units"]
-    assert "of a rate that the file does not tell" in warning
+    assert "whose rate the file does not state" in warning
     assert " 16" in warning
     with_rate = examine(file.path, rate=16.0)
     assert findings(with_rate, "warning") == {}
@@ -501,7 +501,7 @@ def test_wrong_stated_rate_is_used_and_reported(tmp_path: Path) -> None:
     assert file.sequences[0].dt == pytest.approx(1 / 30)
     line = recognised(path).line
     assert "times in frames of 1/30 s" in line
-    assert re.search(r"as it tells; 1[56] frames/s fit", line)
+    assert re.search(r"as stated in the file; 1[56] frames/s fit", line)
 
 
 @pytest.mark.real

@@ -187,7 +187,7 @@ def test_files_without_header_need_rate_and_unit(
         (HEADER + lines(0, 30, 1) + "1.5 31 5 5 0\n", r"line 34: expected"),
         (
             HEADER + lines(0, 30, 1) + lines(30, 30, 1),
-            "frame 30: agent 1 stands there a second time",
+            "frame 30: agent 1 occurs a second time",
         ),
         (HEADER + lines(0, 10, 1), "no sequence"),
     ],

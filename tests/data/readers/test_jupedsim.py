@@ -166,7 +166,7 @@ def test_collection_of_polygons() -> None:
         ({"rows": [*ROWS, (21.5, 1, 0, 0, 0, 0)]}, r"whole numbers.*21\.5"),
         ({"rows": [*ROWS, (10**12, 1, 0, 0, 0, 0)]}, "1000000000000.*consecutive"),
         ({"rows": [*ROWS, (1e300, 1, 0, 0, 0, 0)]}, r"whole numbers.*1e\+300"),
-        ({"rows": [*ROWS, ROWS[0]]}, "frame 0: agent 1 stands there a second time"),
+        ({"rows": [*ROWS, ROWS[0]]}, "frame 0: agent 1 occurs a second time"),
         ({"areas": (ROOM, ROOM.replace("10", "12"))}, r"2 of them.*data\.geometry"),
         ({"areas": ("POINT (1 1)",)}, "table geometry.*Point"),
         ({"extra": "DROP TABLE metadata;"}, "no table metadata.*trajectory_data"),

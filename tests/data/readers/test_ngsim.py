@@ -132,7 +132,7 @@ def test_invalid_files(tmp_path: Path) -> None:
         ("id,t,x\n1,0,0\n", r"lacks Vehicle_ID, Frame_ID, .*; it has: id, t, x; .*"),
         ("1 2 3\n4 5 6\n", "has 3 columns without names; NGSIM's files have 18, 19"),
         (wrong_cell.to_csv(index=False), "line 9: column 'Local_Y' holds 'far'"),
-        (repeated.to_csv(index=False), "line 4002: agent 1 stands .* at 0.1 s .*in line 2"),
+        (repeated.to_csv(index=False), "line 4002: agent 1 occurs .* at 0.1 s .*in line 2"),
     ):
         path.write_text(text)
         with pytest.raises(DataError, match=message):

@@ -128,7 +128,7 @@ def test_coarser_grid(tmp_path: Path) -> None:
     [
         ({"spacing": np.linspace(20, 30, 51)}, "one length of the leader"),
         ({"leader": np.arange(51)}, "line 3: column 'leader' holds 1, before it 0"),
-        ({"time": 0.0}, "line 3: agent 1 of p stands there a second time at 0 s"),
+        ({"time": 0.0}, "line 3: agent 1 of p occurs a second time at 0 s"),
         ({"x_leader": "?"}, "line 2: column 'x_leader' holds '\\?'"),
         # the spacing between fronts
         (

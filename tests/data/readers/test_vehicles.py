@@ -241,7 +241,7 @@ def test_invalid_options(platoon: Path, options: dict, message: str) -> None:
         ("vehicle,time,x\n1,0,0\n,0.1,2\n", r"line 3: column 'vehicle' is empty"),
         (
             "vehicle,time,x\n1,0,0\n2,0,9\n1,0,1\n",
-            r"line 4: agent 1 stands .* at 0 s .*in line 2",
+            r"line 4: agent 1 occurs .* at 0 s .*in line 2",
         ),
         ("vehicle,time,x\n1,0,0\n1,0.1,1\n1,0.2,2\n", r"no sequence; at no time are 3 vehicles"),
         ("vehicle,time,x\n1,0,0,5,6\n1,0\n1,2,3,4,5,6,7\n", "cannot be read as a comma-separated"),
