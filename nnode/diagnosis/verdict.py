@@ -94,7 +94,7 @@ def named_agents(estimate: IndividualEstimate, confirmed: float, order: int) -> 
         formula=effect.formula_for(order),
         source=effect.source,
         coefficients=coefficients,
-        where="everybody, everywhere",
+        where="all agents, everywhere",
         p_value=estimate.p_value,
         confirmed=confirmed,
     )
@@ -131,7 +131,7 @@ def _where(
         return f"vehicles of class {options['kind']}"
     if {"x_o", "y_o"} <= set(coefficients):
         return f"around ({coefficients['x_o'].value:.2f}, {coefficients['y_o'].value:.2f}) m"
-    return "everybody, everywhere"
+    return "all agents, everywhere"
 
 
 def absences(search: Selection, power: PowerSimulation) -> list[Absence]:

@@ -28,7 +28,7 @@ def test_hidden_effect_is_named(
     d = outcome.diagnosis
     assert d.verdict == "named"
     (effect,) = d.effects
-    assert (effect.name, effect.where) == ("relative_speed", "everybody, everywhere")
+    assert (effect.name, effect.where) == ("relative_speed", "all agents, everywhere")
     assert effect.p_value < 0.05
     assert effect.gain > 0
     kappa = effect.coefficients["kappa"]

@@ -68,7 +68,7 @@ def test_places_are_significant_and_explain_excess() -> None:
     [
         ("speed_zone", {"a": (120.0, "m"), "b": (260.5, "m")}, {}, "x in [120, 260.5] m"),
         ("speed_period", {"a": (5.0, "s"), "b": (60.0, "s")}, {}, "t in [5, 60] s"),
-        ("leader_length", {"beta": (1.0, "1")}, {}, "everybody, everywhere"),
+        ("leader_length", {"beta": (1.0, "1")}, {}, "all agents, everywhere"),
         ("leader_length", {"beta": (1.0, "1")}, {"kind": "truck"}, "vehicles of class truck"),
         (
             "leader_length",
