@@ -232,8 +232,9 @@ def _diagnoses(
     diagnoses = []
     for outcome in outcomes:
         law = outcome.diagnosis.model
-        law_model = model if law == name else law_options(law, model)
-        job = Job(law_model, plain_data, {**groups, "model": law}, inputs, options)
+        job = Job(model, plain_data, groups, inputs, options)
+        if law != name:
+            job = replace(job, model=law_options(law, model), groups={**groups, "model": law})
         diagnoses.append((job, outcome))
     return diagnoses
 

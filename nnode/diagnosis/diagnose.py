@@ -98,13 +98,11 @@ def diagnose(
         outcome.diagnosis.model = law
         return _Diagnosed(law, chosen, outcome)
 
-    def with_requested(
-        nearest: _Diagnosed, calibrated: Mapping[str, System]
-    ) -> tuple[_Diagnosed, _Diagnosed]:
-        """The requested law and the best-fitting law, which may be the same."""
+    def requested_law(nearest: _Diagnosed, calibrated: Mapping[str, System]) -> _Diagnosed:
+        """The requested law, which may be the best-fitting one."""
         if nearest.name == name:
-            return nearest, nearest
-        return diagnosed(name, calibrated.get(name), nearest.as_better_law()), nearest
+            return nearest
+        return diagnosed(name, calibrated.get(name), nearest.as_better_law())
 
     first_comparison = compared([])[0] if laws else None
     nearest = diagnosed(_nearest(first_comparison, name) if first_comparison else name)
@@ -115,7 +113,7 @@ def diagnose(
         best = _nearest(second_comparison, nearest.name)
         if best != nearest.name:
             nearest = diagnosed(best, calibrated[best])
-    requested, nearest = with_requested(nearest, calibrated)
+    requested = requested_law(nearest, calibrated)
     # effects that are built into other laws are excluded, because they would favour laws that
     # imitate those
     names = {effect.name for effect in effects}
@@ -125,7 +123,7 @@ def diagnose(
         if last.p_values.get(nearest.name, 1.0) <= thresholds.LEVEL:
             second_comparison = last
             nearest = diagnosed(last.best, calibrated[last.best])
-            requested, nearest = with_requested(nearest, calibrated)
+            requested = requested_law(nearest, calibrated)
     diagnosis = requested.outcome.diagnosis
     diagnosis.laws, diagnosis.laws_again = first_comparison, second_comparison
     for comparison in filter(None, (first_comparison, second_comparison)):

@@ -93,7 +93,8 @@ def divide(
     why += " or overlap in time" if together else ""
     wanted = max(round(options.confirmation * (int(label.max()) + 1)), 1)
     held_back = np.isin(label, _drawn(label, wanted, np.random.default_rng(options.seed)))
-    places, note = [np.flatnonzero(~held_back).tolist(), np.flatnonzero(held_back).tolist()], ""
+    places = [np.flatnonzero(~held_back).tolist(), np.flatnonzero(held_back).tolist()]
+    note = ""
     if not held_back.any():
         parts = split(
             index, SplitOptions(heldout=options.confirmation, gap=options.gap, seed=options.seed)

@@ -27,7 +27,6 @@ from nnode.data.smooth import measured_noise
 from nnode.errors import ConfigError, SimulationError
 from nnode.model.arrays import Formulas
 from nnode.model.differentiate import derivatives
-from nnode.model.expression import symbols
 from nnode.model.extend import effects_of
 from nnode.model.formula import inputs_of
 from nnode.model.lane_rates import SAFE
@@ -229,8 +228,7 @@ def longest_step(system: System, rows: Tensor, longest: float) -> float:
         for j, name in enumerate(ParameterVector(system).names)
         if name in factors
     ]
-    lane = formula_of(system)
-    if lane is not None and "dt" in symbols([lane.law or lane.rates[lane.top]]):
+    if system.is_map:
         steps.append(MAPPED)
     if any(effect.consecutive for effect in effects_of(system)):
         steps.append(ENDS)

@@ -14,10 +14,13 @@ from typing import Any
 import pandas as pd
 import pytest
 
+import nnode
 from nnode.app import discover as app
+from nnode.app.python.inputs import data_of, model_options
 from nnode.app.python.report import Report
 from nnode.calibrate.checkpoint import load_checkpoint
 from nnode.diagnosis import diagnose, thresholds
+from nnode.diagnosis.inputs import inputs_of
 from nnode.diagnosis.options import DiscoverOptions
 from nnode.diagnosis.outcome import DiagnosisOutcome
 from nnode.diagnosis.report import page
@@ -244,6 +247,25 @@ def lin_diagnosed(folder: Path) -> Report:
     return app.diagnose_table(
         table, "traffic", model={"term": "lin"}, folder=folder / "run", options=options
     )
+
+
+@pytest.mark.usefixtures("substituted")
+def test_configuration_group_may_have_another_name_than_the_model(tmp_path: Path) -> None:
+    data = nnode.sequences(
+        lane(tmp_path / "lane.csv", sequences=4, seconds=3.0, cars=3), domain="traffic"
+    )
+    groups = {"model": "lin", "data": "table"}
+    model = {**model_options("lin", "measured"), "name": "mine"}
+    ((job, outcome),) = app._diagnoses(
+        model,
+        data_of(data),
+        {},
+        groups,
+        DiscoverOptions(compare=[]),
+        lambda: inputs_of(data, data_of(data)),
+    )
+    assert job.groups == groups
+    assert outcome.diagnosis.model == job.model["name"] == "mine"
 
 
 @pytest.mark.usefixtures("substituted")
