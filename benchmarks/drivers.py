@@ -364,7 +364,7 @@ def _diagnosed(case: dict[str, Any], laws: list[str] | None) -> dict[str, Any]:
     row = judged(report, list(sizes)) | {"law_at_bounds": bool(report["law_at_bounds"])}
     for name, true in {**sizes, **_variations(case)}.items():
         interval = intervals.get(name, {})
-        row |= _estimate(name, true, *(interval.get(end) for end in ("value", "low", "high")))
+        row |= estimate_row(name, true, *(interval.get(end) for end in ("value", "low", "high")))
     return row
 
 
@@ -399,7 +399,7 @@ def _calibrated(case: dict[str, Any]) -> dict[str, Any]:
     ):
         rows = table.reindex(list(true_values))[["estimate", "lower", "upper"]]
         for name, values in zip(true_values, rows.to_numpy(), strict=True):
-            row |= _estimate(f"{name}{what}", true_values[name], *map(float, values))
+            row |= estimate_row(f"{name}{what}", true_values[name], *map(float, values))
     others = set(variability.index[variability["unit"] == "%"])
     return row | {"false variation": bool(others - set(variations))}
 
@@ -413,7 +413,7 @@ WORKS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 }
 
 
-def _estimate(
+def estimate_row(
     name: str, true: float, value: float | None, low: float | None, high: float | None
 ) -> dict[str, Any]:
     """An estimate, the true value, and whether its interval contains it."""

@@ -1,14 +1,13 @@
 """Comparison of base laws.
 
-Every law is calibrated to the positions of whole sequences, with the same parameters for all
-drivers. Where drivers may differ, followers are simulated behind their measured leaders, and laws
-are then compared by their marginal likelihoods, each with drivers, pushes and parameters of its
-own, minus a price of parameters (BIC). A common parameter for drivers who differ would favour laws
-that imitate differences. The test is that of Vuong 1989, by cluster.
+Where agents may differ, laws are compared by their marginal likelihoods, each with agents, pushes
+and parameters of its own, minus a price of parameters (BIC). A common parameter for agents who
+differ would favour laws that imitate differences. The test is that of Vuong 1989, by cluster.
 
-Otherwise laws are compared by leave-one-cluster-out costs. The whitening is fitted to the residuals
-of the best law, and all laws are recalibrated to residuals with this common whitening. If another
-law is then the best, the whitening is fitted to its residuals and the comparison is repeated.
+Otherwise every law is calibrated to the positions of whole sequences, and laws are compared by
+leave-one-cluster-out costs. The whitening is fitted to the residuals of the best law, and all laws
+are recalibrated to residuals with this common whitening. If another law is then the best, the
+whitening is fitted to its residuals and the comparison is repeated.
 """
 
 from __future__ import annotations
@@ -25,12 +24,13 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.clusters import better
 from nnode.data.sequence import Sequence
 from nnode.diagnosis import thresholds
+from nnode.diagnosis.crowds.engine import CrowdEngine
 from nnode.diagnosis.division import divide, spacing
 from nnode.diagnosis.eligibility import check_model, not_offered
 from nnode.diagnosis.lanes.followers import FollowersEngine
 from nnode.diagnosis.model_comparison import engine_of, windows_of
 from nnode.diagnosis.options import DiscoverOptions
-from nnode.diagnosis.residuals.engine import Engine, square_of
+from nnode.diagnosis.residuals.engine import AgentsEngine, Engine, square_of
 from nnode.diagnosis.residuals.fit import Fit, refine
 from nnode.diagnosis.result import ComparedLaw, Laws
 from nnode.diagnosis.search import Selection, Step, initial_fit
@@ -84,24 +84,37 @@ def compare_laws(
         refused = {key: NO_FORMULA for key in candidates if key not in formulas}
         apart = spacing(sequences, options)
         engine = FollowersEngine(part.sequences, part.label, large=np.inf, apart=apart)
+    elif asked.domain == "crowd":
+        engine = CrowdEngine(part.sequences, clusters=part.label)
     else:
         engine = engine_of(asked, part.sequences, part.label, whole=True)
-    fits, failed = _calibrated(engine, formulas, within)
+    formulas, failed = _simulable(formulas)
     refused |= failed
-    if not fits:
-        return Laws([], refused, 0), {}
-    number = np.bincount(engine.cluster)
-    errors = {key: float((heldout(f, engine.cluster) / number).mean()) for key, f in fits.items()}
-    if asked.domain == "crowd":  # its residuals are not positions
-        errors = {key: square_of(engine, fit.system) for key, fit in fits.items()}
-    if isinstance(engine, FollowersEngine):
-        compared = _by_likelihood(engine, formulas, fits, refused, within)
+    if isinstance(engine, CrowdEngine):
+        compared = _by_likelihood(
+            engine, {k: [law] for k, law in formulas.items()}, refused, within
+        )
+        errors = {}
+        for key, system in compared.systems.items():
+            engine.fit_whitening(system, ParameterVector(system).row)
+            errors[key] = square_of(engine, system)
     else:
-        compared = _by_cost(windows_of(asked, part.sequences, part.label), fits, errors, within)
+        fits, failed = _calibrated(engine, formulas, within)
+        refused |= failed
+        if not fits:
+            return Laws([], refused, 0), {}
+        number = np.bincount(engine.cluster)
+        errors = {k: float((heldout(f, engine.cluster) / number).mean()) for k, f in fits.items()}
+        if isinstance(engine, FollowersEngine):
+            starts = {key: [fit.system, formulas[key]] for key, fit in fits.items()}
+            compared = _by_likelihood(engine, starts, refused, within)
+        else:
+            engine = windows_of(asked, part.sequences, part.label)
+            compared = _by_cost(engine, fits, errors, within)
     ranking = [
         ComparedLaw(
             name=key,
-            parameters=len(fits[key].row),
+            parameters=len(ParameterVector(compared.systems[key]).row),
             error=errors[key],
             behind=behind,
             p_value=p_value,
@@ -111,7 +124,8 @@ def compare_laws(
         )
         for key, (behind, p_value) in compared.ranks.items()
     ]
-    return Laws(ranking, refused, compared.clusters, likelihood=differ), compared.systems
+    likelihood = isinstance(engine, AgentsEngine)
+    return Laws(ranking, refused, compared.clusters, likelihood=likelihood), compared.systems
 
 
 @dataclass(frozen=True)
@@ -130,26 +144,24 @@ class _Ranks:
 
 
 def _by_likelihood(
-    engine: FollowersEngine,
-    candidates: Mapping[str, System],
-    fits: Mapping[str, Fit],
+    engine: AgentsEngine,
+    starts: Mapping[str, list[System]],
     refused: dict[str, str],
     within: Callable[[float], None],
 ) -> _Ranks:
     """Rank laws by their marginal likelihoods.
 
     Args:
-        candidates: the laws as given. fits: those that could be calibrated with the same parameters
-            for all drivers, which may be far from those of the typical driver.
+        starts: the laws by name with different parameters, last as given. Parameters of a
+            calibration with the same ones for all agents may be far from those of the typical one.
         refused: laws whose paths diverge are added.
     """
     values, systems = dict[str, np.ndarray](), dict[str, System]()
-    for place, (name, fit) in enumerate(fits.items()):
-        within((1 + place / len(fits)) / 2)
+    for place, (name, laws) in enumerate(starts.items()):
+        within((1 + place / len(starts)) / 2)
         try:
-            law = candidates[name]
-            starts = fit.system, law, engine.regression_start(law)
-            value, system = engine.log_likelihoods(*starts)
+            regression = engine.regression_start(laws[-1])
+            value, system = engine.log_likelihoods(*laws, regression)
         except (SimulationError, np.linalg.LinAlgError):
             value = np.array([np.nan])
         if np.isfinite(value).all():
@@ -247,7 +259,7 @@ def explained_by_law(
         The effects, and the one-sided p-value of that comparison.
     """
     p_value = 1.0
-    if not isinstance(engine, FollowersEngine):
+    if not isinstance(engine, AgentsEngine):
         engine_of_law = windows_of(nearer.system, engine.sequences, label)
         engine_of_law.fit_whitening(nearer.system, ParameterVector(nearer.system).row)
         costs = [
@@ -255,7 +267,7 @@ def explained_by_law(
             for system in (selection.fit.system, nearer.system)
         ]
         p_value = compare(*costs).p_value
-    elif follower_formula(nearer.system):
+    elif isinstance(engine, CrowdEngine) or follower_formula(nearer.system):
         systems = nearer.system, selection.fit.system
         with suppress(SimulationError, np.linalg.LinAlgError):
             of_law, of_effects = (engine.log_likelihoods(system)[0] for system in systems)
@@ -276,6 +288,18 @@ def _level(costs: np.ndarray) -> float:
     return float(level)
 
 
+def _simulable(candidates: Mapping[str, System]) -> tuple[dict[str, System], dict[str, str]]:
+    """The laws that a diagnosis can simulate, and why it cannot simulate the others."""
+    laws, refused = dict[str, System](), dict[str, str]()
+    for name, system in candidates.items():
+        try:
+            check_model(system)
+            laws[name] = system
+        except ConfigError as error:
+            refused[name] = str(error)
+    return laws, refused
+
+
 def _calibrated(
     engine: Engine, candidates: Mapping[str, System], within: Callable[[float], None]
 ) -> tuple[dict[str, Fit], dict[str, str]]:
@@ -284,11 +308,6 @@ def _calibrated(
     refused: dict[str, str] = {}
     for place, (name, system) in enumerate(candidates.items()):
         within(place / len(candidates) / 2)
-        try:
-            check_model(system)
-        except ConfigError as error:
-            refused[name] = str(error)
-            continue
         fit = initial_fit(engine, copy.deepcopy(system).double())
         if fit is None:
             refused[name] = BLOWS_UP

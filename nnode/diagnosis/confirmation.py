@@ -13,7 +13,6 @@ import numpy as np
 from nnode.data.clusters import better
 from nnode.data.sequence import Sequence
 from nnode.diagnosis import thresholds
-from nnode.diagnosis.crowds.indirect_inference import bias_corrected
 from nnode.diagnosis.division import Part
 from nnode.diagnosis.held_out import MODELS, HeldOutErrors, held_out_errors
 from nnode.diagnosis.model_comparison import ModelComparison, engine_of, too_few
@@ -99,9 +98,9 @@ _SIMULATED = {
     "drivers": "of each follower at each sample after the first. They are simulated behind the "
     "measured paths of the vehicles ahead, smoothed, each with the parameters and the start that "
     "are most likely for that driver",
-    "crowd": "of each person at each compared sample. Everyone is simulated for about 1.5 s at a "
-    "time among the measured paths of the others, and the part that an unknown start state "
-    "explains is removed",
+    "crowd": "of each person at each compared sample. Everyone is simulated for about 2 s at a "
+    "time among the measured paths of the others, from the smoothed place and velocity and with "
+    "the desired speed and relaxation time that are most likely for that person",
 }
 
 
@@ -168,7 +167,7 @@ class ConfirmationSet:
         in the model with all selected effects."""
         if not selection.steps:
             return selection, []
-        full_fit = self._corrected_fit = self._bias_corrected(selection.fit)
+        full_fit = self._corrected_fit = selection.fit
         self.tests = self._closed_tests(engine, selection, full_fit)
         unconfirmed = [
             step for step in selection.steps if not self.tests[step.chosen.name].confirmed
@@ -177,7 +176,7 @@ class ConfirmationSet:
             return selection, []
         reduced = None
         if len(unconfirmed) < len(selection.steps):
-            reduced = self._bias_corrected(self._without(engine, selection.fit, unconfirmed))
+            reduced = self._without(engine, selection.fit, unconfirmed)
             kept = [step for step in selection.steps if step not in unconfirmed]
             test = self._compared(self.base, reduced.system, kept)
             if not test.confirmed:
@@ -207,9 +206,7 @@ class ConfirmationSet:
                 continue
             reduced = self.base
             if len(subset) < len(selection.steps):
-                reduced = self._bias_corrected(
-                    self._without(engine, selection.fit, list(subset))
-                ).system
+                reduced = self._without(engine, selection.fit, list(subset)).system
             test = self._compared(reduced, full_fit.system, subset)
             for name in names:
                 weakest[name] = max(weakest.get(name, test), test, key=_ModelTest.weakness)
@@ -246,9 +243,6 @@ class ConfirmationSet:
 
     def _without(self, engine: Engine, fit: Fit, steps: list[Step]) -> Fit:
         return refine(engine, without(fit.system, *(step.chosen.name for step in steps)))
-
-    def _bias_corrected(self, fit: Fit) -> Fit:
-        return bias_corrected(fit, self.exploration, self.seed) if self.domain == "crowd" else fit
 
     def corrected(self, engine: Engine, selection: Selection) -> Fit:
         """The fit with the confirmed effects, corrected for its bias by simulation."""

@@ -34,17 +34,19 @@ def not_offered(effect: type[Effect], system: System, differ: bool = False) -> s
     """Why an effect is not tested in a model; empty: it is.
 
     Args:
-        differ: see :func:`~nnode.population.followers.drivers_differ`.
+        differ: whether agents differ in the law's parameters, see
+            :func:`~nnode.population.followers.drivers_differ` and
+            :func:`~nnode.diagnosis.crowds.people.parameters_differ`.
     """
     if isinstance(system, Crowd) and effect.sets_desired_speed and system.desired != "last":
         return (
-            f"with desired={system.desired} everybody has a preferred speed already, measured in "
-            "the seconds before: one for all would mend its errors and be no effect"
+            f"with desired={system.desired} everybody has a desired speed already, which the "
+            "diagnosis estimates"
         )
     if effect.acts_on == "force" and not effect.finds(system.terms):
         return "the law has no force between people of its own that it could change"
     if effect.of_drivers and differ:
-        return "the diagnosis estimates how drivers differ together with the law"
+        return "the diagnosis estimates how agents differ together with the law"
     rules = effect.rules.values()
     if differ and rules and all(rule.leader and not rule.rate for rule in rules):
         return "this effect changes leaders only, and the diagnosis takes leaders as measured"

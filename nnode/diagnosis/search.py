@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from nnode.diagnosis.candidate import Candidate, calibrated
 from nnode.diagnosis.curves import curves
 from nnode.diagnosis.lanes.followers import FollowersEngine
 from nnode.diagnosis.residuals.comparison import Comparison
-from nnode.diagnosis.residuals.engine import Engine, square_of
+from nnode.diagnosis.residuals.engine import AgentsEngine, Engine, square_of
 from nnode.diagnosis.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.diagnosis.residuals.variables import Variable
 from nnode.diagnosis.statistics.bias import SimulatedFits, mean_scores, simulated_fits
@@ -28,7 +29,7 @@ from nnode.errors import SimulationError
 from nnode.model.effects import Effect
 from nnode.model.extend import effects_of, place_of, without
 from nnode.model.system import System
-from nnode.population.drivers import Population, likeliest, with_random_effects
+from nnode.population.drivers import likeliest
 
 log = logging.getLogger(__name__)
 
@@ -111,8 +112,8 @@ def converged_fit(engine: Engine, system: System, rounds: int = 2) -> Fit:
     for _ in range(rounds):
         engine.fit_whitening(fit.system, ParameterVector(fit.system).row)
         start = fit.system
-        if isinstance(engine, FollowersEngine) and engine.population is not None:
-            # the drivers' deviations belong to these parameters; from others, the search can end in
+        if isinstance(engine, AgentsEngine) and engine.population is not None:
+            # the agents' deviations belong to these parameters; from others, the search can end in
             # another minimum
             start = engine.population.system
         fit = refine(engine, start)
@@ -215,7 +216,7 @@ def _with_likeliest_ends(engine: FollowersEngine, fit: Fit, name: str) -> Fit:
             if row[index[0]] < row[index[1]]:
                 with suppress(SimulationError):
                     moved = engine.population_of(with_parameters(fit.system, row))
-                    populations.append(with_random_effects(moved))
+                    populations.append(engine.reselected(moved))
         engine.set_population(likeliest(populations))
         if engine.population is not populations[0]:
             fit = refine(engine, engine.population.system)
@@ -278,7 +279,7 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
         return None
     scores = sorted(scores, key=lambda score: -score.gain)
     significant = min(score.p_value for score in scores) <= thresholds.EACH
-    if not significant and isinstance(engine, FollowersEngine):
+    if not significant and isinstance(engine, AgentsEngine):
         return None  # the variances were already fitted with the most likely extension
     hinted = {effect.name for hint in hints for effect in effects_of(hint)}
     ranked = [s for s in scores if s.gain >= thresholds.RIVAL * scores[0].gain][:RIVALS]
@@ -297,7 +298,7 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
         and engine.relevant(selection.fit.system, c.fit.system, selection.square)
     ]
     passing = [c for c in eligible if c.score.p_value <= thresholds.EACH]
-    if not passing and not isinstance(engine, FollowersEngine):
+    if not passing and not isinstance(engine, AgentsEngine):
         passing = [c for c in eligible if _significant_held_out(c, screen, len(scores))]
     if not passing:
         return None
@@ -339,25 +340,25 @@ def _ranked(
         followed = significant or len(candidates) > 1
         if not followed and not _significant_held_out(candidates[0], screen, len(selection.scores)):
             return []
-    if isinstance(engine, FollowersEngine):
+    if isinstance(engine, AgentsEngine):
         candidates = _with_refitted_variances(engine, candidates, selection)
     return _refined(engine, sorted(candidates, key=lambda c: -c.gain.gain), selection)
 
 
 def _with_refitted_variances(
-    engine: FollowersEngine, candidates: list[Candidate], selection: Selection
+    engine: AgentsEngine, candidates: list[Candidate], selection: Selection
 ) -> list[Candidate]:
     """The candidates with variances refitted under the most likely of them. The variances of the
     model without a strong effect would attribute it to autocorrelated pushes."""
     assert selection.screen is not None
     by_cost = sorted(candidates, key=lambda c: c.fit.cost)
     refitted_first = by_cost[:LIKELY] + [c for c in by_cost[LIKELY:] if c.score.effect.covariate]
-    populations = dict[str, Population]()
+    populations = dict[str, Any]()
     for candidate in refitted_first:
         with suppress(SimulationError):
             populations[candidate.name] = engine.population_of(candidate.fit.system)
     if populations:
-        engine.set_population(with_random_effects(likeliest(populations.values())))
+        engine.set_population(engine.reselected(likeliest(populations.values())))
     selection.fit = refine(engine, selection.fit.system)
     refitted = []
     for candidate in candidates:

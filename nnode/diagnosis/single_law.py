@@ -18,6 +18,8 @@ from nnode.data.sequence import Sequence
 from nnode.diagnosis import thresholds
 from nnode.diagnosis.compare import BetterLaw, explained_by_law
 from nnode.diagnosis.confirmation import ConfirmationSet
+from nnode.diagnosis.crowds.engine import CrowdEngine
+from nnode.diagnosis.crowds.people import parameters_differ
 from nnode.diagnosis.curves import curves, significant_curves
 from nnode.diagnosis.division import SETTLED, Division, divide, spacing
 from nnode.diagnosis.eligibility import check_model, not_offered
@@ -25,7 +27,7 @@ from nnode.diagnosis.lanes.followers import FollowersEngine
 from nnode.diagnosis.model_comparison import engine_of
 from nnode.diagnosis.options import DiscoverOptions, check_options
 from nnode.diagnosis.outcome import DiagnosisOutcome
-from nnode.diagnosis.residuals.engine import Engine, of_residuals, square_of
+from nnode.diagnosis.residuals.engine import AgentsEngine, Engine, of_residuals, square_of
 from nnode.diagnosis.residuals.fit import Fit, refine
 from nnode.diagnosis.residuals.variables import Curves, Variable
 from nnode.diagnosis.result import (
@@ -155,7 +157,7 @@ def diagnose_law(
     differ = drivers_differ(system, sequences)
     skip_starts = differ and system.order == 1 and without_errors(sequences)
     notes = [SETTLED] if skip_starts else []
-    offered, refused = _offered(system, names, differ)
+    offered, refused = _offered(system, names, differ or parameters_differ(system))
     effects = [effect for effect in offered if not issubclass(effect, IndividualEffect)]
     explore = partial(
         _explore, system, sequences, options, effects, differ, skip_starts, clock, stages, hint
@@ -290,7 +292,7 @@ def _offered(
 
     Args:
         names: of all candidates.
-        differ: whether drivers differ.
+        differ: whether agents differ in the law's parameters.
     """
     catalogue = CATALOGUE.of(system.domain, system.order)
     candidates = [effect for effect in catalogue if effect.name in names]
@@ -323,22 +325,28 @@ def _drivers(engine: Engine, fit: Fit, seed: int, notes: list[str]) -> list[Vari
         notes: notes are added to them if the estimation does not converge, and if pushes explain a
             large part of the rates.
     """
-    if not isinstance(engine, FollowersEngine):
+    if not isinstance(engine, AgentsEngine):
         return []
     engine.fit_whitening(fit.system, torch.from_numpy(fit.row))
+    if isinstance(engine, FollowersEngine):
+        population = engine.drivers(seed)
+        rows = variations(population)
+        if not population.estimate.converged:
+            notes.append(
+                "The estimation of the differences between drivers did not converge. They are not "
+                "corrected for their bias."
+            )
+    else:
+        assert isinstance(engine, CrowdEngine)
+        rows = engine.variations()
+    drivers = [Variation(name, **row) for name, row in rows.items()]
     assert engine.population is not None
-    population = engine.drivers(seed)
-    if not population.estimate.converged:
-        notes.append(
-            "The estimation of the differences between drivers did not converge. They are not "
-            "corrected for their bias."
-        )
-    drivers = [Variation(name, **row) for name, row in variations(population).items()]
     push = next(row for row in drivers if row.name == "push")
     if push.at_bound == "high" or not engine.population.explains_rates:
         rate = "accelerations" if fit.system.order > 1 else "speeds"
         hint = ""
-        if without_errors(engine.sequences) and not engine.apart:
+        smoothed = isinstance(engine, FollowersEngine) and not engine.apart
+        if smoothed and without_errors(engine.sequences):
             hint = " If positions were smoothed before, set discover.smoothed=true."
         notes.append(
             f"The law explains little of how {rate} vary: pushes have a standard deviation of "
@@ -405,7 +413,7 @@ def _explore(
     if initial is None:
         raise SimulationError(BLOWS_UP)
     hints = [] if hint is None else [hint]
-    if isinstance(engine, FollowersEngine):
+    if isinstance(engine, AgentsEngine):
         try:
             populations = [engine.population_of(initial.system)]
         except SimulationError as error:

@@ -18,7 +18,15 @@ from scipy.special import gammaincinv, ndtri
 from nnode.calibrate.intervals import LEVEL, ClusterInfluence, at_bounds
 from nnode.model.term import short_names
 from nnode.population.drivers import Population
-from nnode.population.likelihood import NOISE, Products, PushNoise, marginal
+from nnode.population.estimate import Variances
+from nnode.population.likelihood import (
+    UNITS,
+    Linearised,
+    Noise,
+    Products,
+    PushNoise,
+    marginal,
+)
 
 #: An estimate is at a bound if its logarithm, or the parameter itself, is closer to it than this.
 NEAR = 1e-3
@@ -51,16 +59,42 @@ def influence(population: Population, cluster: np.ndarray) -> tuple[ClusterInflu
 
 def deviation_intervals(population: Population) -> np.ndarray:
     """``(V, 2)`` intervals of 95 % of the standard deviations and times, in the order of
-    :attr:`nnode.population.estimate.Variances.row`; NaN at a bound, if the likelihood is not
-    concave, or of the time of a process whose standard deviation may be 0. The likelihood hardly
-    depends on such a process, which is therefore fixed for the intervals of the others.
+    :attr:`nnode.population.estimate.Variances.row`, see :func:`variance_intervals`.
 
     The likelihood is that of the estimates before the correction of their bias, and the intervals
     are corrected by the same factors."""
-    corrected, data = population.estimate.variances, population.estimate.data
-    variances = corrected.filled(corrected.row * population.variance_bias)
+    corrected, model = population.estimate.variances, population.model
+    bias, theta = population.variance_bias, population.estimate.theta
+    ends = variance_intervals(
+        population.estimate.data,
+        PushNoise(),
+        corrected.filled(corrected.row * bias),
+        model.low - theta,
+        model.high - theta,
+        population.variance_error,
+    )
+    return ends / bias[:, None]
+
+
+def variance_intervals(
+    data: Linearised,
+    noise: Noise,
+    variances: Variances,
+    lowest: np.ndarray,
+    highest: np.ndarray,
+    error: np.ndarray | float = 0.0,
+) -> np.ndarray:
+    """``(V, 2)`` intervals of 95 % of standard deviations and times; NaN at a bound, if the
+    likelihood is not concave, or of the time of a process whose standard deviation may be 0. The
+    likelihood hardly depends on such a process, which is therefore fixed for the intervals of the
+    others.
+
+    Args:
+        data, noise: of the likelihood. variances: the most likely ones.
+        lowest, highest: ``(P,)`` bounds of the change of the parameters.
+        error: ``(V,)`` standard errors of logarithms that are added.
+    """
     logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
-    theta, model = population.estimate.theta, population.model
     products: dict[tuple[float, ...], Products] = {}
 
     def loglik(places: Any, values: Any) -> float:
@@ -69,21 +103,16 @@ def deviation_intervals(population: Population) -> np.ndarray:
         shifted = variances.filled(np.exp(row))
         key = tuple(shifted.noise)
         if key not in products:
-            products[key] = PushNoise().products(data, shifted.noise)
+            products[key] = noise.products(data, shifted.noise)
         return marginal(
-            data,
-            products[key],
-            shifted.spread,
-            shifted.start,
-            low=model.low - theta,
-            high=model.high - theta,
+            data, products[key], shifted.spread, shifted.start, low=lowest, high=highest
         ).loglik
 
-    noise, peak = NOISE[: len(variances.noise)], loglik(slice(None), logs)
+    names, peak = noise.names[: len(variances.noise)], loglik(slice(None), logs)
     ends, free = np.full((len(logs), 2), np.nan), at_bounds(logs, low, high, NEAR) == ""
-    n_deviations = len(noise) + len(variances.spread)
+    n_deviations = len(names) + len(variances.spread)
     for k in map(int, np.flatnonzero((low < high)[:n_deviations])):
-        name = noise[k] if k < len(noise) else ""
+        name = names[k] if k < len(names) else ""
         if name.endswith("_time") or peak - loglik(k, low[k]) >= DROP:
             continue
 
@@ -92,8 +121,8 @@ def deviation_intervals(population: Population) -> np.ndarray:
 
         upper = brentq(difference, logs[k], high[k]) if difference(high[k]) > 0 else high[k]
         ends[k], free[k] = (0.0, np.exp(upper)), False
-        if f"{name}_time" in noise:
-            free[noise.index(f"{name}_time")] = False
+        if f"{name}_time" in names:
+            free[names.index(f"{name}_time")] = False
     places = np.flatnonzero(free)
     steps, size = DIFFERENCE * np.eye(len(places)), len(places)
     curvature = np.zeros((size, size))
@@ -107,40 +136,61 @@ def deviation_intervals(population: Population) -> np.ndarray:
             )
             curvature[i, j] = curvature[j, i] = -cross / (4 * DIFFERENCE**2)
     if size and np.linalg.eigvalsh(curvature).min() > 0:
-        error = population.variance_error[places]
-        deviation = np.sqrt(np.diag(np.linalg.inv(curvature)) + error**2)
+        added = np.broadcast_to(error, logs.shape)[places]
+        deviation = np.sqrt(np.diag(np.linalg.inv(curvature)) + added**2)
         half = ndtri(0.5 + LEVEL / 2) * deviation
         ends[places] = np.exp(logs[places, None] + half[:, None] * np.array([-1.0, 1.0]))
-    return ends / population.variance_bias[:, None]
+    return ends
 
 
 def variations(population: Population) -> dict[str, dict[str, Any]]:
     """The parameters of the noise by the names of :data:`~nnode.population.likelihood.NOISE`, and
-    the standard deviations of drivers' parameters, %.
+    the standard deviations of drivers' parameters, %; see :func:`variation_rows`."""
+    short = short_names(population.model.names)
+    return variation_rows(
+        population.estimate.variances,
+        PushNoise(),
+        [short[name] for name in population.random],
+        deviation_intervals(population),
+        population.marginal.shrinkage,
+        "m/s" if population.model.lane.order == 1 else "m/s²",
+    )
+
+
+def variation_rows(
+    variances: Variances,
+    noise: Noise,
+    random: list[str],
+    ends: np.ndarray,
+    shrinkage: np.ndarray,
+    push: str,
+) -> dict[str, dict[str, Any]]:
+    """The variances over time and between agents, as rows of a table.
+
+    Args:
+        random: names of what differs between agents.
+        ends: of the intervals. shrinkage: ``(D, Q)`` of the agents. push: the unit of pushes.
 
     Returns:
         By name the ``estimate``, the interval from ``lower`` to ``upper``, the ``unit``,
-        ``at_bound`` (``low``, ``high`` or empty), and the median ``shrinkage`` over drivers; NaN if
+        ``at_bound`` (``low``, ``high`` or empty), and the median ``shrinkage`` over agents; NaN if
         they are not estimated.
     """
-    variances, order = population.estimate.variances, population.model.lane.order
-    short = short_names(population.model.names)
-    noise, drivers = NOISE[: len(variances.noise)], [short[name] for name in population.random]
-    units = ["m/s" if order == 1 else "m/s²", "s", "m", "m", "s"][: len(noise)]
-    shrinkage = [np.nan] * len(noise) + list(np.median(population.marginal.shrinkage, 0))
-    ends = deviation_intervals(population)
+    names = noise.names[: len(variances.noise)]
+    medians = [np.nan] * len(names) + list(np.median(shrinkage, 0))
     logs, low, high = (np.log(values) for values in (variances.row, variances.low, variances.high))
     bounds = np.where(low < high, at_bounds(logs, low, high, NEAR), "")
     table: dict[str, dict[str, Any]] = {}
     # the standard deviations of starts come after these
-    for k, name in enumerate([*noise, *drivers]):
-        value, factor = variances.row[k], 1.0 if k < len(noise) else 100.0
+    for k, name in enumerate([*names, *random]):
+        of_noise = k < len(names)
+        factor, unit = (1.0, push if name == "push" else UNITS[name]) if of_noise else (100.0, "%")
         table[name] = {
-            "estimate": float(factor * value),
+            "estimate": float(factor * variances.row[k]),
             "lower": float(factor * ends[k, 0]),
             "upper": float(factor * ends[k, 1]),
-            "unit": units[k] if k < len(noise) else "%",
+            "unit": unit,
             "at_bound": str(bounds[k]),
-            "shrinkage": float(shrinkage[k]),
+            "shrinkage": float(medians[k]),
         }
     return table

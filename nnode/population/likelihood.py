@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numba import njit
@@ -37,11 +37,26 @@ FLAT = 1e-10
 #: Parameters of :class:`PushNoise`: standard deviations of pushes (m/s or m/s²), of white errors of
 #: positions and of autocorrelated ones (m), and correlation times (s).
 NOISE = ("push", "push_time", "measurement", "lasting_error", "lasting_error_time")
+#: Units of these and of the parameters of :class:`RestartNoise`, except pushes.
+UNITS = {
+    "push_time": "s",
+    "measurement": "m",
+    "lasting_error": "m",
+    "lasting_error_time": "s",
+    "start_speed": "m/s",
+}
+#: Restarts of simulated paths: pushes continue, or nothing is known of them.
+CONTINUED, ANEW = 1, 2
+#: Standard deviation of pushes of which nothing is known, m/s².
+UNKNOWN = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
     """Samples of S segments of D agents, linearised; K samples at most.
+
+    Where a place has A coordinates, the K samples are those of K / A times, one coordinate after
+    the other at each time. The first A states of the linear response are the coordinates.
 
     Attributes:
         residual: ``(S, K)`` w of the module's text.
@@ -50,13 +65,18 @@ class Linearised:
         start: ``(S, K, H)`` by the deviations of the segment's start; H may be 0.
         observed: ``(S, K)`` True where there is a sample.
         agent: ``(S,)`` number of the segment's agent, from 0.
-        step: ``(S, K - 1, M, M)`` transition matrices of the linear response over a sampling
+        step: ``(S, K / A - 1, M, M)`` transition matrices of the linear response over a sampling
             interval; None: there are no pushes.
-        forced: ``(S, K - 1, M, 2)`` its derivatives by the sum of the push at both ends, and by
-            that of the error of the leader's path.
+        forced: ``(S, K / A - 1, M, A + 1)`` its derivatives by the sums of the pushes along the
+            coordinates at both ends, and by that of the error of the leader's path, which may be
+            absent.
         leader: standard deviation and correlation time of the error of the leader's path, m and s;
             it is neglected if the former is 0.
         dt: sampling interval, s.
+        restart: ``(S, K / A)`` where the simulated path restarts from a smoothed measured state:
+            :data:`CONTINUED` where pushes continue, :data:`ANEW` where nothing is known of them,
+            0 elsewhere; None: nowhere.
+        weight: ``(S, K)`` of the whitened samples' squares; None: 1.
     """
 
     residual: np.ndarray
@@ -69,6 +89,14 @@ class Linearised:
     forced: np.ndarray | None = None
     leader: tuple[float, float] = (0.0, 1.0)
     dt: float = 1.0
+    restart: np.ndarray | None = None
+    weight: np.ndarray | None = None
+
+    @property
+    def axes(self) -> int:
+        """The number A of coordinates of a place."""
+        assert self.step is not None
+        return self.residual.shape[1] // (self.step.shape[1] + 1)
 
     @property
     def by_deviation(self) -> np.ndarray:
@@ -77,8 +105,9 @@ class Linearised:
 
     def processes(self, push: float, push_time: float) -> list[tuple[float, float]]:
         """Standard deviation and correlation time of each process that acts, in the order of
-        :attr:`forced`: of the push, and of the error of the leader's path if there is one."""
-        return [(push, push_time), self.leader][: 2 if self.leader[0] > 0 else 1]
+        :attr:`forced`: of the pushes, and of the error of the leader's path if there is one."""
+        pushes = [(push, push_time)] * self.axes
+        return [*pushes, self.leader] if self.leader[0] > 0 else pushes
 
     @cached_property
     def columns(self) -> np.ndarray:
@@ -149,7 +178,13 @@ class Products:
 
 
 class Noise(Protocol):
-    """The residual covariance of a segment."""
+    """The residual covariance of a segment.
+
+    Attributes:
+        names: of its parameters; the last ones may be absent.
+    """
+
+    names: ClassVar[tuple[str, ...]]
 
     def products(self, data: Linearised, values: np.ndarray) -> Products:
         """Products of w, X, Z and H, whitened.
@@ -178,6 +213,8 @@ class Noise(Protocol):
 class WhiteNoise(Noise):
     """Independent errors; the parameter is their standard deviation."""
 
+    names = ("measurement",)
+
     def whitened(
         self, data: Linearised, columns: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -192,24 +229,74 @@ class PushNoise(Noise):
     be absent.
     """
 
+    names = NOISE
+
     def whitened(
         self, data: Linearised, columns: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        assert data.step is not None
-        assert data.forced is not None
         push, push_time, white, *autocorrelated = values
-        processes = data.processes(push, push_time)
-        sigma, time = np.array([*processes, autocorrelated or (0.0, 1.0)]).T
-        whitened: tuple[np.ndarray, np.ndarray] = _filtered(
-            np.ascontiguousarray(columns),
-            data.observed,
-            data.step,
-            np.ascontiguousarray(data.forced[..., : len(processes)]),
-            sigma,
-            np.exp(-data.dt / time),
-            white**2,
-        )
-        return whitened
+        lasting = (autocorrelated[0], autocorrelated[1]) if autocorrelated else (0.0, 1.0)
+        return _whitened(data, columns, (push, push_time), white, lasting, np.zeros(0))
+
+
+@dataclass(frozen=True)
+class RestartNoise(Noise):
+    """Pushes, measurement errors, and errors of the states in which simulated paths restart.
+
+    The parameters are the first three of :data:`NOISE`, and the standard deviation of the errors of
+    smoothed speeds, m/s.
+
+    Attributes:
+        position: standard deviation of the errors of smoothed positions, m.
+    """
+
+    names = (*NOISE[:3], "start_speed")
+    position: float
+
+    def whitened(
+        self, data: Linearised, columns: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        push, push_time, white, speed = values
+        start = np.repeat([self.position, speed], data.axes) ** 2
+        return _whitened(data, columns, (push, push_time), white, (0.0, 1.0), start)
+
+
+def _whitened(
+    data: Linearised,
+    columns: np.ndarray,
+    push: tuple[float, float],
+    white: float,
+    lasting: tuple[float, float],
+    start: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """See :meth:`Noise.whitened`.
+
+    Args:
+        push, lasting: standard deviation and correlation time of pushes, and of autocorrelated
+            errors. white: standard deviation of white errors.
+        start: ``(M,)`` variances of states at restarts; without any, they are not used.
+    """
+    assert data.step is not None
+    assert data.forced is not None
+    processes = data.processes(*push)
+    sigma, time = np.array([*processes, lasting]).T
+    restart = data.restart
+    if restart is None:
+        restart = np.zeros((len(columns), data.step.shape[1] + 1), dtype=np.int8)
+    white_columns, logdet = _filtered(
+        np.ascontiguousarray(columns),
+        data.observed,
+        data.step,
+        np.ascontiguousarray(data.forced[..., : len(processes)]),
+        sigma,
+        np.exp(-data.dt / time),
+        white**2,
+        restart,
+        start,
+    )
+    if data.weight is not None:
+        white_columns = white_columns * np.sqrt(data.weight)[..., None]
+    return white_columns, logdet
 
 
 @njit(cache=True, nogil=True, **LOOP)
@@ -221,19 +308,24 @@ def _filtered(
     sigma: np.ndarray,
     keep: np.ndarray,
     variance: float,
+    restart: np.ndarray,
+    start: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Columns whitened by a Kalman filter, and log determinants.
 
     The state is (d, e), e the J processes that force d, or (d, e, a) where errors a are
-    autocorrelated; a is added to the first element of d, so that this element is measured. The
-    arrays of a step are allocated once, because allocations would take most of the time.
+    autocorrelated; a is added to the first element of d, so that this element is measured. Without
+    such errors, the first elements of d are measured one after the other. The arrays of a step are
+    allocated once, because allocations would take most of the time.
 
     Args:
         sigma: ``(J + 1,)`` standard deviations of e and a. keep: ``(J + 1,)`` their
             autocorrelations over a sampling interval. variance: of white errors.
+        restart: see :class:`Linearised`. start: ``(M,)`` variances of d there.
     """
     number, samples, width = columns.shape
     m, processes = forced.shape[-2:]
+    axes = samples // (step.shape[1] + 1)
     lasting = sigma[-1] > 0
     n = m + processes + 1 if lasting else m + processes
     fresh = sigma**2 * (1 - keep**2)
@@ -242,15 +334,9 @@ def _filtered(
     spread, half, gain = np.empty((n, n)), np.empty((m, n)), np.empty(n)
     forward = np.zeros((m, n))
     for s in range(number):
-        mean[:], spread[:] = 0.0, 0.0
-        for p in range(processes):
-            spread[m + p, m + p] = sigma[p] ** 2
-        if lasting:
-            _add_error(spread, sigma[-1] ** 2)
-        last = samples - 1
-        while last > 0 and not observed[s, last]:
-            last -= 1
-        for k in range(last + 1):
+        mean[:] = 0.0
+        _begin(spread, sigma, m, lasting)
+        for k in range(_last(observed[s]) // axes + 1):
             if k:
                 _set_transition(step[s, k - 1], forced[s, k - 1], keep, forward)
                 _predict_mean(mean, forward, keep, before)
@@ -258,9 +344,46 @@ def _filtered(
                 _add_innovations(spread, forced[s, k - 1], fresh)
                 if lasting:
                     _add_error(spread, fresh[-1])
-            if observed[s, k]:
-                logdet[s] += _condition(mean, spread, columns[s, k], variance, white[s, k], gain)
+            if restart[s, k]:
+                _restart(mean, spread, start, restart[s, k] == ANEW)
+            for axis in range(axes):
+                at = k * axes + axis
+                if observed[s, at]:
+                    logdet[s] += _condition(
+                        mean, spread, axis, columns[s, at], variance, white[s, at], gain
+                    )
     return white, logdet
+
+
+@njit(**INLINE)
+def _begin(spread: np.ndarray, sigma: np.ndarray, m: int, lasting: bool) -> None:
+    """The covariance of the state of :func:`_filtered` before the first sample."""
+    spread[:] = 0.0
+    for p in range(len(sigma) - 1):
+        spread[m + p, m + p] = sigma[p] ** 2
+    if lasting:
+        _add_error(spread, sigma[-1] ** 2)
+
+
+@njit(**INLINE)
+def _last(observed: np.ndarray) -> int:
+    """The place of the last sample; 0 if there is none."""
+    last = len(observed) - 1
+    while last > 0 and not observed[last]:
+        last -= 1
+    return last
+
+
+@njit(**INLINE)
+def _restart(mean: np.ndarray, spread: np.ndarray, start: np.ndarray, anew: bool) -> None:
+    """Restart d with the variances ``start``, and forget e if nothing is known of it: by a push,
+    speeds at a restart already differ from those of the law, so that e depends on them."""
+    n, m = len(spread), len(start)
+    for i in range(n if anew else m):
+        mean[i] = 0.0
+        spread[i] = 0.0
+        spread[:, i] = 0.0
+        spread[i, i] = start[i] if i < m else UNKNOWN**2
 
 
 @njit(**INLINE)
@@ -355,23 +478,24 @@ def _predict_spread(
 def _condition(
     mean: np.ndarray,
     spread: np.ndarray,
+    axis: int,
     sample: np.ndarray,
     variance: float,
     white: np.ndarray,
     gain: np.ndarray,
 ) -> float:
-    """The state after a sample: mean and covariance are replaced, ``white`` is filled. ``gain`` is
-    a work array of as many numbers as the state has.
+    """The state after a sample of its element ``axis``: mean and covariance are replaced, ``white``
+    is filled. ``gain`` is a work array of as many numbers as the state has.
 
     Returns:
         The logarithm of the innovation's variance.
     """
     n, width = mean.shape
-    total = spread[0, 0] + variance
+    total = spread[axis, axis] + variance
     for i in range(n):
-        gain[i] = spread[i, 0] / total
+        gain[i] = spread[i, axis] / total
     for c in range(width):
-        white[c] = sample[c] - mean[0, c]
+        white[c] = sample[c] - mean[axis, c]
     for i in range(n):
         for c in range(width):
             mean[i, c] += gain[i] * white[c]

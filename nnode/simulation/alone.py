@@ -270,10 +270,9 @@ class RunAlone:
         """Arguments of an additional term along the run, ``(F W, N, 2)``."""
         return self._rhs.state(self._moment, self._states)
 
-    def of_people(self, field: Tensor) -> Tensor:
-        """``(P, 2 F)``, by time, from accelerations ``(F W, N, 2)`` or ``(F, W, N, 2)``."""
-        people = field.reshape(len(self._states), -1, 2).index_select(1, self.around.place)
-        return people.movedim(1, 0).flatten(1)
+    def accelerations(self, around: Surroundings) -> Tensor:
+        """``(F, W, N, 2)`` accelerations along the run in other surroundings, m/s²."""
+        return PersonAlone(around, self.system, self._own)(self._moment, self._states)
 
     def parameters(self, steps: Sequence[float]) -> list[Tensor]:
         """K accelerations ``(F, W, N, 2)`` per unit of each parameter.
@@ -299,9 +298,9 @@ class RunAlone:
                 derivatives.append((higher - lower) / steps[len(derivatives)])
         return derivatives
 
-    def unit_responses(self) -> tuple[Tensor, Tensor]:
-        """``(P, F, 2, 4)`` responses of positions to the start (x, v), and ``(P, F, 2, 2 F)`` to
-        accelerations at the steps, by time."""
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """``(F, P, 4, 4)`` derivatives of people's rates (x, v) by their states."""
         matrix = np.zeros((len(self._states), len(self.around.window), 4, 4))
         matrix[..., 0, 2] = matrix[..., 1, 3] = 1.0
         for k in range(4):
@@ -312,15 +311,42 @@ class RunAlone:
             )
             slope = (higher - lower)[:, self.around.window, self.around.person]
             matrix[..., 2:, k] = slope.numpy() / (2 * DIFFERENCE)
-        times = len(matrix)
-        start = np.zeros((2, 2, 4 + 2 * times, 1))
-        source = np.zeros((times, 2, 2, 4 + 2 * times, 1))
+        return matrix
+
+    @cached_property
+    def _solvers(self) -> list[RungeKuttaSolver]:
+        """Of parts of the people, for the cache."""
+        parts = np.split(self.slopes, range(PEOPLE, self.slopes.shape[1], PEOPLE), 1)
+        return [RungeKuttaSolver(part, self.around.step) for part in parts]
+
+    def by_start(self) -> np.ndarray:
+        """``(P, F, 2, 4)`` derivatives of positions by the states at the start."""
+        start = np.zeros((2, 2, 4, 1))
         start[0, 0, 0] = start[0, 1, 1] = start[1, 0, 2] = start[1, 1, 3] = 1.0
-        for axis in range(2):
-            source[:, 1, axis, 4 + axis :: 2, 0] = np.eye(times)
-        responses = []
-        for part in np.split(matrix, range(PEOPLE, matrix.shape[1], PEOPLE), 1):
-            inputs = [np.repeat(unit, part.shape[1], -1) for unit in (source, start)]
-            responses.append(RungeKuttaSolver(part, self.around.step).response(*inputs))
-        joined = torch.from_numpy(np.concatenate(responses, -1)).permute(3, 0, 1, 2)
-        return joined[..., :4], joined[..., 4:]
+        return self._positions(np.zeros((len(self._states), 2, 2, 4, 1)), start)
+
+    def displacements(self, fields: Sequence[Tensor]) -> np.ndarray:
+        """``(P, F, 2, C)`` changes of positions by C additional accelerations, m.
+
+        Args:
+            fields: each ``(F W, N, 2)`` or ``(F, W, N, 2)``.
+        """
+        times, place = len(self._states), self.around.place
+        source = np.zeros((times, 2, 2, len(fields), len(place)))
+        for c, rate in enumerate(fields):
+            people = rate.reshape(times, -1, 2).index_select(1, place)
+            source[:, 1, :, c] = people.movedim(1, 2).numpy()
+        return self._positions(source)
+
+    def _positions(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+        """``(P, F, 2, C)`` changes of positions by sources ``(F, 2, 2, C, P or 1)`` and starts
+        ``(2, 2, C, 1)``."""
+        parts, first = [], 0
+        for solver in self._solvers:
+            last = first + solver.number
+            part = source if source.shape[-1] == 1 else source[..., first:last]
+            shape = (*part.shape[:-1], solver.number)
+            initial = None if start is None else np.repeat(start, solver.number, -1)
+            parts.append(solver.response(np.broadcast_to(part, shape), initial))
+            first = last
+        return np.concatenate(parts, -1).transpose(3, 0, 1, 2)

@@ -66,6 +66,11 @@ class DenseSolver:
         positions: np.ndarray = torch.stack(states)[:, :, :n].permute(0, 2, 3, 1).numpy()
         return positions
 
+    @property
+    def number(self) -> int:
+        """B."""
+        return self._step.shape[1]
+
     def _forced(self, source: Tensor) -> Tensor:
         """``(K - 1, B, M N, C)`` changes of the states in each step by ``source``
         ``(K, B, M N, C)``."""

@@ -204,7 +204,7 @@ FORCES = ("anticipation", "field_of_view", "evasive_rotation")
         ("free_flow_speed", "idm", {}, "acceleration"),
         ("free_flow_speed", "lin", {}, ""),
         ("preferred_speed", "sf", {"desired": "last"}, ""),
-        ("preferred_speed", "sf", {"desired": "direction"}, "preferred speed"),
+        ("preferred_speed", "sf", {"desired": "direction"}, "has a desired speed"),
         ("drift", "sf", {"desired": "direction"}, ""),
         *[(name, "sf", {}, "") for name in FORCES],
         *[(name, "gcfm", {}, "no force between people") for name in FORCES],

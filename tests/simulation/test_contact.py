@@ -5,6 +5,8 @@ The derivative of the social force jumps at a contact.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -55,8 +57,8 @@ def integrated(change: np.ndarray, steps: int, contact: float) -> np.ndarray:
     return solve_ivp(rate, (0.0, SECONDS), START + change[:4], t_eval=time, **tight).y[:2].T
 
 
-def pushed(t: float) -> np.ndarray:
-    return np.array([np.cos(3 * t), np.sin(5 * t)])
+def pushed(t: Any) -> np.ndarray:
+    return np.stack([np.cos(3 * t), np.sin(5 * t)], -1)
 
 
 def run(steps: int, contact: float) -> RunAlone:
@@ -82,10 +84,10 @@ def run(steps: int, contact: float) -> RunAlone:
 def errors(steps: int, contact: float) -> np.ndarray:
     """The largest relative error of the response to each change."""
     linear = run(steps, contact)
-    by_start, by_push = (part[0].numpy() for part in linear.unit_responses())
-    columns = [linear.of_people(field)[0].numpy() for field in linear.parameters([1e-4] * 3)]
-    columns.append(np.concatenate([pushed(t) for t in np.linspace(0.0, SECONDS, steps + 1)]))
-    responses = [*np.moveaxis(by_start, -1, 0), *(by_push @ column for column in columns)]
+    push = torch.zeros(steps + 1, 1, 3, 2, dtype=torch.float64)
+    push[:, 0, 0] = torch.from_numpy(pushed(np.linspace(0.0, SECONDS, steps + 1)))
+    by_rates = linear.displacements([*linear.parameters([1e-4] * 3), push])
+    responses = np.concatenate([linear.by_start()[0], by_rates[0]], -1).transpose(2, 0, 1)
     h, relative = 1e-5, []
     for unit, response in zip(np.eye(8), responses, strict=True):
         upper, lower = (integrated(sign * h * unit, steps, contact) for sign in (1, -1))

@@ -1,96 +1,112 @@
-"""Engine of crowds: residuals on short windows of every person's path."""
+"""Engine of crowds: residuals of people who differ, each among the measured paths of the others.
+
+In a crowd, errors of one person's simulated path would propagate to all. Therefore sequences are
+cut into segments, and in each of them every person is simulated alone. With the notation of
+:mod:`nnode.diagnosis.crowds.people`, the residuals of a model are
+
+    V^(-1/2) (y - f(theta, b) + Z b)
+
+without their projection on V^(-1/2) X. V, Z and b are fixed until the next estimate, so that all
+models of a diagnosis are compared with the same whitening.
+"""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from collections.abc import Sequence as Many
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.optimize import least_squares
 from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.sequence import Sequence, collate
+from nnode.diagnosis.crowds.people import CrowdPopulation, People, differences_of
+from nnode.diagnosis.crowds.simulated import simulated_pair
 from nnode.diagnosis.crowds.variables import crowd_variables
-from nnode.diagnosis.crowds.whitening import Whitening
 from nnode.diagnosis.crowds.windows import Windows
-from nnode.diagnosis.eligibility import check_model
 from nnode.diagnosis.outcome import Simulation
 from nnode.diagnosis.residuals.engine import Squares, of_residuals, removes_enough
+from nnode.diagnosis.residuals.fit import refine
 from nnode.diagnosis.residuals.variables import Variable
+from nnode.errors import SimulationError
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
 from nnode.model.system import Crowd, System
 from nnode.model.term import State
-from nnode.simulation.alone import PersonAlone, RunAlone, Surroundings
+from nnode.population.drivers import ROUGH
+from nnode.simulation.alone import PersonAlone, RunAlone
 
-#: Largest difference between simulated and measured positions, m. Differences are clipped because
-#: contact forces may throw a person far away.
-LIMIT = 3.0
-#: Number of pairs of people in the largest intermediate result.
-CHUNK = 100_000
+#: Length of segments, s.
+SECONDS = 2.0
+#: Antithetic pairs of simulated crowds that estimate the bias of parameters.
+PAIRS = 3
+#: Largest number of alternations between a calibration and an estimate of people.
+ALTERNATIONS = 8
+#: Number of columns that are computed at once, for memory.
+COLUMNS = 64
 
 
 class CrowdEngine:
-    """Residuals on windows in which every person is simulated alone among the others.
-
-    In a crowd, errors of one person's simulated path would propagate to all. Therefore the
-    sequences are cut into windows, the others follow their measured and smoothed paths, and the
-    part of the differences that an unknown start state explains is projected out. The remaining
-    differences of positions are whitened, and outlying windows have smaller weights.
+    """Residuals of a crowd; see :class:`~nnode.diagnosis.residuals.engine.Engine`.
 
     Args:
         sequences: of people, equally sampled.
-        window: length of a window, s.
+        window: length of a segment, s.
         clusters: ``(S,)`` of the sequences; None: each is one.
 
     Attributes:
         batch: the sequences.
         sequence: ``(n,)`` position of each residual's sequence in the batch.
-        clock: ``(n,)`` start time of its window, s.
+        clock: ``(n,)`` start time of its segment, s.
         unit: ``(n,)`` number of its person, counted through all sequences.
         people: of each unit the sequence and the place of the person.
+        population: the last estimate; None before.
 
     Raises:
-        DataError: sequences too short for a window, or positions that are no numbers.
+        DataError: sequences too short for a segment, or positions that are no numbers.
     """
 
     def __init__(
         self,
         sequences: Many[Sequence],
-        window: float = 1.5,
+        window: float = SECONDS,
         clusters: np.ndarray | None = None,
     ) -> None:
-        self.sequences = list(sequences)
+        self.sequences, self._seconds = list(sequences), window
         self.batch = collate(sequences)
-        self.windows = Windows(sequences, window)
-        window_of, place_of = self.windows.person.T
-        self._clusters = clusters
-        pairs, unit = np.unique(
-            np.stack([self.windows.sequence[window_of], place_of], 1), axis=0, return_inverse=True
-        )
-        self._unit = unit.reshape(-1)
-        self.people = [[(int(b), int(i))] for b, i in pairs]
+        self.windows = windows = Windows(sequences, window)
+        self._people = People(windows)
+        self._label = np.arange(len(sequences)) if clusters is None else np.asarray(clusters)
+        self.people = [[pair] for pair in self._people.pairs]
         self.names = [item.name for item in sequences]
-        self._label(1)
-        self._around: Surroundings | None = None
-        self._whitening: Whitening | None = None
+        window_of, n_residuals = windows.person[:, 0], 2 * windows.length
+        self.sequence = windows.sequence[window_of].repeat(n_residuals)
+        self.cluster = of_residuals(clusters, self.sequence)
+        self.clock = windows.batch.start.numpy()[window_of].repeat(n_residuals)
+        self.component = np.tile(np.arange(n_residuals), len(window_of))
+        self.unit = self._people.unit.repeat(n_residuals)
+        self.population: CrowdPopulation | None = None
         self._run: tuple[System, Tensor, RunAlone] | None = None
 
     # -- the interface of engines ----------------------------------------------------------
 
     def residuals(self, system: System, rows: Tensor) -> Tensor:
         """``(R, n)``: whitened differences, measured minus simulated, of R runs of one model."""
-        differences = self._differences(system, rows)
-        self._fitted_whitening(system, rows[0])
-        flat = differences.reshape(len(rows), *self._matrix.shape[::2], 1)
-        return (self._matrix @ flat).reshape(len(rows), -1)
+        population = self._fitted(system, rows[0])
+        differences = self._people.differences(self._states(system, rows))
+        joined = self._people.joined(np.moveaxis(differences, 0, -1))
+        return self._whitened(joined + population.by_speed(population.data.fixed)[..., None])
 
     def squares(self, system: System, row: Tensor) -> Squares:
-        """Squared errors of positions, after start states were projected out."""
+        """Squared errors of positions, with the deviations of people that are most likely under
+        this model."""
         window = self.windows.person[:, 0]
-        squares = (self._projected_errors(system, row) ** 2).sum(-1)
+        squares = (self._errors(system, row) ** 2).sum(-1)
         n_samples = squares.shape[1]
         return Squares(squares.ravel(), self.windows.sequence[window].repeat(n_samples))
 
@@ -98,8 +114,8 @@ class CrowdEngine:
         return removes_enough(self, before, after, square)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
-        """The windows in sequence, each from the best-fitting start state."""
-        difference, length = self._projected_errors(system, row), self.windows.length
+        """The segments in sequence, with the deviations of :meth:`squares`."""
+        difference, length = self._errors(system, row), self.windows.length
         simulations: list[Simulation | None] = [None] * len(self.sequences)
         for i in self.windows.used:
             s, first, stride = self.sequences[i], *self.windows.compared[i]
@@ -121,12 +137,6 @@ class CrowdEngine:
             simulations[i] = Simulation(part, x, restart=length)
         return simulations
 
-    def _projected_errors(self, system: System, row: Tensor) -> np.ndarray:
-        """``(P, L, 2)`` m: measured minus simulated positions, start states projected out."""
-        whitening = self._fitted_whitening(system, row)
-        projected: np.ndarray = whitening.projected(self._differences(system, row[None]).numpy())[0]
-        return projected.reshape(len(projected), -1, 2)
-
     def variables(self) -> list[Variable]:
         """The variables on which deviations of people may depend."""
         windows, no_forces = self.windows, Crowd([])
@@ -142,62 +152,168 @@ class CrowdEngine:
         return 2 * self.windows.variance * (1 - 2 / length)
 
     def fit_whitening(self, system: System, row: Tensor) -> None:
-        """Fit the whitening and the weights to the residuals of a model, and linearise around it.
+        """Estimate desired speeds, variances and weights, with the model's parameters.
 
-        It is called after a fit was accepted. Residuals before and after the call cannot be
-        compared; even their number may change.
+        Residuals before and after the call cannot be compared.
         """
-        self._run = self._simulated(system, row)
-        start, forced = self._run[-1].unit_responses()
-        stride = self.windows.sub
-        difference = self._differences(system, row[None])[0].numpy()
-        self._whitening = Whitening.fit(
-            difference, start[:, ::stride].numpy(), self._turns(), self.windows.variance
-        )
-        self._matrix = torch.as_tensor(self._whitening.matrix())
-        self._response = self._matrix @ forced[:, ::stride].flatten(1, 2)
-        self._label(self._matrix.shape[1])
+        fixed = with_parameters(system, row)
+        self.set_population(self._people.estimated(fixed, self.population))
 
-    def _label(self, n_residuals: int) -> None:
-        """Label the ``n_residuals`` residuals of every person's window."""
-        window = self.windows.person[:, 0]
-        self.sequence = self.windows.sequence[window].repeat(n_residuals)
-        self.cluster = of_residuals(self._clusters, self.sequence)
-        self.clock = self.windows.batch.start.numpy()[window].repeat(n_residuals)
-        self.component = np.tile(np.arange(n_residuals), len(window))
-        self.unit = self._unit.repeat(n_residuals)
+    # -- people who differ -----------------------------------------------------------------
+
+    def set_population(self, population: CrowdPopulation) -> None:
+        """Whiten residuals by an estimate."""
+        self.population, self._run, data = population, None, population.data
+        self._whitening = self._people.whitening(data, population.variances)
+        common = self._people.segments(self._whitening(data.fixed[..., : population.has_speed]))
+        self._common = np.linalg.qr(common.reshape(len(self.unit), population.has_speed))[0]
+
+    def population_of(self, system: System) -> CrowdPopulation:
+        """The estimate with a model, whose parameters are calibrated with it; the engine keeps its
+        own. It starts from usual variances: those of a model that lacks a strong effect would hide
+        it.
+
+        Raises:
+            SimulationError: the model cannot be simulated.
+        """
+        engine = copy.copy(self)
+        engine.population = None
+        fitted, best = copy.deepcopy(system), None
+        for _ in range(ALTERNATIONS):
+            engine.fit_whitening(fitted, ParameterVector(fitted).row)
+            present = engine.population
+            assert present is not None
+            risen = np.inf if best is None else present.criterion - best.criterion
+            best = present if risen > 0 else best
+            if risen < ROUGH:
+                break
+            fitted = refine(engine, fitted).system
+        assert best is not None
+        return best
+
+    def variations(self) -> dict[str, dict[str, Any]]:
+        """The variances over time and between people, see
+        :func:`nnode.population.intervals.variation_rows`. They are not corrected for a bias."""
+        assert self.population is not None
+        return self._people.variations(self.population)
+
+    def reselected(self, population: CrowdPopulation) -> CrowdPopulation:
+        """The same: all quantities differ that may differ."""
+        return population
+
+    def with_usual_variances(self, system: System) -> CrowdEngine:
+        """An engine with the variances where searches start. The variances of a model that lacks a
+        strong effect attribute it to pushes, and would hide where it acts."""
+        engine, random = copy.copy(self), self._fitted(system, ParameterVector(system).row).random
+        usual = self._people.initial_variances(random)
+        engine.set_population(self._people.estimated(system, self.population, usual))
+        return engine
+
+    def regression_start(self, system: System) -> System:
+        """A copy whose parameters are fitted to the accelerations of the smoothed paths by
+        regression, which avoids distant local minima of calibrations."""
+        fitted, batch = copy.deepcopy(system), self.windows.batch
+        vector, around = ParameterVector(fitted), self._people.around(system, self._speed)
+        states = torch.cat([batch.x, batch.v], -1)[::2]
+        moment = 2 * np.arange(len(states))
+        measured = torch.gradient(batch.v[::2], spacing=self.windows.step, dim=0)[0]
+        window, person = around.window, around.person
+
+        def missed(row: np.ndarray) -> np.ndarray:
+            rate = PersonAlone(around, fitted, vector.runs(row[None]))(moment, states)
+            misfit: np.ndarray = (measured - rate)[:, window, person].numpy().ravel()
+            return np.nan_to_num(misfit, nan=1e3, posinf=1e3, neginf=-1e3)
+
+        low, high = vector.bounds
+        start = np.clip(vector.row.numpy(), low, high)
+        best = least_squares(missed, start, bounds=(low, high), loss="soft_l1", max_nfev=50)
+        return vector.fill_(best.x)
+
+    def log_likelihoods(self, *starts: System) -> tuple[np.ndarray, System]:
+        """``(G,)`` log marginal likelihoods of the clusters under a law with parameters, desired
+        speeds and variances of its own, minus their share of the number of parameters times half
+        the logarithm of the number of people (BIC); and the calibrated law.
+
+        Args:
+            starts: the law with different parameters, from each of which it is calibrated.
+
+        Raises:
+            SimulationError: the simulations of all starts diverge.
+        """
+        populations = list[CrowdPopulation]()
+        for start in starts:
+            with suppress(SimulationError, np.linalg.LinAlgError):
+                populations.append(self.population_of(start.double()))
+        if not populations:
+            raise SimulationError("the paths of people diverge from all starts")
+        best = max(populations, key=lambda population: population.criterion)
+        of_people = self._label[[b for b, _ in self._people.pairs]]
+        cluster = np.unique(of_people, return_inverse=True)[1].reshape(-1)
+        values = np.bincount(cluster, best.each)
+        return values - best.price / len(values), best.system
+
+    def simulated_engines(self, system: System, row: Tensor, seed: int) -> list[CrowdEngine]:
+        """Engines of crowds that a model simulates, with the variances of this one: an antithetic
+        pair of draws.
+
+        Args:
+            seed: of the draws.
+
+        Raises:
+            SimulationError: the simulation diverges.
+        """
+        model, used = with_parameters(system, row), self.windows.used
+        variances = self._fitted(system, row).variances
+        preferred = {i: self.windows.preferred[i].copy() for i in used}
+        for (b, i), speed in zip(self._people.pairs, self._speed, strict=True):
+            preferred[b][i] *= speed / max(float(np.hypot(*preferred[b][i])), 1e-9)
+        measured = [replace(self.sequences[i], preferred=preferred[i]) for i in used]
+        engines = []
+        for crowd in simulated_pair(model, measured, seed):
+            if not all(np.isfinite(s.x).all() for s in crowd):
+                raise SimulationError("the simulated crowd diverges")
+            sequences = list(self.sequences)
+            for i, s in zip(used, crowd, strict=True):
+                sequences[i] = s
+            engine = CrowdEngine(sequences, self._seconds, self._label)
+            engine.batch = self.batch  # effects are looked for at the same places
+            engine.set_population(engine._people.estimated(model, None, variances))
+            engines.append(engine)
+        return engines
+
+    def biases(self, system: System, row: Tensor, seed: int) -> np.ndarray:
+        """``(R, K)`` biases of a model's parameters, of each antithetic pair: the Gauss-Newton step
+        from the parameters that crowds were simulated with.
+
+        Raises:
+            SimulationError: the simulation diverges.
+        """
+        pairs = []
+        for k in range(PAIRS):
+            steps = []
+            for engine in self.simulated_engines(system, row, seed + k):
+                tangents = engine.tangents(system, row).numpy().T
+                residual = engine.residuals(system, row[None])[0].numpy()
+                steps.append(np.linalg.lstsq(tangents, -residual, rcond=1e-9)[0])
+            pairs.append(np.mean(steps, 0))
+        return np.array(pairs)
 
     # -- linear response ----------------------------------------------------------------------
-
-    def linearised(self, system: System, row: Tensor) -> RunAlone:
-        """A model along its own paths; the response is that of the model of the whitening."""
-        self._fitted_whitening(system, row)
-        if self._run is None or self._run[0] is not system or not torch.equal(self._run[1], row):
-            self._run = self._simulated(system, row)
-        return self._run[-1]
-
-    def _simulated(self, system: System, row: Tensor) -> tuple[System, Tensor, RunAlone]:
-        states = self._states(system, row[None])[:, 0]
-        filled = with_parameters(system, row)
-        assert self._around is not None
-        run = RunAlone(self._around, filled, states)
-        return system, row.clone(), run
 
     def tangents(self, system: System, row: Tensor) -> Tensor:
         """``(K, n)``: derivatives of the residuals with respect to the calibrated parameters, by
         linear response."""
-        run = self.linearised(system, row)
-        rates = run.parameters(_differences(system))
-        return torch.stack([self._respond(rate, run) for rate in rates])
+        run = self._run_of(system, row)
+        return self._responses(run, run.parameters(differences_of(system)))
 
     def response(
         self, system: System, row: Tensor, rates: Callable[[State], list[Tensor]]
     ) -> Tensor:
         """``(M, n)``: changes of the residuals by M weak additional accelerations, each a function
         of the states, ``(B, N, 2)`` m/s²."""
-        run = self.linearised(system, row)
+        run = self._run_of(system, row)
         with torch.no_grad():
-            return torch.stack([self._respond(rate, run) for rate in rates(run.state)])
+            return self._responses(run, rates(run.state))
 
     def screen_columns(
         self, system: System, row: Tensor, effect: type[Effect], *probes: Probe
@@ -241,58 +357,51 @@ class CrowdEngine:
 
     # -- parts -----------------------------------------------------------------------------
 
-    def _fitted_whitening(self, system: System, row: Tensor) -> Whitening:
-        if self._whitening is None:
+    @property
+    def _speed(self) -> np.ndarray:
+        """``(D,)`` desired speeds of the simulated people, m/s."""
+        return self._people.speed if self.population is None else self.population.speed
+
+    def _fitted(self, system: System, row: Tensor) -> CrowdPopulation:
+        if self.population is None:
             self.fit_whitening(system, row)
-        assert self._whitening is not None
-        return self._whitening
-
-    def _respond(self, rate: Tensor, run: RunAlone) -> Tensor:
-        """``(n,)``: change of the residuals by accelerations of the people."""
-        return -(self._response @ run.of_people(rate)[..., None]).reshape(-1)
-
-    def _differences(self, system: System, rows: Tensor) -> Tensor:
-        """``(R, P, L, 2)`` m: measured minus simulated positions."""
-        window_of, place_of = self.windows.person.T
-        x = self._states(system, rows)[:: self.windows.sub, :, window_of, place_of, :2]
-        measured = torch.from_numpy(self.windows.measured[:, window_of, place_of])
-        difference = (measured[:, None] - x).permute(1, 2, 0, 3)
-        return difference.nan_to_num(LIMIT, LIMIT, -LIMIT).clamp(-LIMIT, LIMIT)
+        assert self.population is not None
+        return self.population
 
     def _states(self, system: System, rows: Tensor) -> Tensor:
-        """``(F, R, W, N, 4)`` simulated positions (m) and velocities (m/s) at the steps."""
-        windows = self.windows
-        # all systems of one diagnosis share walls, radii and masses
-        if self._around is None:
-            check_model(system)
-            self._around = windows.around(system)
-        w, n = windows.batch.agent.shape
-        first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
-        states = []
-        for part in rows.split(max(1, CHUNK // (w * n * n))):
-            rhs = PersonAlone(self._around, system, ParameterVector(system).runs(part))
-            states.append(rhs.simulated(first, windows.steps))
-        return torch.cat(states, 1)
+        """``(F, R, W, N, 4)`` simulated states."""
+        return self._people.states(system, rows, self._speed)
 
-    def _turns(self) -> np.ndarray:
-        """``(P, 2, 2)``: unit vectors along and across each person's path in the window."""
-        window, person = self.windows.person.T
-        x = self.windows.batch.x[:, window, person].numpy()
-        goal = self.windows.batch.destination[window, person].numpy()
-        displacement, to_goal = x[-1] - x[0], goal - x[0]
-        standing = np.hypot(*displacement.T) < 0.1
-        displacement = np.where(standing[:, None], to_goal, displacement)
-        displacement = displacement / np.maximum(np.hypot(*displacement.T), 1e-9)[:, None]
-        return np.stack([displacement, np.stack([-displacement[:, 1], displacement[:, 0]], 1)], 1)
+    def _errors(self, system: System, row: Tensor) -> np.ndarray:
+        """``(P, L, 2)`` m: measured minus simulated positions, with the most likely deviations."""
+        people, population = self._people, self._fitted(system, row)
+        fixed = population.data.fixed
+        difference = people.joined(people.differences(self._states(system, row[None]))[0])
+        data = replace(population.data, residual=difference + population.by_speed(fixed))
+        posterior = people.posterior(data, population.random, population.variances)
+        deviations = posterior.change + posterior.deviations
+        errors = people.segments(data.residual - (fixed * deviations[:, None]).sum(-1))
+        return errors.reshape(len(errors), -1, 2)
 
+    def _whitened(self, columns: np.ndarray) -> Tensor:
+        """``(C, n)`` of columns ``(D, K, C)``."""
+        white = self._people.segments(self._whitening(columns))
+        flat = white.reshape(-1, white.shape[-1])
+        return torch.from_numpy(flat - self._common @ (self._common.T @ flat)).T
 
-def _differences(system: System) -> list[float]:
-    """``(K,)``: finite differences of the parameters."""
-    differences = []
-    for name, p in ParameterVector(system).parameters.items():
-        _, place, key = name.split(".", 2)
-        term = system.terms[int(place)]
-        strength = term.strengths.get(key) if isinstance(term, Effect) else None
-        size = 1e-3 * max(1.0, float(p.detach().abs().max()))
-        differences += [size if strength is None else abs(strength.step)] * p.numel()
-    return differences
+    def _run_of(self, system: System, row: Tensor) -> RunAlone:
+        """A run of a model; the last one is cached."""
+        self._fitted(system, row)
+        if self._run is None or self._run[0] is not system or not torch.equal(self._run[1], row):
+            states = self._states(system, row[None])[:, 0]
+            around = self._people.around(system, self._speed)
+            self._run = system, row.clone(), RunAlone(around, with_parameters(system, row), states)
+        return self._run[-1]
+
+    def _responses(self, run: RunAlone, fields: list[Tensor]) -> Tensor:
+        """``(C, n)`` changes of the residuals by accelerations of the people."""
+        parts = []
+        for first in range(0, len(fields), COLUMNS):
+            moved = run.displacements(fields[first : first + COLUMNS])[:, :: self.windows.sub]
+            parts.append(self._whitened(-self._people.joined(moved)))
+        return torch.cat(parts) if parts else torch.zeros(0, len(self.unit), dtype=torch.float64)

@@ -45,13 +45,15 @@ class Windows:
         step: of the simulation, s. sub: steps between two residuals.
         used: positions of the sequences that are long enough.
         compared: of these the first sample that is compared, and the stride from each to the next.
+        preferred: of these ``(N, 2)`` velocities, m/s: as measured before the sequence, or else the
+            mean within it.
         variance: m², of the noise of one measured coordinate.
 
     Raises:
         DataError: no sequence is long enough, or another fault of the data.
     """
 
-    def __init__(self, sequences: Many[Sequence], window: float = 1.5) -> None:
+    def __init__(self, sequences: Many[Sequence], window: float) -> None:
         dt = sequences[0].dt
         stride = max(1, round(INTERVAL / dt))
         count = [(item.n_samples + stride - 1) // stride for item in sequences]
@@ -73,14 +75,17 @@ class Windows:
         half = np.arange(2 * self.sub * (length - 1) + 1) * self.step / 2
         pieces, measured, sequence, number = [], [], [], []
         self.compared: dict[int, tuple[int, int]] = {}
+        self.preferred: dict[int, np.ndarray] = {}
         for i in self.used:
             item, windows = sequences[i], count[i] // length
             spare = (count[i] - windows * length) // 2
             self.compared[i] = (spare * stride, stride)
+            preferred = self.preferred[i] = _preferred(item, smoother)
             for w in range(windows):
                 first = (spare + w * length) * stride
                 path = smoother.path(item, first * dt + half)
-                pieces.append(_piece(item, item.time[0] + first * dt + half, path.x, path.v))
+                time = item.time[0] + first * dt + half
+                pieces.append(_piece(item, time, path.x, path.v, preferred))
                 measured.append(item.x[first::stride][:length])
                 sequence.append(i)
                 number.append(w)
@@ -97,20 +102,38 @@ class Windows:
         """Steps of the simulation of a window."""
         return self.sub * (self.length - 1)
 
-    def around(self, system: System) -> Surroundings:
-        """The surroundings of the people whom ``system`` simulates."""
+    def around(self, system: System, speed: np.ndarray | None = None) -> Surroundings:
+        """The surroundings of the people whom ``system`` simulates.
+
+        Args:
+            speed: ``(P,)`` their desired speeds, m/s; None: the measured preferred speeds.
+        """
         scene = system.scene(self.batch)
+        window, person = torch.from_numpy(self.person).T
+        if speed is not None:
+            scene.preferred = torch.zeros_like(scene.preferred)
+            scene.preferred[window, person, 0] = torch.from_numpy(speed)
         # terms read the paths from ``Surroundings``, so copies for many runs need only two samples
         scene.measured, scene.measured_rate = scene.measured[:2], scene.measured_rate[:2]
         force: Any = system.find_law("social_force")
         if force is not None and scene.wall.shape[1]:
             reach = force.r + CUT * force.B + STRAY
             scene.near = _near(scene, self.batch.x[:: 2 * self.sub], reach)
-        window, person = torch.from_numpy(self.person).T
         return Surroundings(scene, self.batch.x, self.batch.v, window, person, self.step)
 
 
-def _piece(item: Sequence, time: np.ndarray, x: np.ndarray, v: np.ndarray) -> Sequence:
+def _preferred(item: Sequence, smoother: Smoother) -> np.ndarray:
+    """See :attr:`Windows.preferred`."""
+    ends = smoother.path(item, np.array([0.0, item.dt * (item.n_samples - 1)])).x
+    mean: np.ndarray = (ends[1] - ends[0]) / (item.dt * (item.n_samples - 1))
+    if item.preferred is None:
+        return mean
+    return np.where(np.isfinite(item.preferred), item.preferred, mean)
+
+
+def _piece(
+    item: Sequence, time: np.ndarray, x: np.ndarray, v: np.ndarray, preferred: np.ndarray
+) -> Sequence:
     destination = item.x[-1] if item.destination is None else item.destination
     return Sequence(
         name=item.name,
@@ -121,7 +144,7 @@ def _piece(item: Sequence, time: np.ndarray, x: np.ndarray, v: np.ndarray) -> Se
         kind=item.kind,
         group=item.group,
         destination=destination,
-        preferred=item.preferred,
+        preferred=preferred,
         walls=item.walls,
     )
 

@@ -286,6 +286,9 @@ class FollowersEngine(TrafficEngine):
             return fit_drivers(fixed, paths, pairs=0)
         return refit(start, fixed, paths, fixed=self._like is not None)
 
+    def reselected(self, population: Population) -> Population:
+        return with_random_effects(population)
+
     def drivers(self, seed: int) -> Population:
         """The last estimate, corrected for its bias; where errors of positions are smaller than
         :data:`ERROR`, with errors estimated as well, because larger ones would lengthen the

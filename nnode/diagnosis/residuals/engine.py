@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from torch import Tensor
@@ -134,6 +134,70 @@ class Engine(Protocol):
 
     def variables(self) -> list[Variable]:
         """The variables on which deviations may depend."""
+        ...
+
+
+@runtime_checkable
+class AgentsEngine(Engine, Protocol):
+    """An engine whose residuals are whitened by a statistical model of agents who differ.
+
+    Attributes:
+        population: the last estimate of this model; None before.
+    """
+
+    population: Any
+
+    def population_of(self, system: System) -> Any:
+        """The estimate with a model, whose parameters are calibrated with it; the engine keeps its
+        own."""
+        ...
+
+    def set_population(self, population: Any) -> None:
+        """Whiten residuals by an estimate."""
+        ...
+
+    def reselected(self, population: Any) -> Any:
+        """The estimate after a new selection of what differs between agents."""
+        ...
+
+    def with_usual_variances(self, system: System) -> AgentsEngine:
+        """An engine with the variances where searches start. The variances of a model that lacks a
+        strong effect attribute it to pushes, and would hide where it acts."""
+        ...
+
+    def regression_start(self, system: System) -> System:
+        """A copy whose law is fitted to the smoothed rates by regression. Calibrations that start
+        there avoid distant local minima."""
+        ...
+
+    def log_likelihoods(self, *starts: System) -> tuple[np.ndarray, System]:
+        """``(G,)`` log marginal likelihoods of the clusters under a law with agents, pushes and
+        parameters of its own, minus their share of a price of parameters (BIC); and the calibrated
+        law.
+
+        Args:
+            starts: the law with different parameters.
+
+        Raises:
+            SimulationError: the simulations of all starts diverge.
+        """
+        ...
+
+    def simulated_engines(self, system: System, row: Tensor, seed: int) -> list[Any]:
+        """Engines of paths that a model simulates, with the variances of this one: an antithetic
+        pair of draws.
+
+        Raises:
+            SimulationError: the simulation diverges.
+        """
+        ...
+
+    def biases(self, system: System, row: Tensor, seed: int) -> np.ndarray:
+        """``(R, K)`` biases of a model's parameters in R antithetic pairs of simulations.
+
+        Raises:
+            SimulationError: the simulation diverges.
+        """
         ...
 
 

@@ -1,10 +1,10 @@
 """Bias of scores and of parameters, by parametric bootstrap.
 
-The linearisation at the drivers' modes and the errors of smoothed leaders bias scores slightly,
-which is significant in large data sets. The bias is the mean score in paths that the calibrated
-model simulates. An effect must be significant with and without this correction, because simulations
-of a very wrong model are wrong too. Draws are antithetic pairs, in which terms that are linear in
-pushes, deviations and errors cancel.
+The linearisation at the agents' modes, the errors of smoothed leaders, and people who react to each
+other bias scores slightly, which is significant in large data sets. The bias is the mean score in
+paths that the calibrated model simulates. An effect must be significant with and without this
+correction, because simulations of a very wrong model are wrong too. Draws are antithetic pairs, in
+which terms that are linear in pushes, deviations and errors cancel.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ import torch
 
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.clusters import group_sums
-from nnode.diagnosis.lanes.followers import FollowersEngine
-from nnode.diagnosis.residuals.engine import Engine
+from nnode.diagnosis.residuals.engine import AgentsEngine, Engine
 from nnode.diagnosis.residuals.fit import Fit, evaluated
 from nnode.diagnosis.statistics.leverage import orthonormal, without_span
 from nnode.errors import SimulationError
@@ -35,7 +34,7 @@ def simulated_fits(engine: Engine, fit: Fit, seed: int) -> SimulatedFits:
     Args:
         seed: of the draws.
     """
-    if not isinstance(engine, FollowersEngine):
+    if not isinstance(engine, AgentsEngine):
         return []
     try:
         engines = engine.simulated_engines(fit.system, torch.from_numpy(fit.row), seed)
@@ -72,7 +71,7 @@ def corrected_for_bias(engine: Engine, fit: Fit, seed: int) -> Fit:
     Args:
         seed: of the draws.
     """
-    if not isinstance(engine, FollowersEngine):
+    if not isinstance(engine, AgentsEngine):
         return fit
     try:
         biases = engine.biases(fit.system, torch.from_numpy(fit.row), seed)

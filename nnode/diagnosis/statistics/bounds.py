@@ -24,18 +24,18 @@ def parameters_at_bounds(base: System, fit: Fit, cluster: np.ndarray) -> set[str
     """Names of the law's parameters whose bounds show that the law is wrong: those that are at
     bounds only with the effects, and those for which values beyond are required.
 
-    There are none in crowds: their parameters are biased until they are corrected by simulations
-    in which everybody reacts, and bounds are significant for laws that are true.
+    In crowds, only the latter count: laws of people contain simpler ones at bounds, such as the
+    circular force in ``esf``, to which an effect leads if they are true.
 
     Args:
         base: the calibrated model without effects.
         fit: the calibrated model with effects.
         cluster: ``(n,)`` see :class:`~nnode.diagnosis.residuals.engine.Engine`.
     """
+    required = required_beyond_bounds(fit, cluster)
     if base.domain == "crowd":
-        return set()
-    reached = _at_bounds(fit.system) - _at_bounds(base)
-    return reached | required_beyond_bounds(fit, cluster)
+        return required
+    return required | (_at_bounds(fit.system) - _at_bounds(base))
 
 
 def _at_bounds(system: System) -> set[str]:

@@ -96,7 +96,7 @@ class Effect(Term):
         settings: parameter name to :class:`Setting`.
         tried: one setting to its values, or one strength to its amounts, with one probe each. If
             empty, one probe has all strengths and the settings' default values.
-        of_drivers: whether the effect only describes differences between drivers.
+        of_drivers: whether the effect only describes differences between agents.
         acts_on: the part of a pedestrian law that it changes, ``force`` or ``drive``, see
             :class:`nnode.model.terms.Rule`; empty if it acts on every model.
         min_agents: smallest number of agents of a sequence in which it can be detected.

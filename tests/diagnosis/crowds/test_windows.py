@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -50,7 +51,7 @@ GAP[4] = np.nan
     [
         (Smoother, np.zeros((3, 1, 2)), "at least 4"),
         (Smoother, GAP, "no numbers"),
-        (Windows, np.zeros((4, 2, 2)), "longer sequences"),
+        (partial(Windows, window=1.5), np.zeros((4, 2, 2)), "longer sequences"),
     ],
 )
 def test_unusable_sequences_are_refused(
@@ -78,12 +79,12 @@ def test_windows_do_not_overlap() -> None:
 def test_windows_of_fast_and_slow_cameras(
     samples: int, dt: float, expected: tuple[int, int, float]
 ) -> None:
-    windows = Windows([track(np.zeros((samples, 2, 2)), dt=dt)])
+    windows = Windows([track(np.zeros((samples, 2, 2)), dt=dt)], 1.5)
     assert (windows.length, windows.sub, windows.step) == expected
 
 
 def test_short_sequences_are_used_beside_a_long_one() -> None:
     short = [track(np.zeros((8, 2, 2)), f"r/{i}") for i in range(10)]
-    windows = Windows([*short, track(np.zeros((40, 2, 2)), "r/long")])
+    windows = Windows([*short, track(np.zeros((40, 2, 2)), "r/long")], 1.5)
     assert windows.length == 8
     assert windows.used == list(range(11))

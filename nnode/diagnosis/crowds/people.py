@@ -1,0 +1,462 @@
+"""People who differ: their desired speeds, and the variances between them and over time.
+
+In each of a person's segments, the person is simulated alone among the measured and smoothed paths
+of the others. The desired speed and the relaxation time are those of the typical person times
+log-normal factors. With X the derivatives by the logarithm of the typical desired speed, the
+measured positions y are
+
+    y = f(theta, b) + X d + Z (b* - b) + e,    b* ~ N(0, Omega),
+
+where b are the deviations with which people are simulated, and e has the covariance of
+autocorrelated pushes, of measurement errors, and of errors of the smoothed states in which segments
+start. Pushes continue from one segment of a person to the next.
+
+Source: the statistical model is that of :mod:`nnode.population`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nnode.calibrate.parameters import ParameterVector
+from nnode.diagnosis.crowds.windows import Windows
+from nnode.diagnosis.eligibility import check_model
+from nnode.model.effects.base import Effect
+from nnode.model.expression import symbols
+from nnode.model.formula import crowd_of
+from nnode.model.laws import Law
+from nnode.model.system import Crowd, System
+from nnode.population.drivers import (
+    EXPLAINED,
+    LASTING,
+    LEAST_SPREAD,
+    LONG,
+    LONGEST,
+    MOST_SPREAD,
+    PUSH,
+    SHORT,
+    SPREAD,
+    START_POSITION,
+    START_SPEED,
+    TOLERANCE,
+)
+from nnode.population.estimate import Variances, fit_variances
+from nnode.population.intervals import variance_intervals, variation_rows
+from nnode.population.likelihood import (
+    ANEW,
+    CONTINUED,
+    Linearised,
+    Marginal,
+    RestartNoise,
+    Whitening,
+    marginal,
+)
+from nnode.simulation.alone import PersonAlone, RunAlone, Surroundings
+from nnode.simulation.linear import trapezoidal
+
+#: Smallest standard deviation of errors of positions, m. Simulators integrate differently.
+ERROR = 1e-3
+#: Largest difference between simulated and measured positions, m. Differences are clipped because
+#: contact forces may throw a person far away.
+LIMIT = 3.0
+#: Segments whose sum of squares Q is above this multiple q of the median m have less weight: the
+#: loss is q m (1 + log(Q / (q m))).
+OUTLYING = 2.0
+#: What pushes were is not carried into the next segment from segments with a smaller weight.
+ORDINARY = 0.5
+#: Segments are left out if a change of a start grows by more than this factor: people who touch
+#: make paths chaotic.
+GROWTH = 4.0
+#: Linearisations in which desired speeds, variances and weights are estimated.
+ROUNDS = 3
+#: Number of pairs of people in the largest intermediate result.
+CHUNK = 100_000
+#: Difference of the logarithm of desired speeds for derivatives.
+DIFFERENCE = 1e-3
+#: Smallest desired speed, m/s.
+SLOWEST = 0.05
+#: Name of the desired speed among the quantities in which people differ.
+DESIRED_SPEED = "desired_speed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrowdPopulation:
+    """People who differ, as estimated with a model.
+
+    Attributes:
+        system: the model.
+        random: names of the Q quantities in which people differ.
+        variances: the noise is that of :class:`~nnode.population.likelihood.RestartNoise`.
+        speed: ``(D,)`` desired speeds of the simulated people, m/s.
+        typical: logarithm of the typical one.
+        data: the measured paths of D people, linearised.
+        posterior: the marginal likelihood, and the deviations from the simulated people.
+        acceleration: root mean square of the smoothed accelerations, m/s².
+    """
+
+    system: System
+    random: list[str]
+    variances: Variances
+    speed: np.ndarray
+    typical: float
+    data: Linearised
+    posterior: Marginal
+    acceleration: float
+
+    @property
+    def has_speed(self) -> int:
+        """1 if people differ in their desired speeds, else 0."""
+        return int(DESIRED_SPEED in self.random)
+
+    @property
+    def explains_rates(self) -> bool:
+        """Whether pushes are small compared to measured accelerations, see
+        :data:`~nnode.population.drivers.EXPLAINED`. Otherwise they stand for a deviation of the
+        law."""
+        return float(self.variances.noise[0]) <= EXPLAINED * self.acceleration
+
+    @property
+    def plausible(self) -> bool:
+        """See :attr:`explains_rates`. Records are often too short to show how long pushes last."""
+        return self.explains_rates
+
+    @property
+    def price(self) -> float:
+        """Half the number of parameters times the logarithm of the number of people (BIC)."""
+        free = int(np.count_nonzero(self.variances.low < self.variances.high))
+        number = len(ParameterVector(self.system).row) + free
+        return number * math.log(max(len(self.speed), 2)) / 2
+
+    @property
+    def criterion(self) -> float:
+        """Log marginal likelihood minus :attr:`price`; the larger the better."""
+        return float(self.each.sum()) - self.price
+
+    @property
+    def each(self) -> np.ndarray:
+        """``(D,)`` terms of the log marginal likelihood, with the loss of outlying segments."""
+        assert self.data.weight is not None
+        lost = -OUTLYING / 2 * np.log(np.maximum(self.data.weight, 1e-12))
+        terms: np.ndarray = self.posterior.each - np.where(self.data.observed, lost, 0.0).sum(1)
+        return terms
+
+    def by_speed(self, by_deviation: np.ndarray) -> np.ndarray:
+        """``(D, K)`` m: the change of positions by the deviations with which people were simulated.
+        They have their own desired speeds, and their other parameters are typical."""
+        return _by_speed(by_deviation, self.random, self.speed, self.typical)
+
+
+def _by_speed(
+    by_deviation: np.ndarray, random: list[str], speed: np.ndarray, typical: float
+) -> np.ndarray:
+    if DESIRED_SPEED not in random:
+        return np.zeros(by_deviation.shape[:-1])
+    change: np.ndarray = by_deviation[..., 0] * (np.log(speed) - typical)[:, None]
+    return change
+
+
+def differing(system: System) -> list[str]:
+    """Names of the quantities in which people differ: the desired speed if the model contains it,
+    and positive parameters of its law that are in no sum over others or walls."""
+    assert isinstance(system, Crowd)
+    law = crowd_of([term for term in system.term_list if isinstance(term, Law)])
+    if law is None:
+        return []
+    in_sums = symbols([x for summands in law.sums.values() for x in summands.values()])
+    calibrated, limits = ParameterVector(system).parameters, system.bounds()
+    names = [
+        name
+        for symbol, (name, _, axes) in law.owned.items()
+        if axes is None
+        and name in calibrated
+        and limits[name].low >= 0
+        and symbol in symbols(law.rate)
+        and symbol not in in_sums
+    ]
+    has_speed = system.desired != "last" and "pace" in law.symbols
+    return [DESIRED_SPEED, *names] if has_speed else names
+
+
+def parameters_differ(system: System) -> bool:
+    """Whether people differ in parameters of the law besides their desired speeds."""
+    return system.domain == "crowd" and bool(set(differing(system)) - {DESIRED_SPEED})
+
+
+class People:
+    """The people of segments, simulated and linearised.
+
+    Args:
+        windows: their segments.
+
+    Attributes:
+        unit: ``(P,)`` number of the person of each of the P segments of single people.
+        pairs: of each person the sequence and the place in it.
+        speed: ``(D,)`` preferred speeds as measured, m/s.
+    """
+
+    def __init__(self, windows: Windows) -> None:
+        self.windows = windows
+        window, place = windows.person.T
+        pairs, first, unit = np.unique(
+            np.stack([windows.sequence[window], place], 1),
+            axis=0,
+            return_index=True,
+            return_inverse=True,
+        )
+        self.unit = unit.reshape(-1)
+        self.pairs = [(int(b), int(i)) for b, i in pairs]
+        # segments as places (person, number of the segment), in the order of time
+        self._place = self.unit, windows.number[window]
+        self._number = int(windows.number.max()) + 1
+        preferred = windows.batch.preferred
+        assert preferred is not None
+        speed = np.hypot(*preferred[window, place].numpy()[first].T)
+        self.speed = np.maximum(speed, SLOWEST)
+        dt = windows.sub * windows.step
+        velocity = windows.batch.v[:: 2 * windows.sub, window, place].numpy()
+        self.acceleration = float(np.sqrt(2 * np.mean(np.gradient(velocity, dt, axis=0) ** 2)))
+        self._last: tuple[np.ndarray, Surroundings] | None = None
+
+    @property
+    def noise(self) -> RestartNoise:
+        """The covariance of residuals."""
+        return RestartNoise(START_POSITION * self._error)
+
+    @property
+    def _error(self) -> float:
+        """Standard deviation of the errors of positions, m."""
+        return max(math.sqrt(self.windows.variance), ERROR)
+
+    def initial_variances(self, random: list[str]) -> Variances:
+        """Standard deviations and times where a search starts, and their bounds.
+
+        Args:
+            random: what differs.
+        """
+        windows, number = self.windows, len(random)
+        dt = windows.sub * windows.step
+        low_push, high_push, push = PUSH[2]
+        low_speed, high_speed, speed = START_SPEED
+        duration = dt * windows.length * self._number
+        short, long = SHORT * dt, max(LONG * duration, 2 * SHORT * dt)
+        noise = np.array([push, np.clip(LASTING, short, long), self._error, speed])
+        low, high = [low_push, short, self._error, low_speed], [high_push, long, self._error]
+        return Variances(
+            noise=noise,
+            spread=np.full(number, SPREAD),
+            start=np.zeros(0),
+            low=np.array([*low, *[LEAST_SPREAD] * number]),
+            high=np.array([*high, high_speed, *[MOST_SPREAD] * number]),
+        )
+
+    def estimated(
+        self,
+        system: System,
+        start: CrowdPopulation | None = None,
+        variances: Variances | None = None,
+    ) -> CrowdPopulation:
+        """Desired speeds, variances and weights of segments, with the parameters of a model.
+
+        Args:
+            start: where the search starts, if the same quantities differ.
+            variances: of people and of noise, if they are not estimated.
+        """
+        random, weight = differing(system), np.ones(len(self.unit))
+        speed, typical = self.speed, float(np.log(self.speed).mean())
+        present = self.initial_variances(random) if variances is None else variances
+        if start is not None and start.random == random:
+            speed, typical = start.speed, start.typical
+            present = start.variances if variances is None else variances
+        for round_ in range(ROUNDS):
+            data = self._linearised(system, random, speed, typical, weight)
+            if variances is None:
+                limit = _limit(random)
+                present = fit_variances(
+                    data, self.noise, present, tolerance=TOLERANCE, low=-limit, high=limit
+                )
+            posterior = self.posterior(data, random, present)
+            if round_ < ROUNDS - 1:
+                weight = self._weights(data, posterior, present)
+                if DESIRED_SPEED in random:
+                    typical += float(posterior.change[0])
+                    speed = np.maximum(np.exp(typical + posterior.deviations[:, 0]), SLOWEST)
+        return CrowdPopulation(
+            system=system,
+            random=random,
+            variances=present,
+            speed=speed,
+            typical=typical,
+            data=data,
+            posterior=posterior,
+            acceleration=self.acceleration,
+        )
+
+    def posterior(self, data: Linearised, random: list[str], variances: Variances) -> Marginal:
+        """The most likely deviations of people."""
+        products, limit = self.noise.products(data, variances.noise), _limit(random)
+        return marginal(data, products, variances.spread, variances.start, low=-limit, high=limit)
+
+    def variations(self, population: CrowdPopulation) -> dict[str, dict[str, Any]]:
+        """Rows of a table, see :func:`nnode.population.intervals.variation_rows`."""
+        limit, variances = _limit(population.random), population.variances
+        ends = variance_intervals(population.data, self.noise, variances, -limit, limit)
+        names = [name.rpartition(".")[2] for name in population.random]
+        shrinkage = population.posterior.shrinkage
+        return variation_rows(variances, self.noise, names, ends, shrinkage, "m/s²")
+
+    def whitening(self, data: Linearised, variances: Variances) -> Whitening:
+        """The inverse square root of the covariance."""
+        return Whitening(data, self.noise, variances.noise, variances.spread, variances.start)
+
+    def _weights(self, data: Linearised, posterior: Marginal, variances: Variances) -> np.ndarray:
+        """``(P,)`` weights of the segments, see :data:`OUTLYING`."""
+        assert data.weight is not None
+        residual = (data.residual - data.fixed @ posterior.change)[..., None]
+        white = self.segments(self.whitening(data, variances)(residual))[..., 0]
+        square = (white**2).sum(1) / self.segments(data.weight)[:, 0]
+        limit = OUTLYING * float(np.median(square[square > 0]))
+        weight: np.ndarray = limit / np.maximum(square, limit)
+        return weight
+
+    def _linearised(
+        self,
+        system: System,
+        random: list[str],
+        speed: np.ndarray,
+        typical: float,
+        weight: np.ndarray,
+    ) -> Linearised:
+        """The measured paths, linearised at desired speeds ``(D,)``.
+
+        Args:
+            weight: ``(P,)`` of the segments.
+        """
+        windows, row = self.windows, ParameterVector(system).row[None]
+        states = self.states(system, row, speed)
+        run = RunAlone(self.around(system, speed), system, states[:, 0])
+        stride, dt, times = windows.sub, windows.sub * windows.step, windows.length
+        # a free person's position changes by a unit with the first position, by the time with speed
+        growth = np.abs(run.by_start()) / np.repeat([1.0, dt * times], 2)
+        used = growth.max((1, 2, 3)) < GROWTH
+        matrices = trapezoidal(run.slopes[::stride], dt)
+        # there is no interval after the last sample of a segment
+        step, after = (
+            np.pad(part.numpy().swapaxes(0, 1), ((0, 0), (0, 1), (0, 0), (0, 0)))
+            for part in matrices
+        )
+        restart = np.zeros((len(self.pairs), self._number * times), dtype=np.int8)
+        ordinary = self.joined((used & (weight > ORDINARY))[:, None])
+        restart[:, ::times] = CONTINUED
+        restart[:, 0] = ANEW
+        restart[:, times::times][~ordinary[:, :-1]] = ANEW
+        fixed = self.joined(self._random_columns(system, run, random, speed))
+        residual = self.joined(self.differences(states)[0])
+        return Linearised(
+            residual=residual + _by_speed(fixed, random, speed, typical),
+            fixed=fixed,
+            random=np.arange(len(random)),
+            start=np.zeros((*residual.shape, 0)),
+            observed=self.joined(np.repeat(used[:, None], 2 * times, 1)),
+            agent=np.arange(len(self.pairs)),
+            step=self.joined(step)[:, :-1],
+            forced=self.joined(dt / 2 * after[..., 2:])[:, :-1],
+            restart=restart,
+            weight=self.joined(np.repeat(weight[:, None], 2 * times, 1)),
+            dt=dt,
+        )
+
+    def _random_columns(
+        self, system: System, run: RunAlone, random: list[str], speed: np.ndarray
+    ) -> np.ndarray:
+        """``(P, L, 2, Q)`` derivatives of positions by the logarithms of what differs."""
+        fields, names = list[Tensor](), ParameterVector(system).names
+        by_parameter = run.parameters(differences_of(system)) if random else []
+        for name in random:
+            if name == DESIRED_SPEED:
+                higher, lower = (
+                    run.accelerations(self._surroundings(system, speed * math.exp(change)))
+                    for change in (DIFFERENCE, -DIFFERENCE)
+                )
+                fields.append((higher - lower) / (2 * DIFFERENCE))
+            else:
+                value = float(system.get_parameter(name).detach())
+                fields.append(value * by_parameter[names.index(name)])
+        return run.displacements(fields)[:, :: self.windows.sub]
+
+    def joined(self, segments: np.ndarray) -> np.ndarray:
+        """``(D, W K, ...)``: people's W segments one after the other, from ``(P, K, ...)``; 0 where
+        a person has less. A segment's coordinates ``(P, L, 2, ...)`` are samples."""
+        samples = 2 * self.windows.length
+        if segments.ndim > 2 and segments.shape[1:3] == (self.windows.length, 2):
+            segments = segments.reshape(len(segments), samples, *segments.shape[3:])
+        joined = np.zeros((len(self.pairs), self._number, *segments.shape[1:]), segments.dtype)
+        joined[self._place] = segments
+        return joined.reshape(len(joined), self._number * segments.shape[1], *segments.shape[2:])
+
+    def segments(self, joined: np.ndarray) -> np.ndarray:
+        """``(P, 2 L, ...)`` from ``(D, W 2 L, ...)``, see :meth:`joined`."""
+        shape = len(joined), self._number, 2 * self.windows.length
+        segments: np.ndarray = joined.reshape(*shape, *joined.shape[2:])[self._place]
+        return segments
+
+    # -- simulation ------------------------------------------------------------------------
+
+    def states(self, system: System, rows: Tensor, speed: np.ndarray) -> Tensor:
+        """``(F, R, W, N, 4)`` simulated positions (m) and velocities (m/s) at the steps.
+
+        Args:
+            rows: ``(R, K)`` parameters. speed: ``(D,)`` desired speeds, m/s.
+        """
+        windows, around = self.windows, self.around(system, speed)
+        w, n = windows.batch.agent.shape
+        first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
+        states = []
+        for part in rows.split(max(1, CHUNK // (w * n * n))):
+            rhs = PersonAlone(around, system, ParameterVector(system).runs(part))
+            states.append(rhs.simulated(first, windows.steps))
+        return torch.cat(states, 1)
+
+    def differences(self, states: Tensor) -> np.ndarray:
+        """``(R, P, L, 2)`` m: measured minus simulated positions, of :meth:`states`."""
+        window, place = self.windows.person.T
+        x = states[:: self.windows.sub, :, window, place, :2]
+        measured = torch.from_numpy(self.windows.measured[:, window, place])
+        difference = (measured[:, None] - x).permute(1, 2, 0, 3)
+        limited = difference.nan_to_num(LIMIT, LIMIT, -LIMIT).clamp(-LIMIT, LIMIT)
+        return np.asarray(limited.numpy())
+
+    def around(self, system: System, speed: np.ndarray) -> Surroundings:
+        """The surroundings of people with desired speeds; the last ones are cached. All systems of
+        one diagnosis share walls, radii and masses."""
+        if self._last is None or not np.array_equal(self._last[0], speed):
+            self._last = speed, self._surroundings(system, speed)
+        return self._last[1]
+
+    def _surroundings(self, system: System, speed: np.ndarray) -> Surroundings:
+        check_model(system)
+        return self.windows.around(system, speed[self.unit])
+
+
+def differences_of(system: System) -> Sequence[float]:
+    """``(K,)``: finite differences of the parameters."""
+    differences = []
+    for name, p in ParameterVector(system).parameters.items():
+        _, place, key = name.split(".", 2)
+        term = system.terms[int(place)]
+        strength = term.strengths.get(key) if isinstance(term, Effect) else None
+        size = 1e-3 * max(1.0, float(p.detach().abs().max()))
+        differences += [size if strength is None else abs(strength.step)] * p.numel()
+    return differences
+
+
+def _limit(random: list[str]) -> np.ndarray:
+    """``(Q,)`` largest changes of typical values: only that of the desired speed is estimated with
+    the variances."""
+    return np.array([LONGEST if name == DESIRED_SPEED else 0.0 for name in random])
