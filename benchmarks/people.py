@@ -28,6 +28,7 @@ from benchmarks.discovery.run import sources
 from benchmarks.discovery.verdicts import verdicts
 from benchmarks.drivers import estimate_row
 from benchmarks.synthetic_cases.score import judged
+from nnode.app.python.inputs import model_options
 from nnode.diagnosis.options import DiscoverOptions
 from nnode.files import write_text
 from studies.runner import Task, run_tasks
@@ -223,7 +224,7 @@ def evaluate(laws: list[str] | None, **case: Any) -> dict[str, Any]:
         report = nnode.diagnose(
             crowds(**case),
             "crowd",
-            model={"name": "esf", "term": "esf", "desired": "exit"},
+            model={**model_options("esf"), "desired": "exit"},
             options=DiscoverOptions(page=False, replay=False, compare=laws),
             walls=walls,
         ).plain()
