@@ -168,7 +168,9 @@ def diagnose_law(
     division, engine = exploration.division, exploration.engine
     base_system, selection = exploration.base_system, exploration.selection
     notes += [division.note] if division.note else []
-    selection, imitations, law_at_bounds = _without_imitations(exploration, nearer, notes)
+    selection, imitations, law_at_bounds = _without_imitations(
+        exploration, nearer, notes, options.seed
+    )
     numbers = _clusters(exploration, options, len(effects))
     testable = numbers.exploration >= numbers.least_exploration
     stages.begin("confirming")
@@ -184,7 +186,7 @@ def diagnose_law(
     kinds = [effect for effect in offered if issubclass(effect, IndividualEffect)]
     individuals = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
     selection, unconfirmed = confirmation.confirmed(engine, selection)
-    law_at_bounds |= parameters_at_bounds(base_system, selection.fit, engine.cluster)
+    law_at_bounds |= parameters_at_bounds(base_system, selection.fit, engine, options.seed)
     unexplained = _unexplained(exploration, selection)
     assert selection.screen is not None
     power = PowerSimulation(
@@ -357,19 +359,20 @@ def _drivers(engine: Engine, fit: Fit, seed: int, notes: list[str]) -> list[Vari
 
 
 def _without_imitations(
-    exploration: _Exploration, nearer: BetterLaw | None, notes: list[str]
+    exploration: _Exploration, nearer: BetterLaw | None, notes: list[str], seed: int
 ) -> tuple[Selection, list[NamedEffect], set[str]]:
     """Remove effects that imitate another law; they become hypotheses. They are those that a
     better-fitting law does not need, and all if parameters of the diagnosed law end at bounds.
 
     Args:
         notes: the reason is added to them.
+        seed: of the simulations that estimate the bias of scores.
 
     Returns:
         The selection, the hypotheses, and the parameters at bounds.
     """
     engine, selection, division = exploration.engine, exploration.selection, exploration.division
-    law_at_bounds = parameters_at_bounds(exploration.base_system, selection.fit, engine.cluster)
+    law_at_bounds = parameters_at_bounds(exploration.base_system, selection.fit, engine, seed)
     steps = selection.steps if law_at_bounds else []
     if nearer is not None and selection.steps and not law_at_bounds:
         label = division.exploration.label

@@ -114,7 +114,7 @@ def test_effects_of_law_with_parameters_at_bounds_are_hypotheses(
 ) -> None:
     sequences, options, _ = hidden_reaction
     module = sys.modules[diagnose_law.__module__]
-    monkeypatch.setattr(module, "parameters_at_bounds", lambda base, fit, cluster: {"lin.L"})
+    monkeypatch.setattr(module, "parameters_at_bounds", lambda *arguments: {"lin.L"})
     d = diagnose_law(LAW, sequences, options).diagnosis
     assert (d.verdict, d.effects, d.law_at_bounds) == ("unknown", [], ["lin.L"])
     assert [effect.name for effect in d.hypotheses] == ["relative_speed"]

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from nnode.population.likelihood import Linearised, Marginal, PushNoise, marginal
+from nnode.population.likelihood import (
+    ANEW,
+    CONTINUED,
+    UNKNOWN,
+    Linearised,
+    Marginal,
+    PushNoise,
+    RestartNoise,
+    marginal,
+)
 
 #: Pushes: standard deviation and correlation time (s); sampling interval, s; measurement error, m.
 SIGMA, TAU, DT, ERROR = 0.4, 1.7, 0.2, 0.05
 #: Standard deviations of the random effects and of the starts.
 SPREAD, START = np.array([0.3, 0.7]), np.array([0.2])
+#: Standard deviation of positions where simulated paths restart, m.
+POSITION = 0.15
 
 
 def example(seed: int, states: int, leader: tuple[float, float] = (0.0, 1.0)) -> Linearised:
@@ -139,3 +152,81 @@ def test_bounded_change_maximises_the_likelihood() -> None:
     values = [marginal(data, products, SPREAD, START, low=c, high=c).loglik for c in fixed]
     assert values[1] == pytest.approx(bounded.loglik)
     assert max(values) == values[1] < free.loglik
+
+
+def restarting(seed: int) -> Linearised:
+    """Two people in two dimensions, each with three segments of four times; the second person's
+    last segment is missing."""
+    rng = np.random.default_rng(seed)
+    people, times = 2, 12
+    step = 0.9 * np.eye(4) + 0.05 * rng.normal(size=(people, times - 1, 4, 4))
+    restart = np.zeros((people, times), dtype=np.int8)
+    restart[:, [0, 8]], restart[:, 4] = ANEW, CONTINUED
+    observed = np.ones((people, 2 * times), dtype=bool)
+    observed[1, 16:] = False
+    observed[0, 5] = False
+    return Linearised(
+        residual=rng.normal(size=(people, 2 * times)),
+        fixed=rng.normal(size=(people, 2 * times, 3)),
+        random=np.array([2, 0]),
+        start=np.zeros((people, 2 * times, 0)),
+        observed=observed,
+        agent=np.array([0, 1]),
+        step=step,
+        forced=rng.normal(size=(people, times - 1, 4, 2)),
+        restart=restart,
+        weight=np.ones((people, 2 * times)),
+        dt=DT,
+    )
+
+
+def restarting_covariance(data: Linearised, person: int, speed: float) -> np.ndarray:
+    """The dense covariance of a person's samples, from independent numbers of variance 1."""
+    assert data.step is not None
+    assert data.forced is not None
+    assert data.restart is not None
+    times, keep = len(data.restart[person]), np.exp(-DT / TAU)
+    numbers = iter(np.eye(10 * times))
+
+    def drawn(deviations: list[float]) -> np.ndarray:
+        return np.array([deviation * next(numbers) for deviation in deviations])
+
+    d, e, rows = np.zeros((4, 10 * times)), drawn([SIGMA] * 2), []
+    for k in range(times):
+        if k:
+            before = e
+            e = keep * e + drawn([SIGMA * np.sqrt(1 - keep**2)] * 2)
+            d = data.step[person, k - 1] @ d + data.forced[person, k - 1] @ (before + e)
+        if data.restart[person, k]:
+            d = drawn([POSITION] * 2 + [speed] * 2)
+        if data.restart[person, k] == ANEW:
+            e = drawn([UNKNOWN] * 2)
+        rows += list(d[:2])
+    map_ = np.array(rows)
+    random = data.by_deviation[person] * SPREAD
+    covariance: np.ndarray = map_ @ map_.T + ERROR**2 * np.eye(len(map_)) + random @ random.T
+    return covariance
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_filter_with_restarts_equals_a_dense_gaussian(seed: int) -> None:
+    data, values = restarting(seed), np.array([SIGMA, TAU, ERROR, 0.3])
+    products = RestartNoise(POSITION).products(data, values)
+    zero = np.zeros(3)
+    result = marginal(data, products, SPREAD, np.zeros(0), low=zero, high=zero)
+    for person in range(2):
+        seen = data.observed[person]
+        matrix = restarting_covariance(data, person, 0.3)[np.ix_(seen, seen)]
+        gaussian = multivariate_normal(np.zeros(seen.sum()), matrix)
+        expected = gaussian.logpdf(data.residual[person, seen])
+        assert result.each[person] == pytest.approx(expected, abs=1e-8)
+
+
+def test_weights_scale_whitened_samples() -> None:
+    data, noise = restarting(5), RestartNoise(POSITION)
+    values = np.array([SIGMA, TAU, ERROR, 0.3])
+    weight = np.repeat([1.0, 0.25, 0.5], 8)[None].repeat(2, 0)
+    plain = noise.whitened(data, data.columns, values)
+    weighted = noise.whitened(replace(data, weight=weight), data.columns, values)
+    np.testing.assert_allclose(weighted[0], np.sqrt(weight)[..., None] * plain[0])
+    np.testing.assert_array_equal(weighted[1], plain[1])

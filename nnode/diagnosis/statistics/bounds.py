@@ -9,31 +9,40 @@ Source: Silvey 1959 (the Lagrange multiplier test).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from nnode.calibrate.intervals import at_bounds
 from nnode.data.clusters import better, group_sums
 from nnode.diagnosis import thresholds
+from nnode.diagnosis.residuals.engine import Engine
 from nnode.diagnosis.residuals.fit import Fit
+from nnode.diagnosis.statistics.bias import simulated_fits
 from nnode.diagnosis.statistics.leverage import leverage_adjusted, orthonormal, without_span
 from nnode.model.system import System
 from nnode.model.term import physical_bounds
 
 
-def parameters_at_bounds(base: System, fit: Fit, cluster: np.ndarray) -> set[str]:
+def parameters_at_bounds(base: System, fit: Fit, engine: Engine, seed: int) -> set[str]:
     """Names of the law's parameters whose bounds show that the law is wrong: those that are at
     bounds only with the effects, and those for which values beyond are required.
 
     In crowds, only the latter count: laws of people contain simpler ones at bounds, such as the
-    circular force in ``esf``, to which an effect leads if they are true.
+    circular force in ``esf``, to which an effect leads if they are true. There they must also be
+    required without the bias of the scores, because people react to each other.
 
     Args:
         base: the calibrated model without effects.
         fit: the calibrated model with effects.
-        cluster: ``(n,)`` see :class:`~nnode.diagnosis.residuals.engine.Engine`.
+        engine: of the residuals.
+        seed: of the simulations that estimate the bias.
     """
-    required = required_beyond_bounds(fit, cluster)
+    required = required_beyond_bounds(fit, engine.cluster)
     if base.domain == "crowd":
+        if required:
+            simulated = [each for _, each in simulated_fits(engine, fit, seed)]
+            required &= required_beyond_bounds(fit, engine.cluster, simulated)
         return required
     return required | (_at_bounds(fit.system) - _at_bounds(base))
 
@@ -50,7 +59,9 @@ def _at_bounds(system: System) -> set[str]:
     }
 
 
-def required_beyond_bounds(fit: Fit, cluster: np.ndarray) -> set[str]:
+def required_beyond_bounds(
+    fit: Fit, cluster: np.ndarray, simulated: Sequence[Fit] = ()
+) -> set[str]:
     """Names of the law's parameters at bounds with a significant score toward values beyond.
 
     The one-sided p-value by sign flips of clusters, multiplied by the number of these parameters,
@@ -59,6 +70,7 @@ def required_beyond_bounds(fit: Fit, cluster: np.ndarray) -> set[str]:
     Args:
         fit: a calibrated model, whose first term is the law.
         cluster: ``(n,)`` see :class:`~nnode.diagnosis.residuals.engine.Engine`.
+        simulated: the same model in its own simulated paths, whose mean scores are subtracted.
     """
     held = [
         k
@@ -74,9 +86,18 @@ def required_beyond_bounds(fit: Fit, cluster: np.ndarray) -> set[str]:
     outward = np.sign(columns.T @ fit.residual)
     columns = outward * without_span(columns, basis)
     scores = group_sums(columns * residual[:, None], cluster)
+    biases = [_scores(each, fit.free, held, cluster) for each in simulated]
+    if biases:
+        scores = scores - outward * np.mean(biases, 0)
     law = fit.system.term_list[0].name
     return {
         f"{law}.{fit.names[k].removeprefix('terms.0.')}"
         for k, score in zip(held, scores.T, strict=True)
         if len(held) * better(score) <= thresholds.STRICT
     }
+
+
+def _scores(fit: Fit, free: np.ndarray, held: list[int], cluster: np.ndarray) -> np.ndarray:
+    """``(G, H)`` scores of parameters that are held, by cluster."""
+    columns = without_span(fit.jacobian[:, held], orthonormal(fit.jacobian[:, free]))
+    return group_sums(columns, cluster, fit.residual)

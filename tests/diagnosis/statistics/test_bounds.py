@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -13,6 +17,7 @@ from tests.diagnosis.platoons import lin
 CLUSTERS, SIZE = 24, 20
 NAMES = ["terms.0.v0", "terms.0.L"]
 CLUSTER = np.repeat(np.arange(CLUSTERS), SIZE)
+ENGINE: Any = SimpleNamespace(cluster=CLUSTER)
 
 
 def at_a_bound(seed: int, beyond: float, side: int = 1) -> Fit:
@@ -53,11 +58,20 @@ def test_effects_and_free_parameters_are_ignored() -> None:
 
 def test_bounds_reached_with_effects_only() -> None:
     fit = at_a_bound(0, -0.3)
-    assert parameters_at_bounds(fit.system, fit, CLUSTER) == set()
+    assert parameters_at_bounds(fit.system, fit, ENGINE, 0) == set()
     base, people = lin(), lin()
     people.domain = "crowd"
     with torch.no_grad():
         fit.system.terms[0].L.fill_(base.terms[0].bounds["L"].low)
-    assert parameters_at_bounds(base, fit, CLUSTER) == {"lin.L"}
-    assert parameters_at_bounds(people, fit, CLUSTER) == set()
-    assert parameters_at_bounds(fit.system, fit, CLUSTER) == set()
+    assert parameters_at_bounds(base, fit, ENGINE, 0) == {"lin.L"}
+    assert parameters_at_bounds(people, fit, ENGINE, 0) == set()
+    assert parameters_at_bounds(fit.system, fit, ENGINE, 0) == set()
+
+
+def test_mean_scores_of_simulated_paths_are_subtracted() -> None:
+    """The same fit as its own simulation has the same bias."""
+    fit = at_a_bound(0, 0.3)
+    assert required_beyond_bounds(fit, CLUSTER) == {"lin.L"}
+    assert required_beyond_bounds(fit, CLUSTER, [fit]) == set()
+    unbiased = replace(fit, residual=np.zeros_like(fit.residual))
+    assert required_beyond_bounds(fit, CLUSTER, [unbiased, unbiased]) == {"lin.L"}
