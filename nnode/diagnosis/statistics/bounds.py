@@ -79,16 +79,11 @@ def required_beyond_bounds(
     ]
     if not held:
         return set()
-    basis = orthonormal(fit.tangents)
-    residual = leverage_adjusted(fit.residual, basis, cluster)
-    columns = fit.jacobian[:, held]
+    scores = _scores(fit, fit.free, held, cluster)
+    if simulated:
+        scores = scores - np.mean([_scores(each, fit.free, held, cluster) for each in simulated], 0)
     # the cost falls against the gradient
-    outward = np.sign(columns.T @ fit.residual)
-    columns = outward * without_span(columns, basis)
-    scores = group_sums(columns * residual[:, None], cluster)
-    biases = [_scores(each, fit.free, held, cluster) for each in simulated]
-    if biases:
-        scores = scores - outward * np.mean(biases, 0)
+    scores = scores * np.sign(fit.jacobian[:, held].T @ fit.residual)
     law = fit.system.term_list[0].name
     return {
         f"{law}.{fit.names[k].removeprefix('terms.0.')}"
@@ -99,5 +94,6 @@ def required_beyond_bounds(
 
 def _scores(fit: Fit, free: np.ndarray, held: list[int], cluster: np.ndarray) -> np.ndarray:
     """``(G, H)`` scores of parameters that are held, by cluster."""
-    columns = without_span(fit.jacobian[:, held], orthonormal(fit.jacobian[:, free]))
-    return group_sums(columns, cluster, fit.residual)
+    basis = orthonormal(fit.jacobian[:, free])
+    residual = leverage_adjusted(fit.residual, basis, cluster)
+    return group_sums(without_span(fit.jacobian[:, held], basis) * residual[:, None], cluster)
