@@ -1,1 +1,1 @@
-"""The engine of crowds: residuals on short windows with every person simulated alone."""
+"""The engine of crowds: people who differ, each simulated alone in windows of time."""

@@ -1,7 +1,7 @@
 """Engine of crowds: residuals of people who differ, each among the measured paths of the others.
 
 In a crowd, errors of one person's simulated path would propagate to all. Therefore sequences are
-cut into segments, and in each of them every person is simulated alone. With the notation of
+cut into windows, and in each of them every person is simulated alone. With the notation of
 :mod:`nnode.diagnosis.crowds.people`, the residuals of a model are
 
     V^(-1/2) (y - f(theta, b) + Z b)
@@ -41,7 +41,7 @@ from nnode.model.term import State
 from nnode.population.drivers import ROUGH
 from nnode.simulation.alone import PersonAlone, RunAlone
 
-#: Length of segments, s.
+#: Length of windows, s.
 SECONDS = 2.0
 #: Antithetic pairs of simulated crowds that estimate the bias of parameters.
 PAIRS = 3
@@ -56,19 +56,19 @@ class CrowdEngine:
 
     Args:
         sequences: of people, equally sampled.
-        window: length of a segment, s.
+        window: length of a window, s.
         clusters: ``(S,)`` of the sequences; None: each is one.
 
     Attributes:
         batch: the sequences.
         sequence: ``(n,)`` position of each residual's sequence in the batch.
-        clock: ``(n,)`` start time of its segment, s.
+        clock: ``(n,)`` start time of its window, s.
         unit: ``(n,)`` number of its person, counted through all sequences.
         people: of each unit the sequence and the place of the person.
         population: the last estimate; None before.
 
     Raises:
-        DataError: sequences too short for a segment, or positions that are no numbers.
+        DataError: sequences too short for a window, or positions that are no numbers.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class CrowdEngine:
         return removes_enough(self, before, after, square)
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
-        """The segments in sequence, with the deviations of :meth:`squares`."""
+        """The windows in sequence, with the deviations of :meth:`squares`."""
         difference, length = self._errors(system, row), self.windows.length
         simulations: list[Simulation | None] = [None] * len(self.sequences)
         for i in self.windows.used:
@@ -148,8 +148,7 @@ class CrowdEngine:
     def noise_floor(self) -> float:
         """Mean square error of positions due to measurement noise, summed over both coordinates,
         m²."""
-        length = self.windows.length
-        return 2 * self.windows.variance * (1 - 2 / length)
+        return 2 * self.windows.variance
 
     def fit_whitening(self, system: System, row: Tensor) -> None:
         """Estimate desired speeds, variances and weights, with the model's parameters.
@@ -165,7 +164,7 @@ class CrowdEngine:
         """Whiten residuals by an estimate."""
         self.population, self._run, data = population, None, population.data
         self._whitening = self._people.whitening(data, population.variances)
-        common = self._people.segments(self._whitening(data.fixed[..., : population.has_speed]))
+        common = self._people.parted(self._whitening(data.fixed[..., : population.has_speed]))
         self._common = np.linalg.qr(common.reshape(len(self.unit), population.has_speed))[0]
 
     def population_of(self, system: System) -> CrowdPopulation:
@@ -380,12 +379,12 @@ class CrowdEngine:
         data = replace(population.data, residual=difference + population.by_speed(fixed))
         posterior = people.posterior(data, population.random, population.variances)
         deviations = posterior.change + posterior.deviations
-        errors = people.segments(data.residual - (fixed * deviations[:, None]).sum(-1))
+        errors = people.parted(data.residual - (fixed * deviations[:, None]).sum(-1))
         return errors.reshape(len(errors), -1, 2)
 
     def _whitened(self, columns: np.ndarray) -> Tensor:
         """``(C, n)`` of columns ``(D, K, C)``."""
-        white = self._people.segments(self._whitening(columns))
+        white = self._people.parted(self._whitening(columns))
         flat = white.reshape(-1, white.shape[-1])
         return torch.from_numpy(flat - self._common @ (self._common.T @ flat)).T
 

@@ -1,6 +1,6 @@
 """People who differ: their desired speeds, and the variances between them and over time.
 
-In each of a person's segments, the person is simulated alone among the measured and smoothed paths
+In each of a person's windows, the person is simulated alone among the measured and smoothed paths
 of the others. The desired speed and the relaxation time are those of the typical person times
 log-normal factors. With X the derivatives by the logarithm of the typical desired speed, the
 measured positions y are
@@ -8,8 +8,8 @@ measured positions y are
     y = f(theta, b) + X d + Z (b* - b) + e,    b* ~ N(0, Omega),
 
 where b are the deviations with which people are simulated, and e has the covariance of
-autocorrelated pushes, of measurement errors, and of errors of the smoothed states in which segments
-start. Pushes continue from one segment of a person to the next.
+autocorrelated pushes, of measurement errors, and of errors of the smoothed states in which windows
+start. Pushes continue from one window of a person to the next.
 
 Source: the statistical model is that of :mod:`nnode.population`.
 """
@@ -66,12 +66,12 @@ ERROR = 1e-3
 #: Largest difference between simulated and measured positions, m. Differences are clipped because
 #: contact forces may throw a person far away.
 LIMIT = 3.0
-#: Segments whose sum of squares Q is above this multiple q of the median m have less weight: the
+#: Windows whose sum of squares Q is above this multiple q of the median m have less weight: the
 #: loss is q m (1 + log(Q / (q m))).
 OUTLYING = 2.0
-#: What pushes were is not carried into the next segment from segments with a smaller weight.
+#: What pushes were is not carried into the next window from windows with a smaller weight.
 ORDINARY = 0.5
-#: Segments are left out if a change of a start grows by more than this factor: people who touch
+#: Windows are left out if a change of a start grows by more than this factor: people who touch
 #: make paths chaotic.
 GROWTH = 4.0
 #: Linearisations in which desired speeds, variances and weights are estimated.
@@ -141,7 +141,7 @@ class CrowdPopulation:
 
     @property
     def each(self) -> np.ndarray:
-        """``(D,)`` terms of the log marginal likelihood, with the loss of outlying segments."""
+        """``(D,)`` terms of the log marginal likelihood, with the loss of outlying windows."""
         assert self.data.weight is not None
         lost = -OUTLYING / 2 * np.log(np.maximum(self.data.weight, 1e-12))
         terms: np.ndarray = self.posterior.each - np.where(self.data.observed, lost, 0.0).sum(1)
@@ -190,13 +190,13 @@ def parameters_differ(system: System) -> bool:
 
 
 class People:
-    """The people of segments, simulated and linearised.
+    """The people of windows, simulated and linearised.
 
     Args:
-        windows: their segments.
+        windows: their windows.
 
     Attributes:
-        unit: ``(P,)`` number of the person of each of the P segments of single people.
+        unit: ``(P,)`` number of the person of each of the P windows of single people.
         pairs: of each person the sequence and the place in it.
         speed: ``(D,)`` preferred speeds as measured, m/s.
     """
@@ -212,7 +212,7 @@ class People:
         )
         self.unit = unit.reshape(-1)
         self.pairs = [(int(b), int(i)) for b, i in pairs]
-        # segments as places (person, number of the segment), in the order of time
+        # windows as places (person, number of the window), in the order of time
         self._place = self.unit, windows.number[window]
         self._number = int(windows.number.max()) + 1
         preferred = windows.batch.preferred
@@ -262,7 +262,7 @@ class People:
         start: CrowdPopulation | None = None,
         variances: Variances | None = None,
     ) -> CrowdPopulation:
-        """Desired speeds, variances and weights of segments, with the parameters of a model.
+        """Desired speeds, variances and weights of windows, with the parameters of a model.
 
         Args:
             start: where the search starts, if the same quantities differ.
@@ -316,11 +316,11 @@ class People:
         return Whitening(data, self.noise, variances.noise, variances.spread, variances.start)
 
     def _weights(self, data: Linearised, posterior: Marginal, variances: Variances) -> np.ndarray:
-        """``(P,)`` weights of the segments, see :data:`OUTLYING`."""
+        """``(P,)`` weights of the windows, see :data:`OUTLYING`."""
         assert data.weight is not None
         residual = (data.residual - data.fixed @ posterior.change)[..., None]
-        white = self.segments(self.whitening(data, variances)(residual))[..., 0]
-        square = (white**2).sum(1) / self.segments(data.weight)[:, 0]
+        white = self.parted(self.whitening(data, variances)(residual))[..., 0]
+        square = (white**2).sum(1) / self.parted(data.weight)[:, 0]
         limit = OUTLYING * float(np.median(square[square > 0]))
         weight: np.ndarray = limit / np.maximum(square, limit)
         return weight
@@ -336,7 +336,7 @@ class People:
         """The measured paths, linearised at desired speeds ``(D,)``.
 
         Args:
-            weight: ``(P,)`` of the segments.
+            weight: ``(P,)`` of the windows.
         """
         windows, row = self.windows, ParameterVector(system).row[None]
         states = self.states(system, row, speed)
@@ -346,7 +346,7 @@ class People:
         growth = np.abs(run.by_start()) / np.repeat([1.0, dt * times], 2)
         used = growth.max((1, 2, 3)) < GROWTH
         matrices = trapezoidal(run.slopes[::stride], dt)
-        # there is no interval after the last sample of a segment
+        # there is no interval after the last sample of a window
         step, after = (
             np.pad(part.numpy().swapaxes(0, 1), ((0, 0), (0, 1), (0, 0), (0, 0)))
             for part in matrices
@@ -390,21 +390,21 @@ class People:
                 fields.append(value * by_parameter[names.index(name)])
         return run.displacements(fields)[:, :: self.windows.sub]
 
-    def joined(self, segments: np.ndarray) -> np.ndarray:
-        """``(D, W K, ...)``: people's W segments one after the other, from ``(P, K, ...)``; 0 where
-        a person has less. A segment's coordinates ``(P, L, 2, ...)`` are samples."""
+    def joined(self, values: np.ndarray) -> np.ndarray:
+        """``(D, W K, ...)``: people's W windows one after the other, from ``(P, K, ...)``; 0 where
+        a person has less. A window's coordinates ``(P, L, 2, ...)`` are samples."""
         samples = 2 * self.windows.length
-        if segments.ndim > 2 and segments.shape[1:3] == (self.windows.length, 2):
-            segments = segments.reshape(len(segments), samples, *segments.shape[3:])
-        joined = np.zeros((len(self.pairs), self._number, *segments.shape[1:]), segments.dtype)
-        joined[self._place] = segments
-        return joined.reshape(len(joined), self._number * segments.shape[1], *segments.shape[2:])
+        if values.ndim > 2 and values.shape[1:3] == (self.windows.length, 2):
+            values = values.reshape(len(values), samples, *values.shape[3:])
+        joined = np.zeros((len(self.pairs), self._number, *values.shape[1:]), values.dtype)
+        joined[self._place] = values
+        return joined.reshape(len(joined), self._number * values.shape[1], *values.shape[2:])
 
-    def segments(self, joined: np.ndarray) -> np.ndarray:
+    def parted(self, joined: np.ndarray) -> np.ndarray:
         """``(P, 2 L, ...)`` from ``(D, W 2 L, ...)``, see :meth:`joined`."""
         shape = len(joined), self._number, 2 * self.windows.length
-        segments: np.ndarray = joined.reshape(*shape, *joined.shape[2:])[self._place]
-        return segments
+        values: np.ndarray = joined.reshape(*shape, *joined.shape[2:])[self._place]
+        return values
 
     # -- simulation ------------------------------------------------------------------------
 

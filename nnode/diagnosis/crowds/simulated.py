@@ -1,7 +1,7 @@
 """Simulations of a calibrated crowd in which everybody reacts, for estimates of bias.
 
 People are simulated among the measured paths of the others. But the others have reacted to the
-person's actual path, including disturbances, and the starts of segments are smoothed. Both bias
+person's actual path, including disturbances, and the starts of windows are smoothed. Both bias
 scores and parameters. The bias is estimated from crowds that the calibrated model simulates with
 all interactions. Their disturbances are the accelerations that the model does not explain in the
 measured paths, with a random sign for each person.

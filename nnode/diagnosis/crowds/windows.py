@@ -1,4 +1,4 @@
-"""Short windows in which every person is simulated alone among the others' measured paths."""
+"""Windows of time, in which every person is simulated among the measured paths of the others."""
 
 from __future__ import annotations
 

@@ -247,12 +247,13 @@ def test_person_who_jumps_has_small_weight(plain: list[Sequence]) -> None:
     engine.fit_whitening(model(), ROW)
     weight = engine._fitted(model(), ROW).data.weight
     assert weight is not None
-    weight = engine._people.segments(weight)[:, 0]
+    weight = engine._people.parted(weight)[:, 0]
     place = {(int(w), int(i)): k for k, (w, i) in enumerate(engine.windows.person)}
     assert weight[place[0, 3]] < 0.1
     assert np.median(weight) > 0.8
 
 
+@pytest.mark.thorough
 def test_bias_is_that_of_calibrations_to_simulated_crowds() -> None:
     engine, system = CrowdEngine(people_who_differ(3)), with_speeds()
     fit = converged_fit(engine, system, rounds=1)
@@ -373,6 +374,7 @@ def walls(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
     return np.stack([0 * low, low - high], -1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("extra", "name", "true"),
     [
