@@ -277,7 +277,7 @@ class Variation:
     """A standard deviation, or a correlation time, of a mixed-effects model.
 
     Attributes:
-        name: a parameter that differs between drivers, in % of the typical driver's; ``push``: of
+        name: a parameter that differs between agents, in % of the typical agent's; ``push``: of
             disturbances of the highest rate; ``push_time``: their correlation time;
             ``measurement``: of errors of positions; ``lasting_error``, ``lasting_error_time``: of
             their autocorrelated part, if there is one.

@@ -177,7 +177,7 @@ class CrowdEngine:
         """
         engine = copy.copy(self)
         engine.population = None
-        fitted, best = copy.deepcopy(system), None
+        fitted, best = refine(engine, copy.deepcopy(system)).system, None
         for _ in range(ALTERNATIONS):
             engine.fit_whitening(fitted, ParameterVector(fitted).row)
             present = engine.population
@@ -203,9 +203,8 @@ class CrowdEngine:
     def with_usual_variances(self, system: System) -> CrowdEngine:
         """An engine with the variances where searches start. The variances of a model that lacks a
         strong effect attribute it to pushes, and would hide where it acts."""
-        engine, random = copy.copy(self), self._fitted(system, ParameterVector(system).row).random
-        usual = self._people.initial_variances(random)
-        engine.set_population(self._people.estimated(system, self.population, usual))
+        engine = copy.copy(self)
+        engine.set_population(self._people.usual(system, self.population))
         return engine
 
     def regression_start(self, system: System) -> System:
@@ -362,8 +361,10 @@ class CrowdEngine:
         return self._people.speed if self.population is None else self.population.speed
 
     def _fitted(self, system: System, row: Tensor) -> CrowdPopulation:
+        """The last estimate; at first that with usual variances. Those of a model that is not yet
+        calibrated would attribute its errors to pushes, and no parameters would be better."""
         if self.population is None:
-            self.fit_whitening(system, row)
+            self.set_population(self._people.usual(with_parameters(system, row)))
         assert self.population is not None
         return self.population
 
@@ -376,10 +377,13 @@ class CrowdEngine:
         people, population = self._people, self._fitted(system, row)
         fixed = population.data.fixed
         difference = people.joined(people.differences(self._states(system, row[None]))[0])
-        data = replace(population.data, residual=difference + population.by_speed(fixed))
+        by_speed = np.where(population.data.observed, population.by_speed(fixed), 0.0)
+        data = replace(population.data, residual=difference + by_speed)
         posterior = people.posterior(data, population.random, population.variances)
-        deviations = posterior.change + posterior.deviations
-        errors = people.parted(data.residual - (fixed * deviations[:, None]).sum(-1))
+        deviations = (posterior.change + posterior.deviations)[:, None]
+        # where paths are chaotic, nothing is known of the deviations
+        explained = np.where(data.observed, (fixed * deviations).sum(-1), 0.0)
+        errors = people.parted(data.residual - explained)
         return errors.reshape(len(errors), -1, 2)
 
     def _whitened(self, columns: np.ndarray) -> Tensor:

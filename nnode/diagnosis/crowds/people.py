@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -277,10 +277,7 @@ class People:
         for round_ in range(ROUNDS):
             data = self._linearised(system, random, speed, typical, weight)
             if variances is None:
-                limit = _limit(random)
-                present = fit_variances(
-                    data, self.noise, present, tolerance=TOLERANCE, low=-limit, high=limit
-                )
+                present = self._fitted(data, random, present)
             posterior = self.posterior(data, random, present)
             if round_ < ROUNDS - 1:
                 weight = self._weights(data, posterior, present)
@@ -297,6 +294,29 @@ class People:
             posterior=posterior,
             acceleration=self.acceleration,
         )
+
+    def _fitted(self, data: Linearised, random: list[str], start: Variances) -> Variances:
+        """The most likely variances, from several correlation times of pushes: the likelihood has
+        maxima at short and at long ones."""
+        limit, fits = _limit(random), list[tuple[float, Variances]]()
+        short, long = start.low[1], start.high[1]
+        for time in (start.noise[1], short, long):
+            noise = start.noise.copy()
+            noise[1] = np.clip(time, 1.1 * short, long / 1.1)
+            fit = fit_variances(
+                data,
+                self.noise,
+                replace(start, noise=noise),
+                tolerance=TOLERANCE,
+                low=-limit,
+                high=limit,
+            )
+            fits.append((self.posterior(data, random, fit).loglik, fit))
+        return max(fits, key=lambda each: each[0])[1]
+
+    def usual(self, system: System, start: CrowdPopulation | None = None) -> CrowdPopulation:
+        """The estimate with the variances where searches start."""
+        return self.estimated(system, start, self.initial_variances(differing(system)))
 
     def posterior(self, data: Linearised, random: list[str], variances: Variances) -> Marginal:
         """The most likely deviations of people."""

@@ -155,9 +155,9 @@ def _agents(d: Diagnosis) -> list[Block]:
     """The differences between agents, in addition to population effects."""
     blocks: list[Block] = []
     if d.drivers:
-        blocks = [tables.drivers_table(d)]
-    elif d.agents:
-        blocks = [tables.agents_table(d)]
+        blocks.append(tables.drivers_table(d))
+    if d.agents:
+        blocks.append(tables.agents_table(d))
         if any(estimate.later for estimate in d.agents):
             blocks.append(tables.later_table(d))
     return blocks

@@ -81,8 +81,8 @@ _CRITERIA = {
     ),
     "likelihood": (
         "likelihood below the best (%)",
-        "*Likelihood*: of one measured position, geometric mean. All parameters of a law "
-        "may differ between drivers, and the number of parameters is penalised (BIC).",
+        "*Likelihood*: of one measured position, geometric mean. Parameters of a law may differ "
+        "between agents, and the number of parameters is penalised (BIC).",
     ),
 }
 
@@ -181,16 +181,20 @@ _VARIATIONS = {
     "measurement": "measurement error of positions",
     "lasting_error": "autocorrelated measurement error of positions",
     "lasting_error_time": "correlation time of this error",
+    "start_speed": "error of smoothed speeds",
 }
+#: What agents are called.
+_AGENTS = {"traffic": ("driver", "drivers"), "crowd": ("person", "people")}
 
 
 def drivers_table(d: Diagnosis) -> TableBlock:
-    """Variances between drivers and over time."""
+    """Variances between agents and over time."""
+    agent, agents = _AGENTS[d.domain]
     return _table(
         "drivers",
         [
             {
-                "quantity": _VARIATIONS.get(row.name, f"{row.name} between drivers"),
+                "quantity": _VARIATIONS.get(row.name, f"{row.name} between {agents}"),
                 "estimate": amount(row.estimate),
                 "95 % interval": "not estimable"
                 if math.isnan(row.lower)
@@ -200,11 +204,11 @@ def drivers_table(d: Diagnosis) -> TableBlock:
             }
             for row in d.drivers
         ],
-        "Standard deviations between drivers and over time, estimated together with the law. "
-        "Parameters that are not listed do not differ significantly between drivers. The process "
-        "noise acts on speeds (laws of first order) or accelerations (second order). "
-        "*Posterior variance*: of a driver's parameter, relative to the variance between drivers "
-        "(median).",
+        f"Standard deviations between {agents} and over time, estimated together with the law. "
+        f"No differences between {agents} were found, or sought, in parameters that are not "
+        "listed. The process noise acts on speeds (laws of first order) or accelerations (second "
+        f"order). *Posterior variance*: of the parameter of a {agent}, relative to the variance "
+        f"between {agents} (median).",
     )
 
 
