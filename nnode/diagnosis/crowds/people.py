@@ -341,6 +341,8 @@ class People:
         residual = (data.residual - data.fixed @ posterior.change)[..., None]
         white = self.parted(self.whitening(data, variances)(residual))[..., 0]
         square = (white**2).sum(1) / self.parted(data.weight)[:, 0]
+        if not square.any():  # no window can be used
+            return np.ones(len(square))
         limit = OUTLYING * float(np.median(square[square > 0]))
         weight: np.ndarray = limit / np.maximum(square, limit)
         return weight
