@@ -176,6 +176,7 @@ def differing(system: System) -> list[str]:
         for symbol, (name, _, axes) in law.owned.items()
         if axes is None
         and name in calibrated
+        and name in limits
         and limits[name].low >= 0
         and symbol in symbols(law.rate)
         and symbol not in in_sums

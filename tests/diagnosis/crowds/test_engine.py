@@ -20,6 +20,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Sequence
 from nnode.diagnosis.crowds import simulated
 from nnode.diagnosis.crowds.engine import PAIRS, SECONDS, CrowdEngine
+from nnode.diagnosis.crowds.people import differing
 from nnode.diagnosis.crowds.windows import Windows
 from nnode.diagnosis.curves import columns_of
 from nnode.diagnosis.residuals.fit import evaluated, refine
@@ -405,3 +406,13 @@ def test_hidden_effect_is_recovered(
         estimate = extended_fit.row[extended_fit.names.index(f"terms.{place}.{key}")]
         assert estimate == pytest.approx(value, rel=0.1, abs=0.01)
     assert scores[0].p_value < 0.01
+
+
+def test_what_differs_between_people() -> None:
+    assert differing(with_speeds()) == ["desired_speed", "terms.0.tau"]
+    assert differing(model()) == []  # desired speeds and tau are not part of this law
+    drift, _ = extended(with_speeds(), Drift(a_x=0.1, a_y=0.1))
+    assert differing(drift) == ["desired_speed", "terms.0.tau"]
+    unbounded = with_speeds()
+    unbounded.term_list[0].bounds.pop("tau")
+    assert differing(unbounded) == ["desired_speed"]
