@@ -400,7 +400,8 @@ class People:
     ) -> np.ndarray:
         """``(P, L, 2, Q)`` derivatives of positions by the logarithms of what differs."""
         fields, names = list[Tensor](), ParameterVector(system).names
-        by_parameter = run.parameters(differences_of(system)) if random else []
+        of_law = set(random) - {DESIRED_SPEED}
+        by_parameter = run.parameters(differences_of(system)) if of_law else []
         for name in random:
             if name == DESIRED_SPEED:
                 higher, lower = (
