@@ -483,18 +483,25 @@ def main() -> None:
         )
         for case in chosen
     ]
+    run_cases(tasks, given.table, given.processes, ["law", "hidden"])
+
+
+def run_cases(tasks: list[Task], table: Path, processes: int, by: list[str]) -> None:
+    """Run the cases that are not done yet, write their rows, and print them with the counts of
+    right and false answers.
+
+    Args:
+        table: the CSV file; results of single cases are kept in the folder of its name.
+        by: columns for whose values the answers are counted.
+    """
     results = run_tasks(
-        tasks,
-        given.table.with_suffix(""),
-        workers=given.processes,
-        fingerprint=sources(),
-        title="cases",
+        tasks, table.with_suffix(""), workers=processes, fingerprint=sources(), title="cases"
     )
-    table = pd.DataFrame(list(results.values()))
-    print(table.to_string(index=False))
-    write_text(given.table, str(table.to_csv(index=False)))
-    print(verdicts(table, ["law", "hidden"]).to_string(index=False))
-    print(f"table: {given.table}")
+    rows = pd.DataFrame(list(results.values()))
+    print(rows.to_string(index=False))
+    write_text(table, str(rows.to_csv(index=False)))
+    print(verdicts(rows, by).to_string(index=False))
+    print(f"table: {table}")
 
 
 if __name__ == "__main__":

@@ -24,14 +24,11 @@ import numpy as np
 import pandas as pd
 
 import nnode
-from benchmarks.discovery.run import sources
-from benchmarks.discovery.verdicts import verdicts
-from benchmarks.drivers import estimate_row
+from benchmarks.drivers import estimate_row, run_cases
 from benchmarks.synthetic_cases.score import judged
 from nnode.app.python.inputs import model_options
 from nnode.diagnosis.options import DiscoverOptions
-from nnode.files import write_text
-from studies.runner import Task, run_tasks
+from studies.runner import Task
 
 #: Sampling interval and step, s; samples; s for which people walk before they are measured, so that
 #: speeds at the start depend on pushes.
@@ -242,11 +239,8 @@ def evaluate(laws: list[str] | None, **case: Any) -> dict[str, Any]:
         row |= estimate_row(name, value, *(each.get(end) for end in ("estimate", "lower", "upper")))
     if hidden:
         key, size, _ = HIDDEN[case["effect"]]
-        found = {
-            effect["name"]: effect["coefficients"][key]
-            for effect in report["effects"]
-            if effect["name"] == case["effect"]
-        }.get(case["effect"], {})
+        effects = {effect["name"]: effect["coefficients"] for effect in report["effects"]}
+        found = effects.get(case["effect"], {}).get(key, {})
         row |= estimate_row("size", size, *(found.get(end) for end in ("value", "low", "high")))
     return {**row, "seconds": round(time.monotonic() - start, 1)}
 
@@ -283,18 +277,7 @@ def main() -> None:
         Task(f"esf-{case['effect']}-s{case['seed']}", evaluate, case | {"laws": laws})
         for case in chosen
     ]
-    results = run_tasks(
-        tasks,
-        given.table.with_suffix(""),
-        workers=given.processes,
-        fingerprint=sources(),
-        title="cases",
-    )
-    table = pd.DataFrame(list(results.values()))
-    print(table.to_string(index=False))
-    write_text(given.table, str(table.to_csv(index=False)))
-    print(verdicts(table, ["hidden"]).to_string(index=False))
-    print(f"table: {given.table}")
+    run_cases(tasks, given.table, given.processes, ["hidden"])
 
 
 if __name__ == "__main__":

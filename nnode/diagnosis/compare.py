@@ -84,8 +84,6 @@ def compare_laws(
         refused = {key: NO_FORMULA for key in candidates if key not in formulas}
         apart = spacing(sequences, options)
         engine = FollowersEngine(part.sequences, part.label, large=np.inf, apart=apart)
-    elif asked.domain == "crowd":
-        engine = CrowdEngine(part.sequences, clusters=part.label)
     else:
         engine = engine_of(asked, part.sequences, part.label, whole=True)
     formulas, failed = _simulable(formulas)

@@ -25,7 +25,7 @@ from nnode.diagnosis.crowds.engine import CrowdEngine
 from nnode.diagnosis.lanes.engine import TrafficEngine
 from nnode.diagnosis.lanes.followers import FollowersEngine
 from nnode.diagnosis.outcome import Simulation
-from nnode.diagnosis.residuals.engine import Engine
+from nnode.diagnosis.residuals.engine import AgentsEngine, Engine
 from nnode.diagnosis.statistics.combination import least_confirmation
 from nnode.diagnosis.statistics.paired import score_toward
 from nnode.model.system import System
@@ -80,7 +80,7 @@ class ModelComparison:
         self._engine.fit_whitening(base, ParameterVector(base).row)
         #: the engine of the errors that are reported
         self._reported = self._engine
-        if not isinstance(self._engine, FollowersEngine | CrowdEngine):
+        if not isinstance(self._engine, AgentsEngine):
             self._reported = engine_of(base, engine.sequences, whole=True)
 
     @property
