@@ -4,7 +4,8 @@ Every case is ``--sequences`` sequences of 8 people who walk both ways through a
 measured for 6 s at 10 Hz, by the elliptical social force ``esf``, in which one effect is hidden or
 none. Desired speeds and relaxation times are log-normal with a standard deviation of ``--spread``
 %, pushes have a standard deviation of ``--push`` m/s² and last for ``--lasts`` s, and places are
-measured with errors of 5 mm. With ``--nothing``, nothing is hidden in any case, and with
+measured with errors of 5 mm. With ``--sway``, measured people sway as they step, each with a size
+and a frequency of his own. With ``--nothing``, nothing is hidden in any case, and with
 ``--effects`` one of the named effects in every case. Paths are integrated here; everything else is
 the package's public interface. The cases of a run are fixed by its seed. The table has a row per
 case; the last lines count right and false answers, with exact intervals of 95 %. Laws are not
@@ -52,6 +53,8 @@ HIDDEN: dict[str, tuple[str, float, dict[str, float]]] = {
     "sliding_friction": ("c", 0.3, {}),
     "obstacle": ("A_o", 3.0, {"B_o": 0.5, "x_o": 0.0, "y_o": WIDTH / 2}),
 }
+#: Mean frequency of strides, of two steps each, Hz.
+STRIDES = 0.9
 #: Accelerations ``(S, N, 2)`` as a function of positions and velocities.
 Rate = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -63,6 +66,7 @@ def crowds(
     spread: float = 0.15,
     push: float = 0.1,
     lasts: float = 4.0,
+    sway: float = 0.0,
     sequences: int = 24,
 ) -> pd.DataFrame:
     """A tidy table of measured positions and destinations, m.
@@ -71,6 +75,7 @@ def crowds(
         effect: a name of :data:`HIDDEN`, or ``none``.
         spread: standard deviation of logarithms of desired speeds and relaxation times.
         push: standard deviation of accelerations that last for ``lasts`` s, m/s².
+        sway: standard deviation of measured positions across the corridor by people's steps, m.
     """
     draw, shape = np.random.default_rng(seed), (sequences, PEOPLE)
     way = np.where(np.arange(PEOPLE) % 2, 1.0, -1.0)
@@ -95,6 +100,8 @@ def crowds(
         fresh = push * np.sqrt(1 - keep**2)
         acting = keep * acting + fresh * draw.normal(size=acting.shape)
     measured = np.array(path) + ERROR * draw.normal(size=(SAMPLES, *x.shape))
+    if sway:
+        measured += _swaying(sway, draw, shape)
     samples, s, i = (axis.ravel() for axis in np.indices(measured.shape[:3]))
     return pd.DataFrame(
         {
@@ -107,6 +114,21 @@ def crowds(
             "dest_y": measured[0, s, i, 1],
         }
     )
+
+
+def _swaying(size: float, draw: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    """``(T, S, N, 2)`` m: across the corridor once in two steps, with a third harmonic, and along
+    it with every step."""
+    sizes = size * np.sqrt(2) * np.exp(0.3 * draw.normal(size=shape))
+    frequency = STRIDES * np.exp(0.08 * draw.normal(size=shape))
+    time = DT * np.arange(SAMPLES)[:, None, None]
+
+    def oscillation(harmonic: int, share: float) -> np.ndarray:
+        phase = draw.uniform(0, 2 * np.pi, shape)
+        return np.asarray(share * sizes * np.sin(2 * np.pi * harmonic * frequency * time + phase))
+
+    along, across = oscillation(2, 0.3), oscillation(1, 1.0) + oscillation(3, 0.07)
+    return np.stack([along, across], -1)
 
 
 def _length(vectors: np.ndarray) -> np.ndarray:
@@ -253,6 +275,7 @@ def main() -> None:
         ("spread", 15.0, "between people, percent"),
         ("push", 0.1, "standard deviation of pushes, m/s²"),
         ("lasts", 4.0, "of pushes, s"),
+        ("sway", 0.0, "of people who step, standard deviation across the corridor, m"),
         ("sequences", 24, "in a case"),
         ("processes", 2, "side by side"),
     ):
@@ -270,6 +293,7 @@ def main() -> None:
         spread=given.spread / 100,
         push=given.push,
         lasts=given.lasts,
+        sway=given.sway,
         sequences=given.sequences,
     )
     laws: list[str] | None = None if given.default else []

@@ -281,7 +281,7 @@ class ConfirmationSet:
         (name,) = estimate.effect.strengths
         low, high = estimate.interval()
         errors = None
-        if estimate.spread and (estimate.p_value <= self.alpha or not enough):
+        if estimate.sigma and (estimate.p_value <= self.alpha or not enough):
             errors = held_out_errors(
                 self.domain, self.base, system, estimate, self.sequences, self.label
             )

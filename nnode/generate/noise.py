@@ -19,7 +19,6 @@ from nnode.errors import ConfigError
 from nnode.exchange.drivers import drawn
 from nnode.model import Crowd, Traffic
 from nnode.model.effects.base import IndividualEffect
-from nnode.model.effects.crowd import GaitSway
 from nnode.model.effects.lane import DriverHeterogeneity
 from nnode.model.expression import Expr, substitute, symbol
 from nnode.model.formula import effect_increment, lane_of
@@ -352,16 +351,12 @@ def _with_noise(
 def _assign_drivers(
     system: System, repeated: Batch, names: tuple[str, ...], rng: np.random.Generator
 ) -> None:
-    """Assign numbers to all agents in effects that differ between agents.
-
-    Unknown numbers are drawn, except phases of the gait.
-    """
+    """Assign numbers to all agents in effects that differ between agents. Unknown numbers are
+    drawn."""
     for term in system.terms:
         if isinstance(term, IndividualEffect):
             people = {}
             for i, name in enumerate(repeated.names):
                 numbers = term.people.get(names[i % len(names)])
-                if numbers is None and isinstance(term, GaitSway):
-                    continue
                 people[name] = numbers or drawn(term, [()] * repeated.agent.shape[1], rng).tolist()
             term.people = people

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
@@ -44,6 +44,10 @@ UNITS = {
     "lasting_error": "m",
     "lasting_error_time": "s",
     "start_speed": "m/s",
+    "sway": "m",
+    "sway_along": "m",
+    "sway_frequency": "Hz",
+    "sway_time": "s",
 }
 #: Restarts of simulated paths: pushes continue, or nothing is known of them.
 CONTINUED, ANEW = 1, 2
@@ -77,6 +81,7 @@ class Linearised:
             :data:`CONTINUED` where pushes continue, :data:`ANEW` where nothing is known of them,
             0 elsewhere; None: nowhere.
         weight: ``(S, K)`` of the whitened samples' squares; None: 1.
+        heading: ``(S, K / A, A)`` unit vectors in the direction of walking, for :class:`Sway`.
     """
 
     residual: np.ndarray
@@ -91,6 +96,7 @@ class Linearised:
     dt: float = 1.0
     restart: np.ndarray | None = None
     weight: np.ndarray | None = None
+    heading: np.ndarray | None = None
 
     @property
     def axes(self) -> int:
@@ -241,24 +247,48 @@ class PushNoise(Noise):
 
 @dataclass(frozen=True)
 class RestartNoise(Noise):
-    """Pushes, measurement errors, and errors of the states in which simulated paths restart.
+    """Pushes, measurement errors, sway, and errors of the states in which simulated paths restart.
 
-    The parameters are the first three of :data:`NOISE`, and the standard deviation of the errors of
-    smoothed speeds, m/s.
+    People sway across their direction once in two steps, and along it with every step: stochastic
+    oscillators are added to the positions, with the autocorrelation exp(-t / T) cos(2 pi f t), and
+    2 f in place of f along the direction. Simulated paths restart in states that sway.
+
+    The parameters are the first three of :data:`NOISE`, the standard deviation of the errors of
+    smoothed speeds, m/s, and the standard deviations of the sway across and along the direction, m,
+    its frequency f, Hz, and the time T for which it lasts, s. The last four may be absent.
 
     Attributes:
         position: standard deviation of the errors of smoothed positions, m.
     """
 
-    names = (*NOISE[:3], "start_speed")
+    names = (*NOISE[:3], "start_speed", "sway", "sway_along", "sway_frequency", "sway_time")
     position: float
 
     def whitened(
         self, data: Linearised, columns: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        push, push_time, white, speed = values
+        push, push_time, white, speed, *sway = values
         start = np.repeat([self.position, speed], data.axes) ** 2
-        return _whitened(data, columns, (push, push_time), white, (0.0, 1.0), start)
+        oscillation = None
+        if sway:
+            across, along, frequency, time = sway
+            oscillation = _Oscillation(
+                np.array([across, along]), 2 * np.pi * frequency * np.array([1.0, 2.0]), time
+            )
+        return _whitened(data, columns, (push, push_time), white, (0.0, 1.0), start, oscillation)
+
+
+class _Oscillation(NamedTuple):
+    """Stochastic oscillators that are added to positions.
+
+    Attributes:
+        sigma: ``(2,)`` standard deviations across and along the direction of walking, m.
+        omega: ``(2,)`` angular frequencies, 1/s. time: for which they last, s.
+    """
+
+    sigma: np.ndarray
+    omega: np.ndarray
+    time: float
 
 
 def _whitened(
@@ -268,6 +298,7 @@ def _whitened(
     white: float,
     lasting: tuple[float, float],
     start: np.ndarray,
+    oscillation: _Oscillation | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """See :meth:`Noise.whitened`.
 
@@ -275,24 +306,36 @@ def _whitened(
         push, lasting: standard deviation and correlation time of pushes, and of autocorrelated
             errors. white: standard deviation of white errors.
         start: ``(M,)`` variances of states at restarts; without any, they are not used.
+        oscillation: None: there is none.
     """
     assert data.step is not None
     assert data.forced is not None
     processes = data.processes(*push)
     sigma, time = np.array([*processes, lasting]).T
-    restart = data.restart
+    restart, times = data.restart, data.step.shape[1] + 1
     if restart is None:
-        restart = np.zeros((len(columns), data.step.shape[1] + 1), dtype=np.int8)
+        restart = np.zeros((len(columns), times), dtype=np.int8)
+    keep, omega = np.exp(-data.dt / time), np.zeros(0)
+    direction = np.zeros((len(columns), times, 0, data.axes))
+    if oscillation is not None:
+        assert data.heading is not None
+        across = data.heading[..., ::-1] * [-1.0, 1.0]
+        direction, omega = np.stack([across, data.heading], 2), oscillation.omega
+        sigma = np.concatenate([sigma, np.repeat(oscillation.sigma, 2)])
+        keep = np.concatenate([keep, np.full(2 * len(omega), np.exp(-data.dt / oscillation.time))])
     white_columns, logdet = _filtered(
         np.ascontiguousarray(columns),
         data.observed,
         data.step,
         np.ascontiguousarray(data.forced[..., : len(processes)]),
         sigma,
-        np.exp(-data.dt / time),
+        keep,
         white**2,
         restart,
         start,
+        direction,
+        omega,
+        data.dt,
     )
     if data.weight is not None:
         white_columns = white_columns * np.sqrt(data.weight)[..., None]
@@ -310,59 +353,80 @@ def _filtered(
     variance: float,
     restart: np.ndarray,
     start: np.ndarray,
+    direction: np.ndarray,
+    omega: np.ndarray,
+    dt: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Columns whitened by a Kalman filter, and log determinants.
 
-    The state is (d, e), e the J processes that force d, or (d, e, a) where errors a are
-    autocorrelated; a is added to the first element of d, so that this element is measured. Without
-    such errors, the first elements of d are measured one after the other. The arrays of a step are
-    allocated once, because allocations would take most of the time.
+    The state is (d, e, a, q): e the J processes that force d, a the autocorrelated errors, if there
+    are any, and q the O oscillators, two elements each. a is added to the first element of d, so
+    that this element is measured. Without such errors, the first elements of d are measured one
+    after the other, plus the first elements of the oscillators along the measured coordinate. The
+    arrays of a step are allocated once, because allocations would take most of the time.
 
     Args:
-        sigma: ``(J + 1,)`` standard deviations of e and a. keep: ``(J + 1,)`` their
-            autocorrelations over a sampling interval. variance: of white errors.
+        sigma: ``(J + 1 + 2 O,)`` standard deviations of e, a and q. keep: the same of their
+            autocorrelations over a sampling interval, without the oscillation. variance: of white
+            errors.
         restart: see :class:`Linearised`. start: ``(M,)`` variances of d there.
+        direction: ``(S, K / A, O, A)`` unit vectors of the oscillators. omega: ``(O,)`` their
+            angular frequencies, 1/s. dt: sampling interval, s.
     """
     number, samples, width = columns.shape
     m, processes = forced.shape[-2:]
     axes = samples // (step.shape[1] + 1)
-    lasting = sigma[-1] > 0
-    n = m + processes + 1 if lasting else m + processes
-    fresh = sigma**2 * (1 - keep**2)
+    lasting = sigma[processes] > 0
+    if not lasting:
+        others = np.arange(len(sigma)) != processes
+        sigma, keep = sigma[others], keep[others]
+    n, oscillating = m + len(sigma), m + len(sigma) - 2 * len(omega)
+    fresh, turn = sigma**2 * (1 - keep**2), omega * dt
     white, logdet = np.zeros((number, samples, width)), np.zeros(number)
     mean, before = np.empty((n, width)), np.empty((m, width))
     spread, half, gain = np.empty((n, n)), np.empty((m, n)), np.empty(n)
-    forward = np.zeros((m, n))
+    forward = np.zeros((m, oscillating))
     for s in range(number):
         mean[:] = 0.0
-        _begin(spread, sigma, m, lasting)
+        _begin(spread, sigma, m, processes, lasting)
         for k in range(_last(observed[s]) // axes + 1):
             if k:
-                _set_transition(step[s, k - 1], forced[s, k - 1], keep, forward)
+                _set_transition(step[s, k - 1], forced[s, k - 1], keep, lasting, forward)
                 _predict_mean(mean, forward, keep, before)
                 _predict_spread(spread, forward, keep, half)
                 _add_innovations(spread, forced[s, k - 1], fresh)
                 if lasting:
-                    _add_error(spread, fresh[-1])
+                    _add_error(spread, m + processes, fresh[processes])
+                _oscillate(mean, spread, oscillating, turn, fresh)
             if restart[s, k]:
-                _restart(mean, spread, start, restart[s, k] == ANEW)
+                _restart(mean, spread, start, oscillating, restart[s, k] == ANEW)
+                _restart_swaying(mean, spread, oscillating, direction[s, k], omega)
             for axis in range(axes):
                 at = k * axes + axis
                 if observed[s, at]:
                     logdet[s] += _condition(
-                        mean, spread, axis, columns[s, at], variance, white[s, at], gain
+                        mean,
+                        spread,
+                        axis,
+                        oscillating,
+                        direction[s, k, :, axis],
+                        columns[s, at],
+                        variance,
+                        white[s, at],
+                        gain,
                     )
     return white, logdet
 
 
 @njit(**INLINE)
-def _begin(spread: np.ndarray, sigma: np.ndarray, m: int, lasting: bool) -> None:
+def _begin(spread: np.ndarray, sigma: np.ndarray, m: int, processes: int, lasting: bool) -> None:
     """The covariance of the state of :func:`_filtered` before the first sample."""
     spread[:] = 0.0
-    for p in range(len(sigma) - 1):
+    for p in range(len(sigma)):
         spread[m + p, m + p] = sigma[p] ** 2
     if lasting:
-        _add_error(spread, sigma[-1] ** 2)
+        spread[m + processes, m + processes] = 0.0
+        _add_error(spread, m + processes, sigma[processes] ** 2)
 
 
 @njit(**INLINE)
@@ -375,11 +439,14 @@ def _last(observed: np.ndarray) -> int:
 
 
 @njit(**INLINE)
-def _restart(mean: np.ndarray, spread: np.ndarray, start: np.ndarray, anew: bool) -> None:
+def _restart(
+    mean: np.ndarray, spread: np.ndarray, start: np.ndarray, oscillating: int, anew: bool
+) -> None:
     """Restart d with the variances ``start``, and forget e if nothing is known of it: by a push,
-    speeds at a restart already differ from those of the law, so that e depends on them."""
-    n, m = len(spread), len(start)
-    for i in range(n if anew else m):
+    speeds at a restart already differ from those of the law, so that e depends on them. The states
+    from ``oscillating`` on continue."""
+    m = len(start)
+    for i in range(oscillating if anew else m):
         mean[i] = 0.0
         spread[i] = 0.0
         spread[:, i] = 0.0
@@ -387,29 +454,70 @@ def _restart(mean: np.ndarray, spread: np.ndarray, start: np.ndarray, anew: bool
 
 
 @njit(**INLINE)
-def _set_transition(
-    step: np.ndarray, forced: np.ndarray, keep: np.ndarray, forward: np.ndarray
+def _restart_swaying(
+    mean: np.ndarray, spread: np.ndarray, oscillating: int, direction: np.ndarray, omega: np.ndarray
 ) -> None:
-    """Fill the derivatives ``forward`` ``(M, n)`` of d after a sampling interval by the state of
-    :func:`_filtered` before it. The other elements of the state decay by themselves."""
+    """Subtract the places and speeds of the oscillators, the states from ``oscillating`` on, from
+    those of d, which restarts where the measured path sways."""
+    oscillators, axes = direction.shape
+    for o in range(oscillators):
+        for i in range(2 * axes):
+            is_speed = i >= axes
+            q = oscillating + 2 * o + is_speed
+            share = -direction[o, i % axes] * (omega[o] if is_speed else 1.0)
+            mean[i] += share * mean[q]
+            # the row, and with the changed row the column, so that the matrix remains symmetric
+            spread[i] += share * spread[q]
+            spread[:, i] += share * spread[:, q]
+
+
+@njit(**INLINE)
+def _oscillate(
+    mean: np.ndarray, spread: np.ndarray, oscillating: int, turn: np.ndarray, fresh: np.ndarray
+) -> None:
+    """Turn the oscillators, the states from ``oscillating`` on, by the angles ``turn``, and add the
+    variances of their innovations, the last ones of ``fresh``."""
+    for o in range(len(turn)):
+        first, cosine, sine = oscillating + 2 * o, np.cos(turn[o]), np.sin(turn[o])
+        _turn(mean, first, cosine, sine)
+        _turn(spread, first, cosine, sine)
+        _turn(spread.T, first, cosine, sine)
+        for i in (first, first + 1):
+            spread[i, i] += fresh[len(fresh) + i - len(spread)]
+
+
+@njit(**INLINE)
+def _turn(rows: np.ndarray, first: int, cosine: float, sine: float) -> None:
+    """Turn a row and the next one into each other."""
+    for j in range(rows.shape[1]):
+        a, b = rows[first, j], rows[first + 1, j]
+        rows[first, j], rows[first + 1, j] = cosine * a + sine * b, cosine * b - sine * a
+
+
+@njit(**INLINE)
+def _set_transition(
+    step: np.ndarray, forced: np.ndarray, keep: np.ndarray, lasting: bool, forward: np.ndarray
+) -> None:
+    """Fill the derivatives ``forward`` ``(M, M + J)`` or ``(M, M + J + 1)`` of d after a sampling
+    interval by (d, e, a) before it, see :func:`_filtered`. All elements besides d decay by
+    themselves."""
     m, processes = forced.shape
     for i in range(m):
         for j in range(m):
             forward[i, j] = step[i, j]
         for p in range(processes):
             forward[i, m + p] = forced[i, p] * (1 + keep[p])
-    if forward.shape[1] > m + processes:
+    if lasting:
         for i in range(m):
-            forward[i, -1] = -step[i, 0]
-        forward[0, -1] += keep[-1]
+            forward[i, m + processes] = -step[i, 0]
+        forward[0, m + processes] += keep[processes]
 
 
 @njit(**INLINE)
-def _add_error(spread: np.ndarray, variance: float) -> None:
-    """Add a variance to the error that is the last state, which the first state contains."""
-    last = len(spread) - 1
-    for i in (0, last):
-        for j in (0, last):
+def _add_error(spread: np.ndarray, place: int, variance: float) -> None:
+    """Add a variance to the error, which the first state contains."""
+    for i in (0, place):
+        for j in (0, place):
             spread[i, j] += variance
 
 
@@ -444,7 +552,7 @@ def _predict_mean(
         for j in range(n):
             for c in range(width):
                 mean[i, c] += forward[i, j] * (before[j, c] if j < m else mean[j, c])
-    for i in range(m, n):
+    for i in range(m, len(mean)):
         for c in range(width):
             mean[i, c] *= keep[i - m]
 
@@ -455,16 +563,17 @@ def _predict_spread(
 ) -> None:
     """Replace the covariance of the state by that of one sample later, without innovations.
     ``half`` is a work array."""
-    m, n = forward.shape
+    m, coupled = forward.shape
+    n = len(spread)
     for i in range(m):
         for j in range(n):
             half[i, j] = 0.0
-            for q in range(n):
+            for q in range(coupled):
                 half[i, j] += forward[i, q] * spread[q, j]
     for i in range(m):
         for j in range(i + 1):
             total = 0.0
-            for q in range(n):
+            for q in range(coupled):
                 total += half[i, q] * forward[j, q]
             spread[i, j] = spread[j, i] = total
     for i in range(m, n):
@@ -475,27 +584,48 @@ def _predict_spread(
 
 
 @njit(**INLINE)
+def _covariances(
+    spread: np.ndarray, axis: int, oscillating: int, direction: np.ndarray, covariance: np.ndarray
+) -> float:
+    """The variance of what :func:`_condition` measures, without errors. ``covariance`` is filled
+    with its covariances with the state."""
+    for i in range(len(spread)):
+        covariance[i] = spread[i, axis]
+        for o in range(len(direction)):
+            covariance[i] += direction[o] * spread[i, oscillating + 2 * o]
+    total = covariance[axis]
+    for o in range(len(direction)):
+        total += direction[o] * covariance[oscillating + 2 * o]
+    return float(total)
+
+
+@njit(**INLINE)
 def _condition(
     mean: np.ndarray,
     spread: np.ndarray,
     axis: int,
+    oscillating: int,
+    direction: np.ndarray,
     sample: np.ndarray,
     variance: float,
     white: np.ndarray,
     gain: np.ndarray,
 ) -> float:
-    """The state after a sample of its element ``axis``: mean and covariance are replaced, ``white``
-    is filled. ``gain`` is a work array of as many numbers as the state has.
+    """The state after a sample of its element ``axis``, plus the oscillators, the states from
+    ``oscillating`` on, times ``direction``: mean and covariance are replaced, ``white`` is filled.
+    ``gain`` is a work array of as many numbers as the state has.
 
     Returns:
         The logarithm of the innovation's variance.
     """
     n, width = mean.shape
-    total = spread[axis, axis] + variance
+    total = variance + _covariances(spread, axis, oscillating, direction, gain)
     for i in range(n):
-        gain[i] = spread[i, axis] / total
+        gain[i] /= total
     for c in range(width):
         white[c] = sample[c] - mean[axis, c]
+        for o in range(len(direction)):
+            white[c] -= direction[o] * mean[oscillating + 2 * o, c]
     for i in range(n):
         for c in range(width):
             mean[i, c] += gain[i] * white[c]

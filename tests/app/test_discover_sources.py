@@ -57,8 +57,8 @@ def pedpy(tmp_path: Path) -> Path:
             "highd",
             "model=lin model.leader=measured data.window=null discover.effects=[inertia]",
         ),
-        # the true motion has no sway
-        ("pedpy", "model=sf model.B=0.3 data.t_seq=2 discover.effects=[gait_sway]"),
+        # the true motion has no slope
+        ("pedpy", "model=sf model.B=0.3 data.t_seq=2 discover.effects=[drift]"),
     ],
 )
 def test_a_diagnosis_ends_with_a_verdict(

@@ -165,7 +165,7 @@ def restarting(seed: int) -> Linearised:
     observed = np.ones((people, 2 * times), dtype=bool)
     observed[1, 16:] = False
     observed[0, 5] = False
-    return Linearised(
+    data = Linearised(
         residual=rng.normal(size=(people, 2 * times)),
         fixed=rng.normal(size=(people, 2 * times, 3)),
         random=np.array([2, 0]),
@@ -178,46 +178,66 @@ def restarting(seed: int) -> Linearised:
         weight=np.ones((people, 2 * times)),
         dt=DT,
     )
+    heading = rng.normal(size=(people, times, 2))
+    return replace(data, heading=heading / np.linalg.norm(heading, axis=-1, keepdims=True))
 
 
-def restarting_covariance(data: Linearised, person: int, speed: float) -> np.ndarray:
+def restarting_covariance(
+    data: Linearised, person: int, speed: float, sway: tuple[float, ...]
+) -> np.ndarray:
     """The dense covariance of a person's samples, from independent numbers of variance 1."""
     assert data.step is not None
     assert data.forced is not None
     assert data.restart is not None
+    assert data.heading is not None
     times, keep = len(data.restart[person]), np.exp(-DT / TAU)
-    numbers = iter(np.eye(10 * times))
+    numbers = iter(np.eye(14 * times))
 
     def drawn(deviations: list[float]) -> np.ndarray:
         return np.array([deviation * next(numbers) for deviation in deviations])
 
-    d, e, rows = np.zeros((4, 10 * times)), drawn([SIGMA] * 2), []
+    sizes, frequency, lasts = sway[:2], sway[2], sway[3]
+    swings = [drawn([size, size]) for size in sizes]
+    d, e, rows = np.zeros((4, 14 * times)), drawn([SIGMA] * 2), []
     for k in range(times):
         if k:
             before = e
             e = keep * e + drawn([SIGMA * np.sqrt(1 - keep**2)] * 2)
             d = data.step[person, k - 1] @ d + data.forced[person, k - 1] @ (before + e)
+            for number, size in enumerate(sizes):
+                angle, kept = 2 * np.pi * frequency * (number + 1) * DT, np.exp(-DT / lasts)
+                cosine, sine = np.cos(angle), np.sin(angle)
+                turned = kept * np.array([[cosine, sine], [-sine, cosine]]) @ swings[number]
+                swings[number] = turned + drawn([size * np.sqrt(1 - kept**2)] * 2)
+        along = data.heading[person, k]
+        ways = np.array([-along[1], along[0]]), along
+        place = sum(np.outer(way, swing[0]) for way, swing in zip(ways, swings, strict=True))
         if data.restart[person, k]:
-            d = drawn([POSITION] * 2 + [speed] * 2)
+            turning = [
+                2 * np.pi * frequency * (number + 1) * np.outer(way, swing[1])
+                for number, (way, swing) in enumerate(zip(ways, swings, strict=True))
+            ]
+            d = drawn([POSITION] * 2 + [speed] * 2) - np.concatenate([place, sum(turning)])
         if data.restart[person, k] == ANEW:
             e = drawn([UNKNOWN] * 2)
-        rows += list(d[:2])
+        rows += list(d[:2] + place)
     map_ = np.array(rows)
     random = data.by_deviation[person] * SPREAD
     covariance: np.ndarray = map_ @ map_.T + ERROR**2 * np.eye(len(map_)) + random @ random.T
     return covariance
 
 
+@pytest.mark.parametrize("sway", [(), (0.3, 0.1, 0.9, 2.0)])
 @pytest.mark.parametrize("seed", range(3))
-def test_filter_with_restarts_equals_a_dense_gaussian(seed: int) -> None:
-    data, values = restarting(seed), np.array([SIGMA, TAU, ERROR, 0.3])
+def test_filter_with_restarts_equals_a_dense_gaussian(seed: int, sway: tuple[float, ...]) -> None:
+    data, values = restarting(seed), np.array([SIGMA, TAU, ERROR, 0.3, *sway])
     products = RestartNoise(POSITION).products(data, values)
     zero = np.zeros(3)
     result = marginal(data, products, SPREAD, np.zeros(0), low=zero, high=zero)
     for person in range(2):
         seen = data.observed[person]
-        matrix = restarting_covariance(data, person, 0.3)[np.ix_(seen, seen)]
-        gaussian = multivariate_normal(np.zeros(seen.sum()), matrix)
+        matrix = restarting_covariance(data, person, 0.3, sway or (0.0, 0.0, 1.0, 1.0))
+        gaussian = multivariate_normal(np.zeros(seen.sum()), matrix[np.ix_(seen, seen)])
         expected = gaussian.logpdf(data.residual[person, seen])
         assert result.each[person] == pytest.approx(expected, abs=1e-8)
 

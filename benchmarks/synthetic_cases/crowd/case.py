@@ -184,7 +184,7 @@ class CrowdCase(Subject):
         self.kick = np.ascontiguousarray(kick.transpose(0, 3, 1, 2))
         eta = rng.standard_normal(shape)
         eta = (eta - eta.mean()) / eta.std()
-        self.people = People(x, v, goal, group, eta, rng.uniform(0, 2 * np.pi, shape))
+        self.people = People(x, v, goal, group, eta)
         self.clocks = np.arange(case.n_sequences) * round(duration + _PAUSE, 6)
         self.error = case.generator("measurement").standard_normal(
             (shape[0], case.n_steps + 1, shape[1], 2)
@@ -207,7 +207,7 @@ class CrowdCase(Subject):
         (x,), _ = simulate(
             self.law,
             Hidden(),
-            People(x0, v0, goal, group, nobody, nobody),
+            People(x0, v0, goal, group, nobody),
             self.walls,
             np.zeros((1, steps + 1, *start[0].shape)),
             np.zeros(1),

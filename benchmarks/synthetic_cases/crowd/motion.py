@@ -64,8 +64,6 @@ class Hidden(NamedTuple):
     v_pref: float = 1.3
     dense: float = 0.0  # -dense rho v
     friction: float = 0.0  # sum over j of friction exp((2 r - d)/0.5 m) ((v_j - v_i) t) t
-    sway: float = 0.0  # sway sin(2 pi f clock + phase_i) to the right
-    sway_f: float = 1.0
     spin: float = 0.0  # spin exp(-d²/(2 s²)) around a place, to the left of n
     spin_x: float = 0.0
     spin_y: float = 0.0
@@ -87,7 +85,6 @@ class People(NamedTuple):
         goal: ``(S, N, 2)`` destinations, m.
         group: ``(S, N)`` number of the social group, -1 for those who walk alone.
         eta: ``(S, N)`` how much more vigorously than others they steer.
-        phase: ``(S, N)`` of their gait, rad.
     """
 
     x: np.ndarray
@@ -95,7 +92,6 @@ class People(NamedTuple):
     goal: np.ndarray
     group: np.ndarray
     eta: np.ndarray
-    phase: np.ndarray
 
 
 @njit(cache=True, error_model="numpy")
@@ -205,7 +201,6 @@ def _alone(
     e: complex,
     goal: complex,
     eta: float,
-    phase: float,
     clock: float,
     since: float,
 ) -> complex:
@@ -213,7 +208,7 @@ def _alone(
     speed, way = math.sqrt(_dot(v, v)), goal - x
     a = (1.0 + eta) / base.tau * (speed * way / _length(way) - v) + complex(fx.a_x, fx.a_y)
     along = fx.pull * (fx.v_pref - speed) - fx.tiring * max(since, 0.0)
-    a += e * complex(along, -fx.sway * math.sin(2 * math.pi * fx.sway_f * clock + phase))
+    a += e * along
     if fx.A_o != 0.0:
         offset = x - complex(fx.x_o, fx.y_o)
         d = _length(offset)
@@ -241,13 +236,13 @@ def accelerations(
     since: float,
 ) -> np.ndarray:
     """``(N,)`` m/s² of one crowd among the points ``(P,)`` and segments ``(W, 2)`` of walls."""
-    x, v, goal, group, eta, phase = people
+    x, v, goal, group, eta = people
     e = np.empty_like(v)
     a = np.empty_like(v)
     for i in range(len(x)):
         e[i] = v[i] / _length(v[i])
     for i in range(len(x)):
-        alone = _alone(base, fx, x[i], v[i], e[i], goal[i], eta[i], phase[i], clock, since)
+        alone = _alone(base, fx, x[i], v[i], e[i], goal[i], eta[i], clock, since)
         a[i] = alone + _others(base, fx, i, x, v, e, group)
         a[i] += _walls(base, fx, x[i], v[i], points, segments)
     return a
@@ -277,7 +272,7 @@ def _crowd(
                 x += part * step * dx[q - 1]
                 v += part * step * dv[q - 1]
             t = (m + part) * step
-            now = People(x, v, people.goal, people.group, people.eta, people.phase)
+            now = People(x, v, people.goal, people.group, people.eta)
             a = accelerations(base, fx, now, points, segments, clock + t, since + t)
             dx[q], dv[q] = v, a + (kick[m] + part * (kick[m + 1] - kick[m]))
         xs[m + 1], vs[m + 1] = xs[m], vs[m]

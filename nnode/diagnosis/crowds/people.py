@@ -98,7 +98,7 @@ class CrowdPopulation:
         typical: logarithm of the typical one.
         data: the measured paths of D people, linearised.
         posterior: the marginal likelihood, and the deviations from the simulated people.
-        acceleration: root mean square of the smoothed accelerations, m/s².
+        acceleration: root mean square of the smoothed accelerations along one coordinate, m/s².
     """
 
     system: System
@@ -200,6 +200,10 @@ class People:
         unit: ``(P,)`` number of the person of each of the P windows of single people.
         pairs: of each person the sequence and the place in it.
         speed: ``(D,)`` preferred speeds as measured, m/s.
+        heading: ``(D, T, 2)`` unit vectors from the start to the end of each window, at all T times
+            of a person.
+        sway: the last parameters of :attr:`noise`; empty: people do not sway.
+        acceleration: see :class:`CrowdPopulation`.
     """
 
     def __init__(self, windows: Windows) -> None:
@@ -220,10 +224,15 @@ class People:
         assert preferred is not None
         speed = np.hypot(*preferred[window, place].numpy()[first].T)
         self.speed = np.maximum(speed, SLOWEST)
-        dt = windows.sub * windows.step
-        velocity = windows.batch.v[:: 2 * windows.sub, window, place].numpy()
-        self.acceleration = float(np.sqrt(2 * np.mean(np.gradient(velocity, dt, axis=0) ** 2)))
+        x = windows.batch.x[:, window, place].numpy()
+        way = (x[-1] - x[0]) / np.maximum(np.hypot(*(x[-1] - x[0]).T), 1e-9)[:, None]
+        heading = self.joined(np.repeat(way[:, None], windows.length, 1))
+        self.heading = heading.reshape(len(heading), -1, 2)
         self._last: tuple[np.ndarray, Surroundings] | None = None
+        self.sway = np.zeros(0)
+        velocity = windows.batch.v[:: 2 * windows.sub, window, place].numpy()
+        acceleration = np.gradient(velocity, windows.sub * windows.step, axis=0)
+        self.acceleration = float(np.sqrt(np.mean(acceleration**2)))
 
     @property
     def noise(self) -> RestartNoise:
@@ -241,7 +250,7 @@ class People:
         Args:
             random: what differs.
         """
-        windows, number = self.windows, len(random)
+        windows, number, sway = self.windows, len(random), self.sway
         dt = windows.sub * windows.step
         low_push, high_push, push = PUSH[2]
         low_speed, high_speed, speed = START_SPEED
@@ -250,11 +259,11 @@ class People:
         noise = np.array([push, np.clip(LASTING, short, long), self._error, speed])
         low, high = [low_push, short, self._error, low_speed], [high_push, long, self._error]
         return Variances(
-            noise=noise,
+            noise=np.concatenate([noise, sway]),
             spread=np.full(number, SPREAD),
             start=np.zeros(0),
-            low=np.array([*low, *[LEAST_SPREAD] * number]),
-            high=np.array([*high, high_speed, *[MOST_SPREAD] * number]),
+            low=np.array([*low, *sway, *[LEAST_SPREAD] * number]),
+            high=np.array([*high, high_speed, *sway, *[MOST_SPREAD] * number]),
         )
 
     def estimated(
@@ -278,7 +287,7 @@ class People:
         for round_ in range(ROUNDS):
             data = self._linearised(system, random, speed, typical, weight)
             if variances is None:
-                present = self._fitted(data, random, present)
+                present = self._fitted(data, random, present, several=round_ == 0)
             posterior = self.posterior(data, random, present)
             if round_ < ROUNDS - 1:
                 weight = self._weights(data, posterior, present)
@@ -296,12 +305,14 @@ class People:
             acceleration=self.acceleration,
         )
 
-    def _fitted(self, data: Linearised, random: list[str], start: Variances) -> Variances:
-        """The most likely variances, from several correlation times of pushes: the likelihood has
-        maxima at short and at long ones."""
+    def _fitted(
+        self, data: Linearised, random: list[str], start: Variances, several: bool
+    ) -> Variances:
+        """The most likely variances; with ``several`` from several correlation times of pushes:
+        the likelihood has maxima at short and at long ones."""
         limit, fits = _limit(random), list[tuple[float, Variances]]()
         short, long = start.low[1], start.high[1]
-        for time in (start.noise[1], short, long):
+        for time in (start.noise[1], short, long) if several else start.noise[1:2]:
             noise = start.noise.copy()
             noise[1] = np.clip(time, 1.1 * short, long / 1.1)
             fit = fit_variances(
@@ -392,6 +403,7 @@ class People:
             forced=self.joined(dt / 2 * after[..., 2:])[:, :-1],
             restart=restart,
             weight=self.joined(np.repeat(weight[:, None], 2 * times, 1)),
+            heading=self.heading,
             dt=dt,
         )
 

@@ -182,6 +182,10 @@ _VARIATIONS = {
     "lasting_error": "autocorrelated measurement error of positions",
     "lasting_error_time": "correlation time of this error",
     "start_speed": "error of smoothed speeds",
+    "sway": "sway from side to side",
+    "sway_along": "sway along the direction of walking",
+    "sway_frequency": "frequency of the sway from side to side",
+    "sway_time": "correlation time of the sway",
 }
 #: What agents are called.
 _AGENTS = {"traffic": ("driver", "drivers"), "crowd": ("person", "people")}

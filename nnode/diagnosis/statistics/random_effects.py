@@ -71,25 +71,20 @@ class IndividualEstimate:
     left_out: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     @property
-    def spread(self) -> float:
-        """Standard deviation between agents, per direction."""
-        return float(np.sqrt(max(self.variance, 0.0)))
-
-    @property
     def sigma(self) -> float:
-        """The effect's strength."""
-        return self.effect.spread(self.spread)
+        """The effect's strength: the standard deviation between agents, per direction."""
+        return float(np.sqrt(max(self.variance, 0.0)))
 
     def interval(self) -> tuple[float, float]:
         """The 95 % interval of the strength."""
         half = float(stats.t.ppf(0.975, max(len(self.left_out) - 1, 1))) * self.error
         low, high = (float(np.sqrt(np.maximum(self.variance + s * half, 0.0))) for s in (-1, 1))
-        return self.effect.spread(low), self.effect.spread(high)
+        return low, high
 
     def detectable(self, alpha: float, power: float = 0.8) -> float:
         """The smallest strength whose variance is significant with a power of 80 %."""
         quantiles = stats.t.ppf([1 - alpha, power], max(len(self.left_out) - 1, 1))
-        return self.effect.spread(float(np.sqrt(self.error * quantiles.sum())))
+        return float(np.sqrt(self.error * quantiles.sum()))
 
 
 def estimate_individual(

@@ -262,11 +262,6 @@ class IndividualEffect(Effect):
         """An agent's number, from the amounts that were fitted to the agent."""
         return float(numbers[0])
 
-    @classmethod
-    def spread(cls, sigma: float) -> float:
-        """The strength, from the standard deviation of the amounts of each direction."""
-        return sigma
-
     def inputs(self, scene: Scene) -> dict[str, Tensor]:
         """The rule's first input is the agents' numbers, its second is 1 where they are known."""
         (rule, *_) = self.rules.values()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -31,32 +30,6 @@ class WalkerHeterogeneity(IndividualEffect):
     def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
         """The number, at least -1. Below -1 a person would move away from the destination."""
         return max(float(numbers[0]), -1.0)
-
-
-class GaitSway(IndividualEffect):
-    """A sway whose phases are the people's numbers."""
-
-    tried = {"f": tuple(0.6 + 0.05 * i for i in range(17))}
-
-    @classmethod
-    def applies(cls, batch: Batch, system: System) -> bool:
-        return batch.dt <= 0.25
-
-    @classmethod
-    def directions(cls, options: dict[str, Any]) -> list[tuple[dict[str, Any], float]]:
-        """Sine and cosine of the clock, at 1 m/s²."""
-        unit = {**options, "a": 1.0}
-        return [(unit, 0.0), (unit, math.pi / 2)]
-
-    @classmethod
-    def person(cls, numbers: np.ndarray, options: dict[str, Any]) -> float:
-        """The phase, from the amplitudes of the sine and the cosine of the clock."""
-        return float(np.arctan2(numbers[1], numbers[0]))
-
-    @classmethod
-    def spread(cls, sigma: float) -> float:
-        """The amplitude: sine and cosine share its square."""
-        return math.sqrt(2) * sigma
 
 
 class GroupCohesion(Effect):

@@ -30,7 +30,6 @@ def acceleration(
     points=(),
     walls=WALL[:0],
     clock=0.0,
-    phase=0.0,
     eta=0.0,
     since=0.0,
 ):
@@ -38,7 +37,7 @@ def acceleration(
     x, v = np.array(x, complex), np.array(v, complex)
     group = np.full(len(x), -1) if group is None else np.array(group)
     goal = x + 1e6 * v if goal is None else np.array(goal, complex)
-    people = People(x, v, goal, group, np.full(len(x), eta), np.full(len(x), phase))
+    people = People(x, v, goal, group, np.full(len(x), eta))
     return accelerations(base, hidden, people, np.array(points, complex), walls, clock, since)
 
 
@@ -110,7 +109,6 @@ def test_accelerations_by_hand(x, v, scene, expected):
         (Hidden(a_x=0.2, a_y=-0.1), 0.2 - 0.1j),
         (Hidden(pull=0.5, v_pref=1.4), 0.2),
         (Hidden(dense=0.5), -0.5 * np.exp(-0.72) / (2 * np.pi)),
-        (Hidden(sway=0.8, sway_f=1.0), -0.8j),
         (Hidden(A_o=2.0, B_o=0.5, x_o=0.0, y_o=-1.0), 2j * np.exp(-2.0)),
         (Hidden(A_o=2.0, B_o=0.5, x_o=0.0, y_o=-1.0, bell=1.0), 2j * np.exp(-2.0)),
         (Hidden(tiring=0.1), -0.2),
@@ -126,7 +124,7 @@ def test_accelerations_rotate_with_the_scene():
     rng, turn = np.random.default_rng(4), np.exp(0.7j)
     x, v = (rng.uniform(0, 4, (6, 2)) @ [1, 1j], rng.normal(0, 1, (6, 2)) @ [1, 1j])
     strengths = {"A_2": 0.3, "lambda_": 0.3, "T_a": 0.4, "side": 0.3, "theta": 0.4, "align": 0.2}
-    strengths |= {"cohesion": 0.3, "pull": 0.4, "dense": 0.3, "friction": 0.4, "sway": 0.5}
+    strengths |= {"cohesion": 0.3, "pull": 0.4, "dense": 0.3, "friction": 0.4}
     scene = {"hidden": Hidden(**strengths, tiring=0.1), "group": [0, 0, 1, 1, 1, -1]}
     turned = acceleration(x * turn, v * turn, **scene)
     np.testing.assert_allclose(turned, acceleration(x, v, **scene) * turn, rtol=1e-6, atol=1e-6)
@@ -149,7 +147,7 @@ def test_motion_as_another_integrator_with_errors_of_fourth_order(monkeypatch):
     def walk(step: float) -> np.ndarray:
         steps = round(2.0 / step)
         plane = [np.stack([part.real, part.imag], -1)[None] for part in (x, v, goal)]
-        people = People(*plane, np.full((1, 4), -1), *np.zeros((2, 1, 4)))
+        people = People(*plane, np.full((1, 4), -1), np.zeros((1, 4)))
         kick, zero = np.zeros((1, steps + 1, 4, 2)), np.zeros(1)
         return simulate(SMOOTH, hidden, people, long, kick, zero, zero, step, steps)[0][0, -1]
 

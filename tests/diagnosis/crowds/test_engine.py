@@ -31,7 +31,7 @@ from nnode.errors import SimulationError
 from nnode.model import Crowd, make_law
 from nnode.model.crowd_formula import norm
 from nnode.model.effects import CATALOGUE, Effect, IndividualEffect, Probe, Setting, Strength
-from nnode.model.effects.crowd import Alignment, Drift, GaitSway, PairRepulsion, heading
+from nnode.model.effects.crowd import Alignment, Drift, PairRepulsion, heading
 from nnode.model.extend import extended
 from nnode.model.laws import PEDESTRIAN_LAWS, InteractionForce, Law
 from nnode.model.term import Interval, State
@@ -332,13 +332,10 @@ def test_individual_columns_are_finite_differences(engine: CrowdEngine) -> None:
     assert distance(change, torch.from_numpy(eta[engine.unit]) * column) < 0.1
 
 
-@pytest.mark.parametrize(("effect", "options"), [(GaitSway, {"f": 0.9}), (Stride, {})])
-def test_phase_columns_are_finite_differences(
-    engine: CrowdEngine, effect: type[IndividualEffect], options: dict[str, float]
-) -> None:
-    sine, cosine = engine.individual(model(), ROW, effect, options)
-    people = dict.fromkeys(engine.names, [GaitSway.person(np.array([0.3, 0.4]), {})] * 6)
-    system, _ = extended(model(), effect(people=people, a=0.05, **options))
+def test_phase_columns_are_finite_differences(engine: CrowdEngine) -> None:
+    sine, cosine = engine.individual(model(), ROW, Stride, {})
+    people = dict.fromkeys(engine.names, [math.atan2(0.4, 0.3)] * 6)
+    system, _ = extended(model(), Stride(people=people, a=0.05))
     change = residuals(engine, system) - residuals(engine, model())
     assert distance(change, 0.05 * (0.6 * sine + 0.8 * cosine)) < 0.05
 

@@ -35,7 +35,6 @@ VALUES: dict[str, dict[str, float]] = {
     "obstacle": {"A_o": 0.8, "B_o": 0.7, "x_o": 1.1, "y_o": 0.9},
     "attraction": {"A_o": 0.8, "B_o": 0.7, "x_o": 1.1, "y_o": 0.9},
     "walker_heterogeneity": {"sigma": 0.3},
-    "gait_sway": {"a": 0.4, "f": 0.9},
 }
 
 
@@ -185,9 +184,6 @@ def formula(name: str, item: Sequence, i: int) -> np.ndarray:
         way = unit(item.destination[i] - x[i])
         eta = NUMBERS[item.name][i]
         total = eta * (math.hypot(*v[i]) * way - v[i]) / 0.5
-    elif name == "gait_sway":
-        phase = NUMBERS[item.name][i]
-        total = p["a"] * math.sin(2 * math.pi * p["f"] * 12.2 + phase) * right
     return total
 
 
@@ -313,11 +309,10 @@ def test_effect_on_a_missing_force() -> None:
         model(torch.tensor(0.0), torch.cat([BATCH.x[0], BATCH.v[0]], -1), Scene.of(BATCH))
 
 
-@pytest.mark.parametrize("name", ["walker_heterogeneity", "gait_sway"])
-def test_individual_effects_without_a_sequence(name: str) -> None:
-    effect, model = effect_of(name)
+def test_individual_effect_without_a_sequence() -> None:
+    effect, model = effect_of("walker_heterogeneity")
     before = effect(state(model))
-    copy = CATALOGUE.effects[name](**effect.options())
+    copy = CATALOGUE.effects[effect.name](**effect.options())
     torch.testing.assert_close(copy(state(model)), before)
     del copy.people[CROWDS[0].name]
     changed = copy(state(model))

@@ -204,7 +204,6 @@ EFFECTS = {
     "walls": {
         "wall_repulsion": {"A_w": 0.8, "B_w": 0.3},
         "group_cohesion": {"c": 0.5},
-        "gait_sway": {"a": 0.3, "f": 1.0, "people": {"a": [0.1, 0.4, 0.2, 0.9]}},
         "walker_heterogeneity": {"people": {"c": [0.1, -0.3, 0.2, 0.4, 0.0, 0.1, 0.3]}},
     },
 }

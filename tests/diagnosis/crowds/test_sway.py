@@ -1,0 +1,62 @@
+"""People who sway as they step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import nnode
+from benchmarks.people import STRIDES, crowds
+from nnode.data.sequence import Sequence
+from nnode.diagnosis.crowds.engine import SECONDS
+from nnode.diagnosis.crowds.people import People
+from nnode.diagnosis.crowds.sway import estimated_sway
+from nnode.diagnosis.crowds.windows import Windows
+
+
+def sequences(sway: float, every: int = 1) -> list[Sequence]:
+    """People who sway by ``sway`` m; every ``every``-th sample."""
+    table = crowds("none", 8, sequences=8, sway=sway)
+    return list(nnode.sequences(table[table["time"].rank(method="dense") % every == 0]))
+
+
+@pytest.fixture(scope="module")
+def swaying() -> People:
+    return People(Windows(sequences(0.02), SECONDS))
+
+
+def sway_of(walking: list[Sequence]) -> np.ndarray:
+    return estimated_sway(People(Windows(walking, SECONDS)))
+
+
+def test_parameters_of_sway(swaying: People) -> None:
+    across, along, frequency, lasts = estimated_sway(swaying)
+    assert across == pytest.approx(0.02 * np.exp(0.3**2), rel=0.2)
+    # smoothed speeds at starts contain less of the sway along the direction, which is fast
+    assert 0.3 * across < along < 0.6 * across
+    assert frequency == pytest.approx(STRIDES, rel=0.03)
+    assert lasts > 2.0  # frequencies of people differ by 8 %
+
+
+def test_people_without_sway() -> None:
+    assert not len(sway_of(sequences(0.0)))
+
+
+def test_sway_is_not_resolved_by_few_samples() -> None:
+    assert not len(sway_of(sequences(0.02, every=2)))
+
+
+def test_given_sway_is_kept() -> None:
+    given = np.array([0.01, 0.003, 0.8, 4.0])
+    people = People(Windows(sequences(0.0), SECONDS))
+    people.sway = given
+    variances = people.initial_variances(["desired_speed"])
+    np.testing.assert_array_equal(variances.noise[-4:], given)
+    fixed = variances.low == variances.high
+    assert fixed[4:8].all()
+    assert fixed.sum() == 5  # and the error of positions
+
+
+def test_heading(swaying: People) -> None:
+    np.testing.assert_allclose(np.hypot(*np.moveaxis(swaying.heading, -1, 0)), 1.0)
+    assert (np.abs(swaying.heading[..., 0]) > 0.8).all()  # along the corridor
