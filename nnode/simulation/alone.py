@@ -42,7 +42,8 @@ class Surroundings:
 
     Attributes:
         scene: scene of the windows.
-        x, v: ``(H, W, N, 2)`` measured positions (m) and velocities (m/s) at half steps.
+        x, v: ``(H, W, N, 2)`` measured positions (m) and velocities (m/s) at half steps; the last
+            ones hold for all times after.
         window, person: ``(P,)`` window and index of the P real people.
         step: time step of the simulation, s.
     """
@@ -60,6 +61,16 @@ class Surroundings:
         if number not in self._scenes:
             self._scenes[number] = side_by_side(self.scene, number)
         return self._scenes[number]
+
+    def index(self, moment: np.ndarray) -> np.ndarray:
+        """The places of half steps in :attr:`x`."""
+        return np.minimum(moment, len(self.x) - 1)
+
+    def replace_others(self, states: Tensor) -> None:
+        """Replace the measured states of one time, the only one, by ``(W, N, 4)``."""
+        self.x, self.v = states[None].split(2, -1)
+        self.others[0] = states.permute(2, 0, 1).numpy()
+        self.tables[0][0] = states.permute(0, 2, 1).numpy()
 
     @cached_property
     def place(self) -> Tensor:
@@ -184,7 +195,7 @@ class PersonAlone:
 
     def _add_effects(self, moment: np.ndarray, states: Tensor, rate: Tensor) -> None:
         """Add the accelerations by effects, in parts that fit the cache."""
-        around, out = self.around, rate.numpy()
+        around, out, index = self.around, rate.numpy(), self.around.index(moment)
         components = states.permute(0, 3, 1, 2).contiguous().numpy()
         windows, people = components.shape[2:]
         size = max(1, CACHED // people**2)
@@ -192,7 +203,7 @@ class PersonAlone:
             effects = self._effects[k if self.number > 1 else 0]
             for first in range(0, windows, size):
                 part = slice(first, first + size)
-                current, others = components[k][:, part], around.others[at][:, part]
+                current, others = components[k][:, part], around.others[index[k]][:, part]
                 for axis, component in enumerate(
                     effects(at * around.step / 2, current, others, part)
                 ):
@@ -220,7 +231,7 @@ class PersonAlone:
             accelerations = self._kernel.accelerations(
                 person_states.view(-1, 4).numpy(),
                 np.tile(np.arange(len(place)), number),
-                np.repeat(moment, len(place)),
+                np.repeat(self.around.index(moment), len(place)),
                 np.repeat(row, len(place)),
                 *self.around.tables,
                 self._law,
@@ -235,8 +246,9 @@ class PersonAlone:
         return self._state(self._systems[0], moment, states, self(moment, states))
 
     def _state(self, system: System, moment: np.ndarray, states: Tensor, rate: Tensor) -> State:
-        around, at = self.around, torch.from_numpy(moment)
-        t = (at.to(rate.dtype) * around.step / 2).repeat_interleave(rate.shape[1])
+        around, at = self.around, torch.from_numpy(self.around.index(moment))
+        clock = torch.from_numpy(moment).to(rate.dtype) * around.step / 2
+        t = clock.repeat_interleave(rate.shape[1])
         others = around.x[at].flatten(0, 1), around.v[at].flatten(0, 1)
         (x, v), scene = states.flatten(0, 1).split(2, -1), around.repeated(len(states))
         terms = system.term_list

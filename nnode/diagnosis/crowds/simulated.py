@@ -11,16 +11,18 @@ Source: Wu 1986 (signs of residuals).
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence as Many
 from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.diagnosis.crowds.paths import Path, Smoother
-from nnode.model.system import Crowd, System
+from nnode.model.system import System
+from nnode.simulation.alone import PersonAlone, Surroundings
 from nnode.simulation.numpy import simulated
 
 #: Simulation steps per sampling interval.
@@ -56,43 +58,38 @@ def simulated_pair(
     return crowd(1.0), crowd(-1.0)
 
 
-@torch.no_grad()
 def _disturbances(system: System, batch: Batch, paths: list[Path]) -> list[np.ndarray]:
     """``(K, N, 2)`` accelerations of the measured people that the model does not explain, m/s²."""
-    among_measured = _with(system, "measured")
-    scene = among_measured.scene(batch)
-    time = batch.dt * torch.arange(batch.n_samples, dtype=torch.float64)
+    among_measured = _people(system, batch, batch.x, batch.v, 2 * batch.dt)
     states = torch.cat([batch.x, batch.v], -1)
-    explained = torch.stack(
-        [among_measured(t, y, scene)[..., 2:4] for t, y in zip(time, states, strict=True)]
-    )
-    return [
-        path.a - explained[: len(path.x), b, : path.x.shape[1]].numpy()
-        for b, path in enumerate(paths)
-    ]
+    explained = among_measured(np.arange(len(states)), states).numpy()
+    return [path.a - explained[: len(path.x), b, : path.x.shape[1]] for b, path in enumerate(paths)]
 
 
-@torch.no_grad()
 def _simulated(system: System, batch: Batch, kicks: list[np.ndarray]) -> list[np.ndarray]:
     """``(K, N, 2)`` positions of each sequence's people with all interactions, m."""
-    interacting = _with(system, "simulated")
-    scene, y = interacting.scene(batch), interacting.initial(batch)
-    push = torch.zeros(batch.n_samples, *y.shape, dtype=torch.float64)
+    step = batch.dt / STEPS
+    people = _people(system, batch, batch.x[:1], batch.v[:1], step)
+    push = np.zeros(batch.x.shape)
     for b, kick in enumerate(kicks):
-        push[: len(kick), b, : kick.shape[1], 2:4] = torch.from_numpy(kick)
+        push[: len(kick), b, : kick.shape[1]] = kick
 
     def rate(t: float, y: np.ndarray) -> np.ndarray:
         k = min(int(t / batch.dt + 1e-6), batch.n_samples - 2)
-        kick = torch.lerp(push[k], push[k + 1], t / batch.dt - k)
-        time = torch.tensor(t, dtype=torch.float64)
-        return (interacting(time, torch.from_numpy(y), scene) + kick).numpy()
+        share, states = t / batch.dt - k, torch.from_numpy(y)
+        people.around.replace_others(states)
+        acceleration = people(np.array([round(2 * t / step)]), states[None])[0].numpy()
+        kick = (1 - share) * push[k] + share * push[k + 1]
+        return np.concatenate([y[..., 2:], acceleration + kick], -1)
 
-    states = simulated(rate, y.numpy(), batch.dt, batch.n_samples, batch.dt / STEPS)
+    start = torch.cat([batch.x[0], batch.v[0]], -1).numpy()
+    states = simulated(rate, start, batch.dt, batch.n_samples, step)
     return [states[: len(kick), b, : kick.shape[1], :2] for b, kick in enumerate(kicks)]
 
 
-def _with(system: System, neighbours: str) -> Crowd:
-    crowd = copy.deepcopy(system)
-    assert isinstance(crowd, Crowd)
-    crowd.neighbours = neighbours
-    return crowd
+def _people(system: System, batch: Batch, x: Tensor, v: Tensor, step: float) -> PersonAlone:
+    """The people of a batch among positions and velocities ``(H, B, N, 2)``."""
+    window, person = torch.nonzero(batch.agent, as_tuple=True)
+    around = Surroundings(system.scene(batch), x, v, window, person, step)
+    vector = ParameterVector(system)
+    return PersonAlone(around, system, vector.runs(vector.row[None]))
