@@ -282,15 +282,18 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
         return None
     scores = sorted(scores, key=lambda score: -score.gain)
     significant = min(score.p_value for score in scores) <= thresholds.EACH
-    if not significant and isinstance(engine, AgentsEngine):
-        return None  # the variances were already fitted with the most likely extension
     hinted = {effect.name for hint in hints for effect in effects_of(hint)}
+    # the linear score test can miss a strong, nonlinear effect. Where agents differ, variances were
+    # already fitted with the most likely extension, so that only hints can be such effects
+    strong = hinted if isinstance(engine, AgentsEngine) else {s.effect.name for s in scores}
     ranked = [s for s in scores if s.gain >= thresholds.RIVAL * scores[0].gain][:RIVALS]
+    if not significant:
+        ranked = [s for s in ranked if s.effect.name in strong]
     # the whitening removes most of a change by a property of agents, as of all that differs between
     # agents, so that its gain is too small until the variances are refitted
     hidden = {s.effect.name for s in scores if s.effect.covariate and s.p_value <= thresholds.EACH}
     ranked += [s for s in scores if s.effect.name in hinted | hidden and s not in ranked]
-    candidates = _ranked(engine, selection, ranked, hints, significant)
+    candidates = _ranked(engine, selection, ranked, hints, significant) if ranked else []
     eligible = [
         c
         for c in candidates
@@ -301,8 +304,12 @@ def _next_step(engine: Engine, selection: Selection, hints: Sequence[System]) ->
         and engine.relevant(selection.fit.system, c.fit.system, selection.square)
     ]
     passing = [c for c in eligible if c.score.p_value <= thresholds.EACH]
-    if not passing and not isinstance(engine, AgentsEngine):
-        passing = [c for c in eligible if _significant_held_out(c, screen, len(scores))]
+    if not passing:
+        passing = [
+            c
+            for c in eligible
+            if c.name in strong and _significant_held_out(c, screen, len(scores))
+        ]
     if not passing:
         return None
     best = _simplest(passing, screen)
@@ -339,7 +346,6 @@ def _ranked(
         except SimulationError:
             continue
         candidates.append(_candidate(score, fit, selection.fit, screen))
-        # the linear score test can miss a strong, nonlinear effect
         followed = significant or len(candidates) > 1
         if not followed and not _significant_held_out(candidates[0], screen, len(selection.scores)):
             return []

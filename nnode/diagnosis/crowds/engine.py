@@ -26,9 +26,9 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.sequence import Sequence, collate
-from nnode.diagnosis.crowds.people import CrowdPopulation, People, differences_of
+from nnode.diagnosis.crowds.gait import estimated_gait
+from nnode.diagnosis.crowds.people import CrowdPopulation, Gait, People, differences_of
 from nnode.diagnosis.crowds.simulated import simulated_pair
-from nnode.diagnosis.crowds.sway import estimated_sway
 from nnode.diagnosis.crowds.variables import crowd_variables
 from nnode.diagnosis.crowds.windows import Windows
 from nnode.diagnosis.outcome import Simulation
@@ -59,8 +59,7 @@ class CrowdEngine:
         sequences: of people, equally sampled.
         window: length of a window, s.
         clusters: ``(S,)`` of the sequences; None: each is one.
-        sway: its parameters, see :func:`~nnode.diagnosis.crowds.sway.estimated_sway`; None: they
-            are estimated.
+        gait: of the people; None: it is estimated.
 
     Attributes:
         batch: the sequences.
@@ -79,13 +78,13 @@ class CrowdEngine:
         sequences: Many[Sequence],
         window: float = SECONDS,
         clusters: np.ndarray | None = None,
-        sway: np.ndarray | None = None,
+        gait: Gait | None = None,
     ) -> None:
         self.sequences, self._seconds = list(sequences), window
         self.batch = collate(sequences)
         self.windows = windows = Windows(sequences, window)
         self._people = People(windows)
-        self._people.sway = estimated_sway(self._people) if sway is None else sway
+        self._people.gait = estimated_gait(self._people) if gait is None else gait
         self._label = np.arange(len(sequences)) if clusters is None else np.asarray(clusters)
         self.people = [[pair] for pair in self._people.pairs]
         self.names = [item.name for item in sequences]
@@ -278,7 +277,7 @@ class CrowdEngine:
             sequences = list(self.sequences)
             for i, s in zip(used, crowd, strict=True):
                 sequences[i] = s
-            engine = CrowdEngine(sequences, self._seconds, self._label, self._people.sway)
+            engine = CrowdEngine(sequences, self._seconds, self._label, self._people.gait)
             engine.batch = self.batch  # effects are looked for at the same places
             engine.set_population(engine._people.estimated(model, None, variances))
             engines.append(engine)

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -86,6 +86,19 @@ SLOWEST = 0.05
 DESIRED_SPEED = "desired_speed"
 
 
+class Gait(NamedTuple):
+    """How people walk, whatever the law.
+
+    Attributes:
+        sway: ``(4,)`` the last parameters of :class:`~nnode.population.likelihood.RestartNoise`;
+            empty: people do not sway.
+        acceleration: standard deviation of their other accelerations along a coordinate, m/s².
+    """
+
+    sway: np.ndarray
+    acceleration: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class CrowdPopulation:
     """People who differ, as estimated with a model.
@@ -98,7 +111,7 @@ class CrowdPopulation:
         typical: logarithm of the typical one.
         data: the measured paths of D people, linearised.
         posterior: the marginal likelihood, and the deviations from the simulated people.
-        acceleration: root mean square of the smoothed accelerations along one coordinate, m/s².
+        acceleration: see :class:`Gait`.
     """
 
     system: System
@@ -117,7 +130,7 @@ class CrowdPopulation:
 
     @property
     def explains_rates(self) -> bool:
-        """Whether pushes are small compared to measured accelerations, see
+        """Whether pushes are small compared to accelerations, see
         :data:`~nnode.population.drivers.EXPLAINED`. Otherwise they stand for a deviation of the
         law."""
         return float(self.variances.noise[0]) <= EXPLAINED * self.acceleration
@@ -202,8 +215,7 @@ class People:
         speed: ``(D,)`` preferred speeds as measured, m/s.
         heading: ``(D, T, 2)`` unit vectors from the start to the end of each window, at all T times
             of a person.
-        sway: the last parameters of :attr:`noise`; empty: people do not sway.
-        acceleration: see :class:`CrowdPopulation`.
+        gait: at first without sway.
     """
 
     def __init__(self, windows: Windows) -> None:
@@ -229,10 +241,7 @@ class People:
         heading = self.joined(np.repeat(way[:, None], windows.length, 1))
         self.heading = heading.reshape(len(heading), -1, 2)
         self._last: tuple[np.ndarray, Surroundings] | None = None
-        self.sway = np.zeros(0)
-        velocity = windows.batch.v[:: 2 * windows.sub, window, place].numpy()
-        acceleration = np.gradient(velocity, windows.sub * windows.step, axis=0)
-        self.acceleration = float(np.sqrt(np.mean(acceleration**2)))
+        self.gait = Gait(np.zeros(0), math.inf)
 
     @property
     def noise(self) -> RestartNoise:
@@ -250,7 +259,7 @@ class People:
         Args:
             random: what differs.
         """
-        windows, number, sway = self.windows, len(random), self.sway
+        windows, number, sway = self.windows, len(random), self.gait.sway
         dt = windows.sub * windows.step
         low_push, high_push, push = PUSH[2]
         low_speed, high_speed, speed = START_SPEED
@@ -302,7 +311,7 @@ class People:
             typical=typical,
             data=data,
             posterior=posterior,
-            acceleration=self.acceleration,
+            acceleration=self.gait.acceleration,
         )
 
     def _fitted(

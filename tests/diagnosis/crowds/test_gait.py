@@ -1,4 +1,4 @@
-"""People who sway as they step."""
+"""People who sway as they step, and how much they accelerate."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import nnode
 from benchmarks.people import STRIDES, crowds
 from nnode.data.sequence import Sequence
 from nnode.diagnosis.crowds.engine import SECONDS
-from nnode.diagnosis.crowds.people import People
-from nnode.diagnosis.crowds.sway import estimated_sway
+from nnode.diagnosis.crowds.gait import estimated_gait
+from nnode.diagnosis.crowds.people import Gait, People
 from nnode.diagnosis.crowds.windows import Windows
 
 
@@ -25,31 +25,34 @@ def swaying() -> People:
     return People(Windows(sequences(0.02), SECONDS))
 
 
-def sway_of(walking: list[Sequence]) -> np.ndarray:
-    return estimated_sway(People(Windows(walking, SECONDS)))
+def gait_of(walking: list[Sequence]) -> Gait:
+    return estimated_gait(People(Windows(walking, SECONDS)))
 
 
 def test_parameters_of_sway(swaying: People) -> None:
-    across, along, frequency, lasts = estimated_sway(swaying)
+    (across, along, frequency, lasts), acceleration = estimated_gait(swaying)
     assert across == pytest.approx(0.02 * np.exp(0.3**2), rel=0.2)
     # smoothed speeds at starts contain less of the sway along the direction, which is fast
     assert 0.3 * across < along < 0.6 * across
     assert frequency == pytest.approx(STRIDES, rel=0.03)
     assert lasts > 2.0  # frequencies of people differ by 8 %
+    assert acceleration == pytest.approx(gait_of(sequences(0.0)).acceleration, rel=0.5)
 
 
 def test_people_without_sway() -> None:
-    assert not len(sway_of(sequences(0.0)))
+    sway, acceleration = gait_of(sequences(0.0))
+    assert not len(sway)
+    assert 0.1 < acceleration < 0.4
 
 
 def test_sway_is_not_resolved_by_few_samples() -> None:
-    assert not len(sway_of(sequences(0.02, every=2)))
+    assert not len(gait_of(sequences(0.02, every=2)).sway)
 
 
 def test_given_sway_is_kept() -> None:
     given = np.array([0.01, 0.003, 0.8, 4.0])
     people = People(Windows(sequences(0.0), SECONDS))
-    people.sway = given
+    people.gait = Gait(given, 0.2)
     variances = people.initial_variances(["desired_speed"])
     np.testing.assert_array_equal(variances.noise[-4:], given)
     fixed = variances.low == variances.high

@@ -1,4 +1,4 @@
-"""People's sway: they move from side to side, and faster and slower, as they step.
+"""How people walk, whatever the law: their sway as they step, and how much they accelerate.
 
 Source: Hoogendoorn & Daamen 2005; Liu, Song & Zhang 2009 (lateral sway); the statistical model is
 that of :class:`~nnode.population.likelihood.RestartNoise`.
@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from nnode.calibrate.intervals import at_bounds
-from nnode.diagnosis.crowds.people import People
+from nnode.diagnosis.crowds.people import Gait, People
 from nnode.population.drivers import TOLERANCE
 from nnode.population.estimate import fit_variances
 from nnode.population.likelihood import ANEW, CONTINUED, Linearised
@@ -27,24 +27,22 @@ SWAY = ((1e-4, 0.02, 0.2), (1e-4, 0.005, 0.1), (0.65, 0.95, 1.3), (0.5, 3.0, 30.
 FREQUENCY, NEAR = 2, 1e-3
 
 
-def estimated_sway(people: People) -> np.ndarray:
-    """``(4,)`` the sway's parameters, see :class:`~nnode.population.likelihood.RestartNoise`; empty
-    where there is no evidence for it.
+def estimated_gait(people: People) -> Gait:
+    """The gait without a law, so that all laws are compared with the same: in each window everybody
+    walks on with the smoothed velocity at its start, and is pushed.
 
-    They are estimated without a law, so that all laws are compared with the same sway: in each
-    window everybody walks on with the smoothed velocity at its start, and is pushed. Sway is found
-    if it raises the likelihood by more than its parameters need (Schwarz 1978), and if its
-    frequency is within its bounds.
+    Sway is found if it raises the likelihood by more than its parameters need (Schwarz 1978), and
+    if its frequency is within its bounds.
 
     Args:
-        people: their sway is not used.
+        people: their gait is not used.
     """
-    windows = people.windows
-    if windows.sub * windows.step > RESOLVED:
-        return np.zeros(0)
     data, plain = _walking_straight(people), people.initial_variances([])
     plain = fit_variances(data, people.noise, plain, tolerance=TOLERANCE)
     low, start, high = np.array(SWAY).T
+    without = Gait(np.zeros(0), float(plain.noise[0]))
+    if data.dt > RESOLVED:
+        return without
     swaying = replace(
         plain,
         noise=np.concatenate([plain.noise, start]),
@@ -56,7 +54,8 @@ def estimated_sway(people: People) -> np.ndarray:
     sway = swaying.noise[len(plain.noise) :]
     price = len(sway) * math.log(max(len(people.pairs), 2)) / 2
     at_bound = at_bounds(np.log(sway), np.log(low), np.log(high), NEAR)[FREQUENCY]
-    return sway if after > before + price and not at_bound else np.zeros(0)
+    found = after > before + price and not at_bound
+    return Gait(sway, float(swaying.noise[0])) if found else without
 
 
 def _walking_straight(people: People) -> Linearised:
