@@ -329,8 +329,8 @@ def _ranked(
     """The candidates calibrated with the model, the best first; none if the model fits exactly.
 
     Args:
-        significant: whether any score test rejects. Otherwise further candidates are calibrated
-            only if the first one is significant on held-out clusters.
+        significant: whether any score test rejects. Otherwise, where agents are alike, further
+            candidates are calibrated only if the first one is significant on held-out clusters.
     """
     screen, candidates = selection.screen, list[Candidate]()
     assert screen is not None
@@ -346,7 +346,7 @@ def _ranked(
         except SimulationError:
             continue
         candidates.append(_candidate(score, fit, selection.fit, screen))
-        followed = significant or len(candidates) > 1
+        followed = significant or len(candidates) > 1 or isinstance(engine, AgentsEngine)
         if not followed and not _significant_held_out(candidates[0], screen, len(selection.scores)):
             return []
     if isinstance(engine, AgentsEngine):
