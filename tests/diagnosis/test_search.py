@@ -12,10 +12,12 @@ import pytest
 
 import nnode
 from benchmarks import drivers
+from benchmarks.people import crowds
 from nnode.app.python.inputs import model_options
 from nnode.calibrate.parameters import ParameterVector
 from nnode.diagnosis import candidate, thresholds
 from nnode.diagnosis import search as module
+from nnode.diagnosis.crowds.engine import CrowdEngine
 from nnode.diagnosis.lanes.engine import TrafficEngine
 from nnode.diagnosis.lanes.followers import FollowersEngine
 from nnode.diagnosis.residuals.fit import Fit, refine
@@ -40,16 +42,19 @@ def fitted(strength: float) -> tuple[TrafficEngine, Fit]:
     return engine, converged_fit(engine, lin())
 
 
+scores = Screen.scores
+
+
+def insignificant(screen: Screen, columns: list[Trace]) -> list[Score]:
+    """The scores of a screen, none of them significant."""
+    return [replace(score, p_value=1.0) for score in scores(screen, columns)]
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize(("strength", "names"), [(0.5, ["relative_speed"]), (0.0, [])])
 def test_effect_is_accepted_by_held_out_clusters_alone(
     monkeypatch: pytest.MonkeyPatch, strength: float, names: list[str]
 ) -> None:
-    scores = Screen.scores
-
-    def insignificant(screen: Screen, columns: list[Trace]) -> list[Score]:
-        return [replace(score, p_value=1.0) for score in scores(screen, columns)]
-
     monkeypatch.setattr(Screen, "scores", insignificant)
     engine, fit = fitted(strength)
     result = search(engine, fit, EFFECTS)
@@ -148,3 +153,26 @@ def test_end_of_period_moves_into_sequence(monkeypatch: pytest.MonkeyPatch) -> N
     end = fit.names.index("terms.1.b")
     assert not 500 < fit.row[end] < 530  # drivers of the platoon at 500 s are estimated as slow
     assert _with_best_ends(engine, fit, SpeedPeriod).row[end] == pytest.approx(518, abs=5)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("hinted", [True, False])
+def test_strong_effect_with_a_small_score_is_selected_if_hinted(
+    monkeypatch: pytest.MonkeyPatch, hinted: bool
+) -> None:
+    table = crowds("alignment", 5, push=0.02, sequences=10)
+    engine = CrowdEngine(list(nnode.sequences(table)), clusters=np.arange(10))
+    options = {**model_options("esf"), "desired": "exit"}
+    system, extension = (
+        build_model({**options, "effects": effects}, 0).double()
+        for effects in ([], [{"name": "alignment", "c": 0.15}])
+    )
+    monkeypatch.setattr(Screen, "scores", insignificant)
+    engine.set_population(engine.population_of(engine.regression_start(extension)))
+    result = search(
+        engine,
+        refine(engine, system),
+        [CATALOGUE.effects["alignment"]],
+        hints=[extension] if hinted else [],
+    )
+    assert [step.chosen.name for step in result.steps] == (["alignment"] if hinted else [])
