@@ -157,7 +157,7 @@ class ConfirmationSet:
         )
         self.before = self.comparison.squares(base)
         self.tests: dict[str, _ModelTest] = {}
-        self._corrected_fit: Fit | None = None
+        self._confirmed_fit: Fit | None = None
         self._held_out: dict[str, HeldOutErrors] = {}
 
     def confirmed(
@@ -167,7 +167,7 @@ class ConfirmationSet:
         in the model with all selected effects."""
         if not selection.steps:
             return selection, []
-        full_fit = self._corrected_fit = selection.fit
+        full_fit = self._confirmed_fit = selection.fit
         self.tests = self._closed_tests(engine, selection, full_fit)
         unconfirmed = [
             step for step in selection.steps if not self.tests[step.chosen.name].confirmed
@@ -185,7 +185,7 @@ class ConfirmationSet:
         # the intervals need the whitening of the full model, which without_steps refits
         hypotheses = [self.named(engine, full_fit, step) for step in unconfirmed]
         remaining = without_steps(engine, selection, unconfirmed, self.base)
-        self._corrected_fit = reduced or remaining.fit
+        self._confirmed_fit = reduced or remaining.fit
         return remaining, hypotheses
 
     def named(self, engine: Engine, fit: Fit, step: Step) -> NamedEffect:
@@ -246,9 +246,9 @@ class ConfirmationSet:
 
     def corrected(self, engine: Engine, selection: Selection) -> Fit:
         """The fit with the confirmed effects, corrected for its bias by simulation."""
-        if self._corrected_fit is None or not selection.steps:
+        if self._confirmed_fit is None or not selection.steps:
             return selection.fit
-        return corrected_for_bias(engine, self._corrected_fit, self.seed)
+        return corrected_for_bias(engine, self._confirmed_fit, self.seed)
 
     def confirmation(self, agents: list[Agents]) -> Confirmation:
         """The weakest test of the selected effects: of the population, or else of individuals."""
