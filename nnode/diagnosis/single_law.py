@@ -417,14 +417,22 @@ def _explore(
         raise SimulationError(BLOWS_UP)
     hints = [] if hint is None else [hint]
     if isinstance(engine, AgentsEngine):
-        try:
-            populations = [engine.population_of(initial.system)]
-        except SimulationError as error:
-            raise SimulationError(BLOWS_UP) from error
+        starts = [initial.system]
+        if isinstance(engine, CrowdEngine):
+            # the costs of both starts depend on the simulation by which the engine is whitened
+            starts.append(copy.deepcopy(system).double())
+        from_starts = []
+        for start in starts:
+            with suppress(SimulationError):
+                from_starts.append(engine.population_of(start))
+        if not from_starts:
+            raise SimulationError(BLOWS_UP)
+        populations = [likeliest(from_starts)]
+        start = populations[0].system if isinstance(engine, CrowdEngine) else initial.system
         if testable and not populations[0].plausible:
             # a strong missing effect is attributed to pushes
-            usual = engine.with_usual_variances(initial.system)
-            extensions = likely_extensions(usual, refine(usual, initial.system), effects)
+            usual = engine.with_usual_variances(start)
+            extensions = likely_extensions(usual, refine(usual, start), effects)
             hints += extensions
             for extension in extensions:
                 with suppress(SimulationError):
