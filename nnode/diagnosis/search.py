@@ -76,13 +76,10 @@ class Selection:
 
 def initial_fit(engine: Engine, system: System) -> Fit | None:
     """A model calibrated to the engine's residuals with their present whitening, from the better of
-    two starts: a regression on the measured rates, and its own parameters. None if the simulations
-    of both diverge.
-
-    The regression comes first because an engine of crowds is whitened by its first simulation: with
-    parameters that make people collide, windows would be left out that other parameters explain."""
+    two starts: its own parameters, and a regression on the measured rates. None if the simulations
+    of both diverge."""
     regression = getattr(engine, "regression_start", None)
-    starts = [*([] if regression is None else [regression(system)]), copy.deepcopy(system)]
+    starts = [copy.deepcopy(system), *([] if regression is None else [regression(system)])]
     return best_fit(engine, starts, tolerance=ROUGH)
 
 
