@@ -421,7 +421,7 @@ def _explore(
         if isinstance(engine, CrowdEngine):
             # an engine of crowds is whitened by its first simulation: with parameters that make
             # people collide, windows were left out that others explain
-            starts.append(engine.regression_start(copy.deepcopy(system).double()))
+            starts.append(copy.deepcopy(system).double())
         from_starts = []
         for start in starts:
             with suppress(SimulationError):
