@@ -417,19 +417,16 @@ def _explore(
         raise SimulationError(BLOWS_UP)
     hints = [] if hint is None else [hint]
     if isinstance(engine, AgentsEngine):
-        starts = [initial.system]
-        if isinstance(engine, CrowdEngine):
-            # an engine of crowds is whitened by its first simulation: with parameters that make
-            # people collide, windows were left out that others explain
-            starts.append(copy.deepcopy(system).double())
-        from_starts = []
-        for start in starts:
-            with suppress(SimulationError):
-                from_starts.append(engine.population_of(start))
-        if not from_starts:
-            raise SimulationError(BLOWS_UP)
-        populations = [likeliest(from_starts)]
-        start = populations[0].system if isinstance(engine, CrowdEngine) else initial.system
+        start, populations = initial.system, list[Any]()
+        try:
+            if isinstance(engine, CrowdEngine):
+                own = copy.deepcopy(system).double()
+                populations.append(engine.population_of(start, own))
+                start = populations[0].system
+            else:
+                populations.append(engine.population_of(start))
+        except SimulationError as error:
+            raise SimulationError(BLOWS_UP) from error
         if testable and not populations[0].plausible:
             # a strong missing effect is attributed to pushes
             usual = engine.with_usual_variances(start)

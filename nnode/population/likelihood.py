@@ -81,7 +81,8 @@ class Linearised:
             :data:`CONTINUED` where pushes continue, :data:`ANEW` where nothing is known of them,
             0 elsewhere; None: nowhere.
         weight: ``(S, K)`` of the whitened samples' squares; None: 1.
-        heading: ``(S, K / A, A)`` unit vectors in the direction of walking, for :class:`Sway`.
+        heading: ``(S, K / A, A)`` unit vectors in the direction of walking, along and across which
+            people sway; None: they do not sway.
     """
 
     residual: np.ndarray

@@ -171,14 +171,29 @@ class CrowdEngine:
         common = self._people.parted(self._whitening(data.fixed[..., : population.has_speed]))
         self._common = np.linalg.qr(common.reshape(len(self.unit), population.has_speed))[0]
 
-    def population_of(self, system: System) -> CrowdPopulation:
+    def population_of(self, *starts: System) -> CrowdPopulation:
         """The estimate with a model, whose parameters are calibrated with it; the engine keeps its
-        own. It starts from usual variances: those of a model that lacks a strong effect would hide
-        it.
+        own. The likeliest one from several starts.
+
+        Args:
+            starts: the model with different parameters. Costs from different starts cannot be
+                compared: a search is whitened by its first simulation, and where parameters make
+                people collide, windows are left out that others explain.
 
         Raises:
-            SimulationError: the model cannot be simulated.
+            SimulationError: the simulations of all starts diverge.
         """
+        populations = list[CrowdPopulation]()
+        for start in starts:
+            with suppress(SimulationError, np.linalg.LinAlgError):
+                populations.append(self._population_from(start))
+        if not populations:
+            raise SimulationError("the paths of people diverge from all starts")
+        return max(populations, key=lambda population: population.criterion)
+
+    def _population_from(self, system: System) -> CrowdPopulation:
+        """The estimate that starts from usual variances: those of a model that lacks a strong
+        effect would hide it."""
         engine = copy.copy(self)
         engine.population = None
         fitted, best = refine(engine, copy.deepcopy(system)).system, None
@@ -242,13 +257,7 @@ class CrowdEngine:
         Raises:
             SimulationError: the simulations of all starts diverge.
         """
-        populations = list[CrowdPopulation]()
-        for start in starts:
-            with suppress(SimulationError, np.linalg.LinAlgError):
-                populations.append(self.population_of(start.double()))
-        if not populations:
-            raise SimulationError("the paths of people diverge from all starts")
-        best = max(populations, key=lambda population: population.criterion)
+        best = self.population_of(*(start.double() for start in starts))
         of_people = self._label[[b for b, _ in self._people.pairs]]
         cluster = np.unique(of_people, return_inverse=True)[1].reshape(-1)
         values = np.bincount(cluster, best.each)

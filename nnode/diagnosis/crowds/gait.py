@@ -15,7 +15,7 @@ from nnode.calibrate.intervals import at_bounds
 from nnode.diagnosis.crowds.people import Gait, People
 from nnode.population.drivers import TOLERANCE
 from nnode.population.estimate import fit_variances
-from nnode.population.likelihood import ANEW, CONTINUED, Linearised
+from nnode.population.likelihood import Linearised
 
 #: s; sampled more coarsely, sway is not resolved: people make two steps per second.
 RESOLVED = 0.15
@@ -60,14 +60,12 @@ def estimated_gait(people: People) -> Gait:
 
 def _walking_straight(people: People) -> Linearised:
     """The paths of people who walk on with the velocity at the start of a window."""
-    windows, dt = people.windows, people.windows.sub * people.windows.step
+    windows, dt = people.windows, people.windows.interval
     number, times = len(people.unit), windows.length
     window, place = windows.person.T
     x, v = (array[0, window, place].numpy() for array in (windows.batch.x, windows.batch.v))
     straight = x[:, None] + dt * np.arange(times)[:, None] * v[:, None]
     measured = windows.measured[:, window, place].swapaxes(0, 1)
-    restart = np.zeros((number, times), dtype=np.int8)
-    restart[:, 0] = np.where(windows.number[window] > 0, CONTINUED, ANEW)
     one, zero = np.eye(2), np.zeros((2, 2))
     free = np.block([[one, dt * one], [zero, one]])
     pushed = np.concatenate([dt**2 / 4 * one, dt / 2 * one])
@@ -83,7 +81,7 @@ def _walking_straight(people: People) -> Linearised:
         agent=np.arange(len(observed)),
         step=np.broadcast_to(free, (*intervals, 4, 4)),
         forced=np.broadcast_to(pushed, (*intervals, 4, 2)),
-        restart=people.joined(restart),
+        restart=people.restarts(),
         heading=people.heading,
         dt=dt,
     )

@@ -260,7 +260,7 @@ class People:
             random: what differs.
         """
         windows, number, sway = self.windows, len(random), self.gait.sway
-        dt = windows.sub * windows.step
+        dt = windows.interval
         low_push, high_push, push = PUSH[2]
         low_speed, high_speed, speed = START_SPEED
         duration = dt * windows.length * self._number
@@ -384,7 +384,7 @@ class People:
         windows, row = self.windows, ParameterVector(system).row[None]
         states = self.states(system, row, speed)
         run = RunAlone(self.around(system, speed), system, states[:, 0])
-        stride, dt, times = windows.sub, windows.sub * windows.step, windows.length
+        stride, dt, times = windows.sub, windows.interval, windows.length
         # a free person's position changes by a unit with the first position, by the time with speed
         growth = np.abs(run.by_start()) / np.repeat([1.0, dt * times], 2)
         used = growth.max((1, 2, 3)) < GROWTH
@@ -394,10 +394,7 @@ class People:
             np.pad(part.numpy().swapaxes(0, 1), ((0, 0), (0, 1), (0, 0), (0, 0)))
             for part in matrices
         )
-        restart = np.zeros((len(self.pairs), self._number * times), dtype=np.int8)
-        ordinary = self.joined((used & (weight > ORDINARY))[:, None])
-        restart[:, ::times] = CONTINUED
-        restart[:, 0] = ANEW
+        ordinary, restart = self.joined((used & (weight > ORDINARY))[:, None]), self.restarts()
         restart[:, times::times][~ordinary[:, :-1]] = ANEW
         fixed = self.joined(self._random_columns(system, run, random, speed))
         residual = self.joined(self.differences(states)[0])
@@ -415,6 +412,13 @@ class People:
             heading=self.heading,
             dt=dt,
         )
+
+    def restarts(self) -> np.ndarray:
+        """``(D, T)`` where windows begin, see :class:`~nnode.population.likelihood.Linearised`."""
+        restart = np.zeros(self.heading.shape[:2], dtype=np.int8)
+        restart[:, :: self.windows.length] = CONTINUED
+        restart[:, 0] = ANEW
+        return restart
 
     def _random_columns(
         self, system: System, run: RunAlone, random: list[str], speed: np.ndarray

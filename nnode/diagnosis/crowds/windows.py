@@ -98,6 +98,11 @@ class Windows:
         self.sequence, self.number = np.array(sequence), np.array(number)
 
     @property
+    def interval(self) -> float:
+        """s, between two residuals."""
+        return self.sub * self.step
+
+    @property
     def steps(self) -> int:
         """Steps of the simulation of a window."""
         return self.sub * (self.length - 1)

@@ -147,7 +147,7 @@ class AgentsEngine(Engine, Protocol):
 
     population: Any
 
-    def population_of(self, system: System) -> Any:
+    def population_of(self, system: System, /) -> Any:
         """The estimate with a model, whose parameters are calibrated with it; the engine keeps its
         own."""
         ...
