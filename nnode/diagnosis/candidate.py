@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,13 +54,17 @@ class Candidate:
         return low < high
 
     def strength_excludes_neutral(self, cluster: np.ndarray, *, minimal: bool = False) -> bool:
-        """Whether the interval of any of its strengths excludes the neutral value.
+        """Whether the interval of any of its strengths, given its settings, excludes the neutral
+        value. With a neutral strength, settings have no influence, so that their errors say nothing
+        about whether the strength is neutral (Davies 1977).
 
         Args:
             minimal: whether it must exclude all negligible strengths as well.
         """
-        intervals, effect = self.fit.jackknife_intervals(cluster), self.score.effect
-        place = place_of(self.fit.system, self.name)
+        effect, place = self.score.effect, place_of(self.fit.system, self.name)
+        settings = [f"terms.{place}.{name}" for name in effect.settings]
+        given_settings = replace(self.fit, free=self.fit.free & ~np.isin(self.fit.names, settings))
+        intervals = given_settings.jackknife_intervals(cluster)
         negligible = negligible_strengths(effect, len(effect.strengths)) * minimal
         bounds = [
             (strength.neutral, margin, *intervals[self.fit.names.index(f"terms.{place}.{name}")])

@@ -104,7 +104,10 @@ def compare_laws(
         number = np.bincount(engine.cluster)
         errors = {k: float((heldout(f, engine.cluster) / number).mean()) for k, f in fits.items()}
         if isinstance(engine, FollowersEngine):
-            starts = {key: [fit.system, formulas[key]] for key, fit in fits.items()}
+            starts = {
+                key: [fit.system, formulas[key], engine.regression_start(formulas[key])]
+                for key, fit in fits.items()
+            }
             compared = _by_likelihood(engine, starts, refused, within)
         else:
             engine = windows_of(asked, part.sequences, part.label)
@@ -150,16 +153,15 @@ def _by_likelihood(
     """Rank laws by their marginal likelihoods.
 
     Args:
-        starts: the laws by name with different parameters, last as given. Parameters of a
-            calibration with the same ones for all agents may be far from those of the typical one.
+        starts: the laws by name with different parameters. Those of a calibration with the same
+            ones for all agents may be far from those of the typical one.
         refused: laws whose paths diverge are added.
     """
     values, systems = dict[str, np.ndarray](), dict[str, System]()
     for place, (name, laws) in enumerate(starts.items()):
         within((1 + place / len(starts)) / 2)
         try:
-            regression = engine.regression_start(laws[-1])
-            value, system = engine.log_likelihoods(*laws, regression)
+            value, system = engine.log_likelihoods(*laws)
         except (SimulationError, np.linalg.LinAlgError):
             value = np.array([np.nan])
         if np.isfinite(value).all():

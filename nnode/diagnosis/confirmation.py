@@ -229,7 +229,7 @@ class ConfirmationSet:
             float(np.nanmean(squares(system))) for system in (before, after)
         )
         errors_fall = (
-            error_after < error_before or before is not self.base or self.comparison.drivers
+            error_after < error_before or before is not self.base or self.comparison.agents_differ
         )
         return _ModelTest(
             float(combined(exploration, confirmation, self.n_exploration, self.clusters)),
@@ -352,7 +352,7 @@ class ConfirmationSet:
             {"name": self.sequences[i].name, "before": float(a), "after": float(b)}
             for i, a, b in zip(used, before, after, strict=True)
         ]
-        compared = "drivers" if self.comparison.drivers else self.domain
+        compared = "drivers" if self.comparison.followers else self.domain
         gap = Gap(
             mean_before, mean_after, floor, closed, definition=defined(compared, bool(individual))
         )

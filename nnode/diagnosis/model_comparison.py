@@ -63,7 +63,7 @@ def windows_of(
 ) -> Engine:
     """The engine for any models of one domain, also those that are code."""
     if system.domain == "crowd":
-        return CrowdEngine(sequences, clusters=clusters)
+        return CrowdEngine(sequences, clusters=clusters, given=system)
     return TrafficEngine(sequences, clusters=clusters)
 
 
@@ -84,9 +84,14 @@ class ModelComparison:
             self._reported = engine_of(base, engine.sequences, whole=True)
 
     @property
-    def drivers(self) -> bool:
-        """Whether drivers differ in the residuals. Then errors of positions are mostly due to
+    def agents_differ(self) -> bool:
+        """Whether agents differ in the residuals. Then errors of positions are mostly due to
         autocorrelated pushes and are no criterion."""
+        return isinstance(self._engine, AgentsEngine)
+
+    @property
+    def followers(self) -> bool:
+        """Whether errors are those of followers one by one."""
         return isinstance(self._engine, FollowersEngine)
 
     @property

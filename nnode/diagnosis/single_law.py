@@ -412,23 +412,16 @@ def _explore(
     part, apart = division.exploration, spacing(sequences, options)
     engine = engine_of(system, part.sequences, part.label, differ=differ, apart=apart)
     testable = int(engine.cluster.max()) + 1 >= _least_clusters(options, len(effects))
-    initial = initial_fit(engine, copy.deepcopy(system).double())
-    if initial is None:
-        raise SimulationError(BLOWS_UP)
+    initial = _initial(engine, system)
     hints = [] if hint is None else [hint]
     if isinstance(engine, AgentsEngine):
-        start, populations = initial.system, list[Any]()
         try:
-            if isinstance(engine, CrowdEngine):
-                own = copy.deepcopy(system).double()
-                populations.append(engine.population_of(start, own))
-                start = populations[0].system
-            else:
-                populations.append(engine.population_of(start))
+            populations = [engine.population_of(initial)]
         except SimulationError as error:
             raise SimulationError(BLOWS_UP) from error
         if testable and not populations[0].plausible:
             # a strong missing effect is attributed to pushes
+            start = populations[0].system
             usual = engine.with_usual_variances(start)
             extensions = likely_extensions(usual, refine(usual, start), effects)
             hints += extensions
@@ -438,12 +431,12 @@ def _explore(
                 if populations[-1].plausible:
                     break
         engine.set_population(likeliest(populations))
-        fit = best_fit(engine, [populations[0].system, initial.system])
+        fit = best_fit(engine, [populations[0].system, initial])
         if fit is None:
             raise SimulationError(BLOWS_UP)
         base = fit
     else:
-        base = converged_fit(engine, initial.system)
+        base = converged_fit(engine, initial)
     base_system = copy.deepcopy(base.system)
     clock.lap("calibrate")
     stages.begin("locating")
@@ -479,6 +472,21 @@ def _explore(
         selection=selection,
         simultaneity=simultaneity,
     )
+
+
+def _initial(engine: Engine, system: System) -> System:
+    """Where the calibration of a model starts.
+
+    Raises:
+        SimulationError: the model cannot be simulated on these data.
+    """
+    own = copy.deepcopy(system).double()
+    if isinstance(engine, CrowdEngine):  # estimates people from several starts
+        return own
+    fit = initial_fit(engine, own)
+    if fit is None:
+        raise SimulationError(BLOWS_UP)
+    return fit.system
 
 
 def _least_clusters(options: DiscoverOptions, effects: int) -> int:

@@ -13,6 +13,7 @@ models of a diagnosis are compared with the same whitening.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from collections.abc import Sequence as Many
 from contextlib import suppress
@@ -32,11 +33,13 @@ from nnode.diagnosis.crowds.simulated import simulated_pair
 from nnode.diagnosis.crowds.variables import crowd_variables
 from nnode.diagnosis.crowds.windows import Windows
 from nnode.diagnosis.outcome import Simulation
-from nnode.diagnosis.residuals.engine import Squares, of_residuals, removes_enough
+from nnode.diagnosis.residuals.engine import Squares, of_residuals
+from nnode.diagnosis.residuals.fit import ROUGH as ROUGH_COST
 from nnode.diagnosis.residuals.fit import refine
 from nnode.diagnosis.residuals.variables import Variable
 from nnode.errors import SimulationError
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
+from nnode.model.extend import effects_of, extended
 from nnode.model.system import Crowd, System
 from nnode.model.term import State
 from nnode.population.drivers import ROUGH
@@ -60,6 +63,7 @@ class CrowdEngine:
         window: length of a window, s.
         clusters: ``(S,)`` of the sequences; None: each is one.
         gait: of the people; None: it is estimated.
+        given: the law with the parameters where calibrations start, see :meth:`population_of`.
 
     Attributes:
         batch: the sequences.
@@ -79,8 +83,10 @@ class CrowdEngine:
         window: float = SECONDS,
         clusters: np.ndarray | None = None,
         gait: Gait | None = None,
+        given: System | None = None,
     ) -> None:
         self.sequences, self._seconds = list(sequences), window
+        self._given = None if given is None else copy.deepcopy(given).double()
         self.batch = collate(sequences)
         self.windows = windows = Windows(sequences, window)
         self._people = People(windows)
@@ -115,7 +121,14 @@ class CrowdEngine:
         return Squares(squares.ravel(), self.windows.sequence[window].repeat(n_samples))
 
     def relevant(self, before: System, after: System, square: float) -> bool:
-        return removes_enough(self, before, after, square)
+        """Whether simulated positions with and without an effect differ by the error of measured
+        ones (root mean square), with the same desired speeds. Pushes produce most of the errors, so
+        the decrease of the errors shows no effect."""
+        without, with_effect = (
+            self._people.differences(self._states(system, ParameterVector(system).row[None]))
+            for system in (before, after)
+        )
+        return not math.sqrt(np.mean((with_effect - without) ** 2)) < self._people.error
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """The windows in sequence, with the deviations of :meth:`squares`."""
@@ -171,42 +184,59 @@ class CrowdEngine:
         common = self._people.parted(self._whitening(data.fixed[..., : population.has_speed]))
         self._common = np.linalg.qr(common.reshape(len(self.unit), population.has_speed))[0]
 
-    def population_of(self, *starts: System) -> CrowdPopulation:
-        """The estimate with a model, whose parameters are calibrated with it; the engine keeps its
-        own. The likeliest one from several starts.
-
-        Args:
-            starts: the model with different parameters. Costs from different starts cannot be
-                compared: a search is whitened by its first simulation, and where parameters make
-                people collide, windows are left out that others explain.
+    def population_of(self, system: System) -> CrowdPopulation:
+        """The likeliest estimate with a model, whose parameters are calibrated with it; the engine
+        keeps its own. Calibrations start from the model's parameters, and from a regression that
+        starts from those of the law as it was given.
 
         Raises:
             SimulationError: the simulations of all starts diverge.
         """
+        law = system if self._given is None else self._given
+        present = {effect.name for effect in effects_of(law)}
+        for effect in effects_of(system):
+            if effect.name not in present:
+                law, _ = extended(law, type(effect)(**effect.options()).double())
+        return self._likeliest(system, self.regression_start(law))
+
+    def _likeliest(self, *starts: System) -> CrowdPopulation:
+        """The estimate that is converged from the start that is likeliest after one alternation.
+
+        Costs from different starts cannot be compared: a search is whitened by its first
+        simulation, and where parameters make people collide, windows are left out that others
+        explain.
+        """
         populations = list[CrowdPopulation]()
         for start in starts:
             with suppress(SimulationError, np.linalg.LinAlgError):
-                populations.append(self._population_from(start))
+                populations.append(self._first(start))
         if not populations:
             raise SimulationError("the paths of people diverge from all starts")
-        return max(populations, key=lambda population: population.criterion)
+        return self._converged(max(populations, key=lambda population: population.criterion))
 
-    def _population_from(self, system: System) -> CrowdPopulation:
-        """The estimate that starts from usual variances: those of a model that lacks a strong
-        effect would hide it."""
+    def _first(self, system: System) -> CrowdPopulation:
+        """The estimate after one alternation. It starts from usual variances: those of a model that
+        lacks a strong effect would hide it."""
         engine = copy.copy(self)
         engine.population = None
-        fitted, best = refine(engine, copy.deepcopy(system)).system, None
+        fitted = refine(engine, copy.deepcopy(system), tolerance=ROUGH_COST).system
+        engine.fit_whitening(fitted, ParameterVector(fitted).row)
+        assert engine.population is not None
+        return engine.population
+
+    def _converged(self, start: CrowdPopulation) -> CrowdPopulation:
+        """The likeliest estimate of further alternations."""
+        engine, best = copy.copy(self), start
+        engine.set_population(start)
         for _ in range(ALTERNATIONS):
+            assert engine.population is not None
+            fitted = refine(engine, copy.deepcopy(engine.population.system)).system
             engine.fit_whitening(fitted, ParameterVector(fitted).row)
-            present = engine.population
-            assert present is not None
-            risen = np.inf if best is None else present.criterion - best.criterion
-            best = present if risen > 0 else best
+            risen = engine.population.criterion - best.criterion
+            if risen > 0:
+                best = engine.population
             if risen < ROUGH:
                 break
-            fitted = refine(engine, fitted).system
-        assert best is not None
         return best
 
     def variations(self) -> dict[str, dict[str, Any]]:
@@ -252,12 +282,14 @@ class CrowdEngine:
         the logarithm of the number of people (BIC); and the calibrated law.
 
         Args:
-            starts: the law with different parameters, from each of which it is calibrated.
+            starts: the law with different parameters, from each of which it is calibrated, and
+                from a regression.
 
         Raises:
             SimulationError: the simulations of all starts diverge.
         """
-        best = self.population_of(*(start.double() for start in starts))
+        laws = [start.double() for start in starts]
+        best = self._likeliest(*laws, self.regression_start(laws[0]))
         of_people = self._label[[b for b, _ in self._people.pairs]]
         cluster = np.unique(of_people, return_inverse=True)[1].reshape(-1)
         values = np.bincount(cluster, best.each)

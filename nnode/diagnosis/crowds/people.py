@@ -246,10 +246,10 @@ class People:
     @property
     def noise(self) -> RestartNoise:
         """The covariance of residuals."""
-        return RestartNoise(START_POSITION * self._error)
+        return RestartNoise(START_POSITION * self.error)
 
     @property
-    def _error(self) -> float:
+    def error(self) -> float:
         """Standard deviation of the errors of positions, m."""
         return max(math.sqrt(self.windows.variance), ERROR)
 
@@ -265,8 +265,8 @@ class People:
         low_speed, high_speed, speed = START_SPEED
         duration = dt * windows.length * self._number
         short, long = SHORT * dt, max(LONG * duration, 2 * SHORT * dt)
-        noise = np.array([push, np.clip(LASTING, short, long), self._error, speed])
-        low, high = [low_push, short, self._error, low_speed], [high_push, long, self._error]
+        noise = np.array([push, np.clip(LASTING, short, long), self.error, speed])
+        low, high = [low_push, short, self.error, low_speed], [high_push, long, self.error]
         return Variances(
             noise=np.concatenate([noise, sway]),
             spread=np.full(number, SPREAD),

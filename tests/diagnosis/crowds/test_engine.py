@@ -236,9 +236,30 @@ def test_small_errors_of_a_start_hardly_change_residuals(engine: CrowdEngine) ->
     finally:
         batch.x[0], batch.v[0] = start
     change = float((after - before).square().mean().sqrt())
-    unweighted = np.sqrt(np.mean((raw_before - raw_after) ** 2)) / engine._people._error
+    unweighted = np.sqrt(np.mean((raw_before - raw_after) ** 2)) / engine._people.error
     assert np.abs(raw_before - raw_after).max() > 0.02
     assert change < 0.1 * unweighted
+
+
+@pytest.mark.parametrize(("a_x", "relevant"), [(0.001, False), (0.05, True)])
+def test_relevance_of_effect_depends_on_change_of_paths(
+    engine: CrowdEngine, a_x: float, relevant: bool
+) -> None:
+    """People who drift are displaced by a_x t²/2 at most, within 2 s; positions have errors of
+    5 mm."""
+    changed, _ = extended(model(), Drift(a_x=a_x, a_y=0.0))
+    assert engine.relevant(model(), changed, 1.0) is relevant
+
+
+@pytest.mark.thorough
+def test_likelier_start_is_taken() -> None:
+    engine, system = CrowdEngine(people_who_differ(4)[:5]), with_speeds()
+    distant = copy.deepcopy(system)
+    ParameterVector(distant).fill_(np.array([0.0, 3.0, 0.5, 1.0, 1.5]))
+    first = [engine._first(start) for start in (distant, system)]
+    assert first[0].criterion < first[1].criterion
+    expected = engine._converged(first[1]).criterion
+    assert engine._likeliest(distant, system).criterion == expected > first[1].criterion
 
 
 def test_person_who_jumps_has_small_weight(plain: list[Sequence]) -> None:
