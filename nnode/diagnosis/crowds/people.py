@@ -74,8 +74,9 @@ ORDINARY = 0.5
 #: Windows are left out if a change of a start grows by more than this factor: people who touch
 #: make paths chaotic.
 GROWTH = 4.0
-#: Linearisations in which desired speeds, variances and weights are estimated.
-ROUNDS = 3
+#: Smallest and largest number of linearisations in which desired speeds, variances and weights are
+#: estimated, and the change of desired speeds (root mean square, as a share) at which they end.
+ROUNDS, MOST_ROUNDS, CLOSE = 3, 8, 0.01
 #: Number of pairs of people in the largest intermediate result.
 CHUNK = 100_000
 #: Difference of the logarithm of desired speeds for derivatives.
@@ -293,16 +294,29 @@ class People:
         if start is not None and start.random == random:
             speed, typical = start.speed, start.typical
             present = start.variances if variances is None else variances
-        for round_ in range(ROUNDS):
-            data = self._linearised(system, random, speed, typical, weight)
+        share, last_change = 1.0, math.inf
+        for round_ in range(MOST_ROUNDS):
+            data = self._linearised(system, random, speed, typical)
+            if round_ > 0:
+                # weights of the linearisation before would count windows fully that it left out
+                data = self._weighted(data, weight)
+                weight = self._weights(data, self.posterior(data, random, present), present)
+            data = self._weighted(data, weight)
             if variances is None:
                 present = self._fitted(data, random, present, several=round_ == 0)
             posterior = self.posterior(data, random, present)
-            if round_ < ROUNDS - 1:
-                weight = self._weights(data, posterior, present)
-                if DESIRED_SPEED in random:
-                    typical += float(posterior.change[0])
-                    speed = np.maximum(np.exp(typical + posterior.deviations[:, 0]), SLOWEST)
+            shift, step = 0.0, np.zeros(len(speed))
+            if DESIRED_SPEED in random:
+                shift = float(posterior.change[0])
+                modes = np.exp(typical + shift + posterior.deviations[:, 0])
+                step = np.log(np.maximum(modes, SLOWEST)) - np.log(speed)
+            change = math.sqrt(np.mean(step**2))
+            if round_ >= ROUNDS - 1 and (change < CLOSE or round_ == MOST_ROUNDS - 1):
+                break
+            share = share / 2 if change > last_change else share
+            last_change = change
+            typical += share * shift
+            speed = speed * np.exp(share * step)
         return CrowdPopulation(
             system=system,
             random=random,
@@ -374,13 +388,8 @@ class People:
         random: list[str],
         speed: np.ndarray,
         typical: float,
-        weight: np.ndarray,
     ) -> Linearised:
-        """The measured paths, linearised at desired speeds ``(D,)``.
-
-        Args:
-            weight: ``(P,)`` of the windows.
-        """
+        """The measured paths, linearised at desired speeds ``(D,)``, without weights."""
         windows, row = self.windows, ParameterVector(system).row[None]
         states = self.states(system, row, speed)
         run = RunAlone(self.around(system, speed), system, states[:, 0])
@@ -394,8 +403,6 @@ class People:
             np.pad(part.numpy().swapaxes(0, 1), ((0, 0), (0, 1), (0, 0), (0, 0)))
             for part in matrices
         )
-        ordinary, restart = self.joined((used & (weight > ORDINARY))[:, None]), self.restarts()
-        restart[:, times::times][~ordinary[:, :-1]] = ANEW
         fixed = self.joined(self._random_columns(system, run, random, speed))
         residual = self.joined(self.differences(states)[0])
         return Linearised(
@@ -407,11 +414,19 @@ class People:
             agent=np.arange(len(self.pairs)),
             step=self.joined(step)[:, :-1],
             forced=self.joined(dt / 2 * after[..., 2:])[:, :-1],
-            restart=restart,
-            weight=self.joined(np.repeat(weight[:, None], 2 * times, 1)),
             heading=self.heading,
             dt=dt,
         )
+
+    def _weighted(self, data: Linearised, weight: np.ndarray) -> Linearised:
+        """The paths with weights ``(P,)`` of the windows, which also decide where pushes
+        continue."""
+        times, restart = self.windows.length, self.restarts()
+        used = self.parted(data.observed)[:, 0]
+        ordinary = self.joined((used & (weight > ORDINARY))[:, None])
+        restart[:, times::times][~ordinary[:, :-1]] = ANEW
+        weights = self.joined(np.repeat(weight[:, None], 2 * times, 1))
+        return replace(data, restart=restart, weight=weights)
 
     def restarts(self) -> np.ndarray:
         """``(D, T)`` where windows begin, see :class:`~nnode.population.likelihood.Linearised`."""
