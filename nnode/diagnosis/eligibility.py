@@ -9,8 +9,6 @@ from nnode.model.build import add_effects
 from nnode.model.effects import Effect, IndividualEffect
 from nnode.model.expression import symbols
 from nnode.model.extend import effects_of
-from nnode.model.formula import crowd_of
-from nnode.model.laws import Law
 from nnode.model.system import Crowd, System, Traffic
 from nnode.model.terms import SMALLEST
 
@@ -65,8 +63,7 @@ def check_model(system: System) -> None:
     Raises:
         ConfigError: names the term and what to do.
     """
-    crowd = system.domain == "crowd"
-    law = crowd_of([t for t in system.terms if isinstance(t, Law)]) if crowd else None
+    law = system.law_formula if isinstance(system, Crowd) else None
     if law is not None and (law.order == 1 or law.sums[SMALLEST]):
         what = "of first order" if law.order == 1 else "with smallest values over others"
         raise ConfigError(

@@ -310,6 +310,11 @@ class Crowd(System):
     def formula(self) -> CrowdDynamics | None:
         return crowd_of(self.term_list)
 
+    @property
+    def law_formula(self) -> CrowdDynamics | None:
+        """The formula of its laws without effects; None where one is code without a formula."""
+        return crowd_of([term for term in self.term_list if isinstance(term, Law)])
+
     def scene(self, batch: Batch) -> Scene:
         return with_destinations(super().scene(batch), batch, self.desired)
 

@@ -186,8 +186,8 @@ class CrowdEngine:
 
     def population_of(self, system: System) -> CrowdPopulation:
         """The likeliest estimate with a model, whose parameters are calibrated with it; the engine
-        keeps its own. Calibrations start from the model's parameters, and from a regression that
-        starts from those of the law as it was given.
+        keeps its own. Calibrations start from the model's parameters, and for formulas from a
+        regression that starts from those of the law as it was given.
 
         Raises:
             SimulationError: the simulations of all starts diverge.
@@ -197,7 +197,13 @@ class CrowdEngine:
         for effect in effects_of(system):
             if effect.name not in present:
                 law, _ = extended(law, type(effect)(**effect.options()).double())
-        return self._likeliest(system, self.regression_start(law))
+        return self._likeliest(system, *self._by_regression(law))
+
+    def _by_regression(self, system: System) -> list[System]:
+        """A further start, see :meth:`regression_start`; none for networks, where a regression on
+        60 parameters takes minutes."""
+        assert isinstance(system, Crowd)
+        return [] if system.law_formula is None else [self.regression_start(system)]
 
     def _likeliest(self, *starts: System) -> CrowdPopulation:
         """The estimate that is converged from the start that is likeliest after one alternation.
@@ -283,13 +289,13 @@ class CrowdEngine:
 
         Args:
             starts: the law with different parameters, from each of which it is calibrated, and
-                from a regression.
+                from a regression if it is a formula.
 
         Raises:
             SimulationError: the simulations of all starts diverge.
         """
         laws = [start.double() for start in starts]
-        best = self._likeliest(*laws, self.regression_start(laws[0]))
+        best = self._likeliest(*laws, *self._by_regression(laws[0]))
         of_people = self._label[[b for b, _ in self._people.pairs]]
         cluster = np.unique(of_people, return_inverse=True)[1].reshape(-1)
         values = np.bincount(cluster, best.each)

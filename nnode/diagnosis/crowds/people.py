@@ -30,8 +30,6 @@ from nnode.diagnosis.crowds.windows import Windows
 from nnode.diagnosis.eligibility import check_model
 from nnode.model.effects.base import Effect
 from nnode.model.expression import symbols
-from nnode.model.formula import crowd_of
-from nnode.model.laws import Law
 from nnode.model.system import Crowd, System
 from nnode.population.drivers import (
     EXPLAINED,
@@ -180,7 +178,7 @@ def differing(system: System) -> list[str]:
     """Names of the quantities in which people differ: the desired speed if the model contains it,
     and positive parameters of its law that are in no sum over others or walls."""
     assert isinstance(system, Crowd)
-    law = crowd_of([term for term in system.term_list if isinstance(term, Law)])
+    law = system.law_formula
     if law is None:
         return []
     in_sums = symbols([x for summands in law.sums.values() for x in summands.values()])
