@@ -37,7 +37,7 @@ from nnode.diagnosis.search import Selection, Step, initial_fit
 from nnode.diagnosis.statistics.paired import compare, heldout
 from nnode.errors import ConfigError, SimulationError
 from nnode.model.effects import CATALOGUE, Effect
-from nnode.model.extend import effects_of, extended
+from nnode.model.extend import with_missing
 from nnode.model.system import System
 from nnode.population.followers import drivers_differ, follower_formula, without_errors
 
@@ -220,11 +220,10 @@ def with_effects(laws: Mapping[str, System], effects: list[Effect]) -> dict[str,
     extended_laws = {}
     for name, law in laws.items():
         offered = CATALOGUE.of(law.domain, law.order)
-        present = {effect.name for effect in effects_of(law)}
         for effect in effects:
             kind = type(effect)
-            if kind in offered and effect.name not in present and not not_offered(kind, law):
-                law, _ = extended(law, kind(**effect.options()))
+            if kind in offered and not not_offered(kind, law):
+                law = with_missing(law, [effect])
         extended_laws[name] = copy.deepcopy(law)
     return extended_laws
 

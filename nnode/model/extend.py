@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 
 from nnode.model.effects import Effect
 from nnode.model.system import System
@@ -25,6 +26,15 @@ def extended(system: System, effect: Effect, *, same_terms: bool = False) -> tup
             break
     model.terms.insert(place, effect)
     return model, place
+
+
+def with_missing(system: System, effects: Iterable[Effect]) -> System:
+    """A copy of a model with those effects that it lacks, with their present values."""
+    model = copy.deepcopy(system)
+    for effect in effects:
+        if effect.name not in {present.name for present in effects_of(model)}:
+            model, _ = extended(model, type(effect)(**effect.options()))
+    return model
 
 
 def without(system: System, *names: str) -> System:

@@ -39,7 +39,7 @@ from nnode.diagnosis.residuals.fit import refine
 from nnode.diagnosis.residuals.variables import Variable
 from nnode.errors import SimulationError
 from nnode.model.effects.base import Effect, IndividualEffect, Probe
-from nnode.model.extend import effects_of, extended
+from nnode.model.extend import effects_of, with_missing
 from nnode.model.system import Crowd, System
 from nnode.model.term import State
 from nnode.population.drivers import ROUGH
@@ -193,10 +193,7 @@ class CrowdEngine:
             SimulationError: the simulations of all starts diverge.
         """
         law = system if self._given is None else self._given
-        present = {effect.name for effect in effects_of(law)}
-        for effect in effects_of(system):
-            if effect.name not in present:
-                law, _ = extended(law, type(effect)(**effect.options()).double())
+        law = with_missing(law, effects_of(system)).double()
         return self._likeliest(system, *self._by_regression(law))
 
     def _by_regression(self, system: System) -> list[System]:

@@ -17,10 +17,11 @@ from torch import Tensor, nn
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence, collate
+from nnode.diagnosis import thresholds
 from nnode.diagnosis.lanes.variables import traffic_variables
 from nnode.diagnosis.lanes.whitening import PlatoonFilter
 from nnode.diagnosis.outcome import Simulation
-from nnode.diagnosis.residuals.engine import Squares, of_residuals, removes_enough
+from nnode.diagnosis.residuals.engine import Squares, of_residuals, square_of
 from nnode.diagnosis.residuals.variables import Variable
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.extend import effects_of, extended, without
@@ -252,7 +253,10 @@ class TrafficEngine:
         return Squares(difference**2, self.sequence)
 
     def relevant(self, before: System, after: System, square: float) -> bool:
-        return removes_enough(self, before, after, square)
+        """Whether squared errors fall by :data:`~nnode.diagnosis.thresholds.SMALLEST_SHARE` of
+        ``square``."""
+        removed = square_of(self, before) - square_of(self, after)
+        return removed >= thresholds.SMALLEST_SHARE * square
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """Whole sequences behind their leaders; of engines without windows."""

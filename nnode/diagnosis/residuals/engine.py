@@ -11,7 +11,6 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence
-from nnode.diagnosis import thresholds
 from nnode.diagnosis.outcome import Simulation
 from nnode.model.effects import Effect, IndividualEffect, Probe
 from nnode.model.system import System
@@ -147,7 +146,7 @@ class AgentsEngine(Engine, Protocol):
 
     population: Any
 
-    def population_of(self, system: System, /) -> Any:
+    def population_of(self, system: System) -> Any:
         """The estimate with a model, whose parameters are calibrated with it; the engine keeps its
         own."""
         ...
@@ -211,13 +210,6 @@ def of_residuals(label: np.ndarray | None, sequence: np.ndarray) -> np.ndarray:
     clusters = sequence if label is None else np.asarray(label)[sequence]
     numbered: np.ndarray = np.unique(clusters, return_inverse=True)[1].reshape(-1)
     return numbered
-
-
-def removes_enough(engine: Engine, before: System, after: System, square: float) -> bool:
-    """Whether squared errors fall by :data:`~nnode.diagnosis.thresholds.SMALLEST_SHARE` of
-    ``square``."""
-    removed = square_of(engine, before) - square_of(engine, after)
-    return removed >= thresholds.SMALLEST_SHARE * square
 
 
 def square_of(engine: Engine, system: System) -> float:
