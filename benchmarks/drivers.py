@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import ndtr, stdtrit
 
 import nnode
 from benchmarks.discovery.run import sources
@@ -84,9 +85,9 @@ PAIRS = {
     "fvdm": ["speed_zone+multi_anticipation", "speed_zone+reaction_delay"],
 }
 #: What departs from the assumptions: desired speeds that vary by 8 % over 30 s, drivers of a skewed
-#: distribution (gamma), pushes with heavy tails (Student's t of four degrees of freedom), errors of
-#: measurement that last for 1 s.
-NATURES = ("plain", "moods", "skewed", "heavy", "lasting")
+#: distribution (gamma), pushes with heavy tails (Student's t of four degrees of freedom), pushes
+#: that change smoothly (second-order autoregressive), errors of measurement that last for 1 s.
+NATURES = ("plain", "moods", "skewed", "heavy", "smooth", "lasting")
 #: Ends of the zone, m, and of the period, s.
 ZONE, PERIOD = (250.0, 420.0), (1010.0, 2020.0)
 #: Share of trucks, and their length, m, where an effect depends on the vehicle.
@@ -132,7 +133,7 @@ def platoons(
     gap = drivers.equilibrium_gap(mean) * rng.uniform(0.9, 1.2, shape)
     gap += drivers.longer + (0.0 if law == "lin" else drivers.length[:, :-1] - CAR)
     x = rng.uniform(0, 300, (number, 1)) - np.insert(gap.cumsum(1), 0, 0.0, 1)
-    v, push = np.repeat(mean, vehicles, 1), PUSH[law] * rng.normal(size=shape)
+    v, pushes = np.repeat(mean, vehicles, 1), Pushes(nature, shape, rng)
     delay = round(drivers.sizes.get("reaction_delay", 0.0) / STEP)
     lag = drivers.sizes.get("inertia", STEP)
     mood, kick = np.zeros(shape), np.zeros((number, vehicles))
@@ -149,6 +150,7 @@ def platoons(
         past = [*past, (x, v.copy())][-delay - 1 :]
         if nature == "moods":
             mood = _next(mood, rng.normal(size=shape), STEP, 30.0)
+        push = PUSH[law] * pushes.present()
         clock = START * np.arange(number)[:, None] + k * STEP
         wish = drivers.v0 * np.exp(0.08 * mood) * drivers.slowed(x[:, 1:], clock)
         wanted = drivers.wanted(*past[0], wish)
@@ -164,10 +166,7 @@ def platoons(
             after = np.maximum(v[:, 1:] + STEP * np.clip(slow + push, -8.0, 5.0), 0.0)
             x = x + STEP * np.column_stack([lead, (v[:, 1:] + after) / 2])
             v = np.column_stack([lead, after])
-        shock = rng.normal(size=shape)
-        if nature == "heavy":
-            shock = rng.standard_t(4, size=shape) / np.sqrt(2.0)
-        push = _next(push, shock, STEP, LASTS, PUSH[law])
+        pushes.advance()
     return _table(np.array(rows), drivers.columns())
 
 
@@ -276,6 +275,36 @@ class _Drivers:
 def _sizes(law: str, effect: str) -> dict[str, float]:
     """Of the effects that are hidden."""
     return {name: HIDDEN[law][name] for name in effect.split("+") if name != "none"}
+
+
+class Pushes:
+    """Pushes of followers, with a standard deviation of 1, that last :data:`LASTS`.
+
+    Args:
+        nature: one of :data:`NATURES`.
+    """
+
+    def __init__(self, nature: str, shape: tuple[int, int], rng: np.random.Generator) -> None:
+        self._nature, self._rng = nature, rng
+        self._process = rng.normal(size=shape)
+        self._source = self._process / np.sqrt(2.0)  # of smooth pushes, which follow it
+
+    def present(self) -> np.ndarray:
+        """Their present values."""
+        if self._nature == "heavy":
+            tails: np.ndarray = stdtrit(4, ndtr(self._process)) / np.sqrt(2.0)
+            return tails
+        return self._process
+
+    def advance(self) -> None:
+        """Go on by a step."""
+        shock = self._rng.normal(size=self._process.shape)
+        if self._nature == "smooth":
+            self._source = _next(self._source, shock, STEP, LASTS / 2)
+            missing = np.sqrt(2.0) * self._source - self._process
+            self._process = self._process + STEP / (LASTS / 2) * missing
+        else:
+            self._process = _next(self._process, shock, STEP, LASTS)
 
 
 def _next(

@@ -7,8 +7,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import kurtosis
 
 import nnode
 from benchmarks import drivers
@@ -22,6 +24,22 @@ def run(monkeypatch: pytest.MonkeyPatch, path: Path, *options: str) -> pd.DataFr
     monkeypatch.setattr(sys, "argv", argv)
     drivers.main()
     return pd.read_csv(path)
+
+
+def test_pushes_have_their_distribution_and_smoothness() -> None:
+    values, changes = {}, {}
+    for nature in ("plain", "heavy", "smooth"):
+        pushes = drivers.Pushes(nature, (60, 60), np.random.default_rng(3))
+        for _ in range(round(8.0 / drivers.STEP)):
+            pushes.advance()
+        before = pushes.present()
+        pushes.advance()
+        values[nature], changes[nature] = before, pushes.present() - before
+    for each in values.values():
+        assert each.std() == pytest.approx(1.0, abs=0.05)
+    assert kurtosis(values["heavy"], axis=None) > 3 > 0.2 > kurtosis(values["plain"], axis=None)
+    # changes in a step: sqrt(2 STEP / LASTS) of first, 2 STEP / LASTS of second order
+    assert changes["smooth"].std() < 0.1 * changes["plain"].std()
 
 
 @pytest.mark.thorough
