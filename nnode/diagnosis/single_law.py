@@ -42,7 +42,6 @@ from nnode.diagnosis.result import (
 )
 from nnode.diagnosis.search import (
     Selection,
-    best_fit,
     converged_fit,
     initial_fit,
     likely_extensions,
@@ -341,6 +340,12 @@ def _drivers(engine: Engine, fit: Fit, seed: int, notes: list[str]) -> list[Vari
     else:
         assert isinstance(engine, CrowdEngine)
         rows = engine.variations()
+        assert engine.population is not None
+        if not engine.population.predicts:
+            notes.append(
+                "The law does not help to predict these people: their paths are as likely if they "
+                "walk straight on for the length of a window and are pushed at random."
+            )
     drivers = [Variation(name, **row) for name, row in rows.items()]
     assert engine.population is not None
     push = next(row for row in drivers if row.name == "push")
@@ -431,10 +436,7 @@ def _explore(
                 if populations[-1].plausible:
                     break
         engine.set_population(likeliest(populations))
-        fit = best_fit(engine, [populations[0].system, initial])
-        if fit is None:
-            raise SimulationError(BLOWS_UP)
-        base = fit
+        base = refine(engine, copy.deepcopy(populations[0].system))
     else:
         base = converged_fit(engine, initial)
     base_system = copy.deepcopy(base.system)

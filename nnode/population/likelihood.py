@@ -25,12 +25,11 @@ from functools import cached_property
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 from scipy.optimize import lsq_linear
 
 from nnode.data.clusters import group_sums
 from nnode.errors import SimulationError
-from nnode.simulation.kernels.functions import INLINE, LOOP
+from nnode.population.kalman import filtered
 
 #: Share of the largest eigenvalue of the scaled information below which a direction is flat.
 FLAT = 1e-10
@@ -49,10 +48,6 @@ UNITS = {
     "sway_frequency": "Hz",
     "sway_time": "s",
 }
-#: Restarts of simulated paths: pushes continue, or nothing is known of them.
-CONTINUED, ANEW = 1, 2
-#: Standard deviation of pushes of which nothing is known, m/s².
-UNKNOWN = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +73,9 @@ class Linearised:
             it is neglected if the former is 0.
         dt: sampling interval, s.
         restart: ``(S, K / A)`` where the simulated path restarts from a smoothed measured state:
-            :data:`CONTINUED` where pushes continue, :data:`ANEW` where nothing is known of them,
-            0 elsewhere; None: nowhere.
+            :data:`~nnode.population.kalman.CONTINUED` where pushes continue,
+            :data:`~nnode.population.kalman.ANEW` where nothing is known of them, 0 elsewhere; None:
+            nowhere.
         weight: ``(S, K)`` of the whitened samples' squares; None: 1.
         heading: ``(S, K / A, A)`` unit vectors in the direction of walking, along and across which
             people sway; None: they do not sway.
@@ -324,7 +320,7 @@ def _whitened(
         direction, omega = np.stack([across, data.heading], 2), oscillation.omega
         sigma = np.concatenate([sigma, np.repeat(oscillation.sigma, 2)])
         keep = np.concatenate([keep, np.full(2 * len(omega), np.exp(-data.dt / oscillation.time))])
-    white_columns, logdet = _filtered(
+    white_columns, logdet = filtered(
         np.ascontiguousarray(columns),
         data.observed,
         data.step,
@@ -341,301 +337,6 @@ def _whitened(
     if data.weight is not None:
         white_columns = white_columns * np.sqrt(data.weight)[..., None]
     return white_columns, logdet
-
-
-@njit(cache=True, nogil=True, **LOOP)
-def _filtered(
-    columns: np.ndarray,
-    observed: np.ndarray,
-    step: np.ndarray,
-    forced: np.ndarray,
-    sigma: np.ndarray,
-    keep: np.ndarray,
-    variance: float,
-    restart: np.ndarray,
-    start: np.ndarray,
-    direction: np.ndarray,
-    omega: np.ndarray,
-    dt: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Columns whitened by a Kalman filter, and log determinants.
-
-    The state is (d, e, a, q): e the J processes that force d, a the autocorrelated errors, if there
-    are any, and q the O oscillators, two elements each. a is added to the first element of d, so
-    that this element is measured. Without such errors, the first elements of d are measured one
-    after the other, plus the first elements of the oscillators along the measured coordinate. The
-    arrays of a step are allocated once, because allocations would take most of the time.
-
-    Args:
-        sigma: ``(J + 1 + 2 O,)`` standard deviations of e, a and q. keep: the same of their
-            autocorrelations over a sampling interval, without the oscillation. variance: of white
-            errors.
-        restart: see :class:`Linearised`. start: ``(M,)`` variances of d there.
-        direction: ``(S, K / A, O, A)`` unit vectors of the oscillators. omega: ``(O,)`` their
-            angular frequencies, 1/s. dt: sampling interval, s.
-    """
-    number, samples, width = columns.shape
-    m, processes = forced.shape[-2:]
-    axes = samples // (step.shape[1] + 1)
-    lasting = sigma[processes] > 0
-    if not lasting:
-        others = np.arange(len(sigma)) != processes
-        sigma, keep = sigma[others], keep[others]
-    n, oscillating = m + len(sigma), m + len(sigma) - 2 * len(omega)
-    fresh, turn = sigma**2 * (1 - keep**2), omega * dt
-    white, logdet = np.zeros((number, samples, width)), np.zeros(number)
-    mean, before = np.empty((n, width)), np.empty((m, width))
-    spread, half, gain = np.empty((n, n)), np.empty((m, n)), np.empty(n)
-    forward = np.zeros((m, oscillating))
-    for s in range(number):
-        mean[:] = 0.0
-        _begin(spread, sigma, m, processes, lasting)
-        for k in range(_last(observed[s]) // axes + 1):
-            if k:
-                _set_transition(step[s, k - 1], forced[s, k - 1], keep, lasting, forward)
-                _predict_mean(mean, forward, keep, before)
-                _predict_spread(spread, forward, keep, half)
-                _add_innovations(spread, forced[s, k - 1], fresh)
-                if lasting:
-                    _add_error(spread, m + processes, fresh[processes])
-                _oscillate(mean, spread, oscillating, turn, fresh)
-            if restart[s, k]:
-                _restart(mean, spread, start, oscillating, restart[s, k] == ANEW)
-                _restart_swaying(mean, spread, oscillating, direction[s, k], omega)
-            for axis in range(axes):
-                at = k * axes + axis
-                if observed[s, at]:
-                    logdet[s] += _condition(
-                        mean,
-                        spread,
-                        axis,
-                        oscillating,
-                        direction[s, k, :, axis],
-                        columns[s, at],
-                        variance,
-                        white[s, at],
-                        gain,
-                    )
-    return white, logdet
-
-
-@njit(**INLINE)
-def _begin(spread: np.ndarray, sigma: np.ndarray, m: int, processes: int, lasting: bool) -> None:
-    """The covariance of the state of :func:`_filtered` before the first sample."""
-    spread[:] = 0.0
-    for p in range(len(sigma)):
-        spread[m + p, m + p] = sigma[p] ** 2
-    if lasting:
-        spread[m + processes, m + processes] = 0.0
-        _add_error(spread, m + processes, sigma[processes] ** 2)
-
-
-@njit(**INLINE)
-def _last(observed: np.ndarray) -> int:
-    """The place of the last sample; 0 if there is none."""
-    last = len(observed) - 1
-    while last > 0 and not observed[last]:
-        last -= 1
-    return last
-
-
-@njit(**INLINE)
-def _restart(
-    mean: np.ndarray, spread: np.ndarray, start: np.ndarray, oscillating: int, anew: bool
-) -> None:
-    """Restart d with the variances ``start``, and forget e if nothing is known of it: by a push,
-    speeds at a restart already differ from those of the law, so that e depends on them. The states
-    from ``oscillating`` on continue."""
-    m = len(start)
-    for i in range(oscillating if anew else m):
-        mean[i] = 0.0
-        spread[i] = 0.0
-        spread[:, i] = 0.0
-        spread[i, i] = start[i] if i < m else UNKNOWN**2
-
-
-@njit(**INLINE)
-def _restart_swaying(
-    mean: np.ndarray, spread: np.ndarray, oscillating: int, direction: np.ndarray, omega: np.ndarray
-) -> None:
-    """Subtract the places and speeds of the oscillators, the states from ``oscillating`` on, from
-    those of d, which restarts where the measured path sways."""
-    oscillators, axes = direction.shape
-    for o in range(oscillators):
-        for i in range(2 * axes):
-            is_speed = i >= axes
-            q = oscillating + 2 * o + is_speed
-            share = -direction[o, i % axes] * (omega[o] if is_speed else 1.0)
-            mean[i] += share * mean[q]
-            # the row, and with the changed row the column, so that the matrix remains symmetric
-            spread[i] += share * spread[q]
-            spread[:, i] += share * spread[:, q]
-
-
-@njit(**INLINE)
-def _oscillate(
-    mean: np.ndarray, spread: np.ndarray, oscillating: int, turn: np.ndarray, fresh: np.ndarray
-) -> None:
-    """Turn the oscillators, the states from ``oscillating`` on, by the angles ``turn``, and add the
-    variances of their innovations, the last ones of ``fresh``."""
-    for o in range(len(turn)):
-        first, cosine, sine = oscillating + 2 * o, np.cos(turn[o]), np.sin(turn[o])
-        _turn(mean, first, cosine, sine)
-        _turn(spread, first, cosine, sine)
-        _turn(spread.T, first, cosine, sine)
-        for i in (first, first + 1):
-            spread[i, i] += fresh[len(fresh) + i - len(spread)]
-
-
-@njit(**INLINE)
-def _turn(rows: np.ndarray, first: int, cosine: float, sine: float) -> None:
-    """Turn a row and the next one into each other."""
-    for j in range(rows.shape[1]):
-        a, b = rows[first, j], rows[first + 1, j]
-        rows[first, j], rows[first + 1, j] = cosine * a + sine * b, cosine * b - sine * a
-
-
-@njit(**INLINE)
-def _set_transition(
-    step: np.ndarray, forced: np.ndarray, keep: np.ndarray, lasting: bool, forward: np.ndarray
-) -> None:
-    """Fill the derivatives ``forward`` ``(M, M + J)`` or ``(M, M + J + 1)`` of d after a sampling
-    interval by (d, e, a) before it, see :func:`_filtered`. All elements besides d decay by
-    themselves."""
-    m, processes = forced.shape
-    for i in range(m):
-        for j in range(m):
-            forward[i, j] = step[i, j]
-        for p in range(processes):
-            forward[i, m + p] = forced[i, p] * (1 + keep[p])
-    if lasting:
-        for i in range(m):
-            forward[i, m + processes] = -step[i, 0]
-        forward[0, m + processes] += keep[processes]
-
-
-@njit(**INLINE)
-def _add_error(spread: np.ndarray, place: int, variance: float) -> None:
-    """Add a variance to the error, which the first state contains."""
-    for i in (0, place):
-        for j in (0, place):
-            spread[i, j] += variance
-
-
-@njit(**INLINE)
-def _add_innovations(spread: np.ndarray, forced: np.ndarray, fresh: np.ndarray) -> None:
-    """Add the covariance of the innovations of e, of variances ``fresh``, and of d by them."""
-    m, processes = forced.shape
-    for p in range(processes):
-        e = m + p
-        spread[e, e] += fresh[p]
-        for i in range(m):
-            change = forced[i, p] * fresh[p]
-            spread[i, e] += change
-            spread[e, i] += change
-            for j in range(m):
-                spread[i, j] += change * forced[j, p]
-
-
-@njit(**INLINE)
-def _predict_mean(
-    mean: np.ndarray, forward: np.ndarray, keep: np.ndarray, before: np.ndarray
-) -> None:
-    """Replace the mean of the state by that of one sample later. ``before`` is a work array. Loops
-    over single numbers are faster than slices here."""
-    m, n = forward.shape
-    width = mean.shape[1]
-    for i in range(m):
-        for c in range(width):
-            before[i, c] = mean[i, c]
-            mean[i, c] = 0.0
-    for i in range(m):
-        for j in range(n):
-            for c in range(width):
-                mean[i, c] += forward[i, j] * (before[j, c] if j < m else mean[j, c])
-    for i in range(m, len(mean)):
-        for c in range(width):
-            mean[i, c] *= keep[i - m]
-
-
-@njit(**INLINE)
-def _predict_spread(
-    spread: np.ndarray, forward: np.ndarray, keep: np.ndarray, half: np.ndarray
-) -> None:
-    """Replace the covariance of the state by that of one sample later, without innovations.
-    ``half`` is a work array."""
-    m, coupled = forward.shape
-    n = len(spread)
-    for i in range(m):
-        for j in range(n):
-            half[i, j] = 0.0
-            for q in range(coupled):
-                half[i, j] += forward[i, q] * spread[q, j]
-    for i in range(m):
-        for j in range(i + 1):
-            total = 0.0
-            for q in range(coupled):
-                total += half[i, q] * forward[j, q]
-            spread[i, j] = spread[j, i] = total
-    for i in range(m, n):
-        for j in range(m):
-            spread[i, j] = spread[j, i] = keep[i - m] * half[j, i]
-        for j in range(m, n):
-            spread[i, j] *= keep[i - m] * keep[j - m]
-
-
-@njit(**INLINE)
-def _covariances(
-    spread: np.ndarray, axis: int, oscillating: int, direction: np.ndarray, covariance: np.ndarray
-) -> float:
-    """The variance of what :func:`_condition` measures, without errors. ``covariance`` is filled
-    with its covariances with the state."""
-    for i in range(len(spread)):
-        covariance[i] = spread[i, axis]
-        for o in range(len(direction)):
-            covariance[i] += direction[o] * spread[i, oscillating + 2 * o]
-    total = covariance[axis]
-    for o in range(len(direction)):
-        total += direction[o] * covariance[oscillating + 2 * o]
-    return float(total)
-
-
-@njit(**INLINE)
-def _condition(
-    mean: np.ndarray,
-    spread: np.ndarray,
-    axis: int,
-    oscillating: int,
-    direction: np.ndarray,
-    sample: np.ndarray,
-    variance: float,
-    white: np.ndarray,
-    gain: np.ndarray,
-) -> float:
-    """The state after a sample of its element ``axis``, plus the oscillators, the states from
-    ``oscillating`` on, times ``direction``: mean and covariance are replaced, ``white`` is filled.
-    ``gain`` is a work array of as many numbers as the state has.
-
-    Returns:
-        The logarithm of the innovation's variance.
-    """
-    n, width = mean.shape
-    total = variance + _covariances(spread, axis, oscillating, direction, gain)
-    for i in range(n):
-        gain[i] /= total
-    for c in range(width):
-        white[c] = sample[c] - mean[axis, c]
-        for o in range(len(direction)):
-            white[c] -= direction[o] * mean[oscillating + 2 * o, c]
-    for i in range(n):
-        for c in range(width):
-            mean[i, c] += gain[i] * white[c]
-        for j in range(n):
-            spread[i, j] -= gain[i] * gain[j] * total
-    scale = 1 / np.sqrt(total)
-    for c in range(width):
-        white[c] *= scale
-    return float(np.log(total))
 
 
 class Whitening:

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from nnode.population.kalman import ANEW, CONTINUED, UNKNOWN
 from nnode.population.likelihood import (
-    ANEW,
-    CONTINUED,
-    UNKNOWN,
     Linearised,
     Marginal,
     PushNoise,

@@ -12,9 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from nnode.calibrate.intervals import at_bounds
-from nnode.diagnosis.crowds.people import Gait, People
+from nnode.diagnosis.crowds.people import OUTLYING, Gait, People, outlying_weights
 from nnode.population.drivers import TOLERANCE
-from nnode.population.estimate import fit_variances
+from nnode.population.estimate import Variances, fit_variances
+from nnode.population.kalman import ANEW
 from nnode.population.likelihood import Linearised
 
 #: s; sampled more coarsely, sway is not resolved: people make two steps per second.
@@ -37,10 +38,16 @@ def estimated_gait(people: People) -> Gait:
     Args:
         people: their gait is not used.
     """
-    data, plain = _walking_straight(people), people.initial_variances([])
+    windows, plain = walking_straight(people), people.initial_variances([])
+    data = _joined(people, windows)
     plain = fit_variances(data, people.noise, plain, tolerance=TOLERANCE)
     low, start, high = np.array(SWAY).T
-    without = Gait(np.zeros(0), float(plain.noise[0]))
+
+    def gait(variances: Variances, sway: np.ndarray) -> Gait:
+        terms = window_log_likelihoods(people, windows, variances.noise)
+        return Gait(sway, float(variances.noise[0]), terms)
+
+    without = gait(plain, np.zeros(0))
     if data.dt > RESOLVED:
         return without
     swaying = replace(
@@ -55,33 +62,74 @@ def estimated_gait(people: People) -> Gait:
     price = len(sway) * math.log(max(len(people.pairs), 2)) / 2
     at_bound = at_bounds(np.log(sway), np.log(low), np.log(high), NEAR)[FREQUENCY]
     found = after > before + price and not at_bound
-    return Gait(sway, float(swaying.noise[0])) if found else without
+    return gait(swaying, sway) if found else without
 
 
-def _walking_straight(people: People) -> Linearised:
-    """The paths of people who walk on with the velocity at the start of a window."""
+def walking_straight(people: People) -> Linearised:
+    """The windows of people who walk on with the velocity at the start of a window; each is a
+    segment."""
     windows, dt = people.windows, people.windows.interval
     number, times = len(people.unit), windows.length
     window, place = windows.person.T
     x, v = (array[0, window, place].numpy() for array in (windows.batch.x, windows.batch.v))
     straight = x[:, None] + dt * np.arange(times)[:, None] * v[:, None]
     measured = windows.measured[:, window, place].swapaxes(0, 1)
+    restart = np.zeros((number, times), dtype=np.int8)
+    restart[:, 0] = ANEW
+    return _free(
+        dt,
+        residual=(measured - straight).reshape(number, -1),
+        observed=np.ones((number, 2 * times), dtype=bool),
+        restart=restart,
+        heading=people.parted(people.heading.reshape(len(people.pairs), -1)).reshape(-1, times, 2),
+    )
+
+
+def _joined(people: People, windows: Linearised) -> Linearised:
+    """The windows of each person one after the other."""
+    return _free(
+        windows.dt,
+        residual=people.joined(windows.residual),
+        observed=people.joined(windows.observed),
+        restart=people.restarts(),
+        heading=people.heading,
+    )
+
+
+def _free(
+    dt: float,
+    *,
+    residual: np.ndarray,
+    observed: np.ndarray,
+    restart: np.ndarray,
+    heading: np.ndarray,
+) -> Linearised:
+    """Paths of people without a law."""
     one, zero = np.eye(2), np.zeros((2, 2))
     free = np.block([[one, dt * one], [zero, one]])
     pushed = np.concatenate([dt**2 / 4 * one, dt / 2 * one])
-    observed = people.joined(np.ones((number, 2 * times), dtype=bool))
-    none = np.zeros((*observed.shape, 0))
-    intervals = len(observed), observed.shape[1] // 2 - 1
+    none = np.zeros((*residual.shape, 0))
+    intervals = len(residual), residual.shape[1] // 2 - 1
     return Linearised(
-        residual=people.joined(measured - straight),
+        residual=residual,
         fixed=none,
         random=np.zeros(0, dtype=int),
         start=none,
         observed=observed,
-        agent=np.arange(len(observed)),
+        agent=np.arange(len(residual)),
         step=np.broadcast_to(free, (*intervals, 4, 4)),
         forced=np.broadcast_to(pushed, (*intervals, 4, 2)),
-        restart=people.restarts(),
-        heading=people.heading,
+        restart=restart,
+        heading=heading,
         dt=dt,
     )
+
+
+def window_log_likelihoods(people: People, windows: Linearised, noise: np.ndarray) -> np.ndarray:
+    """``(P,)`` log likelihoods of the windows by themselves, with the loss of outlying ones."""
+    products = people.noise.products(windows, noise)
+    square, samples = products.gram[:, 0, 0], windows.residual.shape[1]
+    weight = outlying_weights(square)
+    robust = weight * square - OUTLYING * samples * np.log(weight)
+    terms: np.ndarray = -(robust + products.logdet + samples * math.log(2 * math.pi)) / 2
+    return terms

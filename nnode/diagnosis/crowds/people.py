@@ -39,6 +39,7 @@ from nnode.population.drivers import (
     LONGEST,
     MOST_SPREAD,
     PUSH,
+    ROUGH,
     SHORT,
     SPREAD,
     START_POSITION,
@@ -47,9 +48,8 @@ from nnode.population.drivers import (
 )
 from nnode.population.estimate import Variances, fit_variances
 from nnode.population.intervals import variance_intervals, variation_rows
+from nnode.population.kalman import ANEW, CONTINUED
 from nnode.population.likelihood import (
-    ANEW,
-    CONTINUED,
     Linearised,
     Marginal,
     RestartNoise,
@@ -92,10 +92,12 @@ class Gait(NamedTuple):
         sway: ``(4,)`` the last parameters of :class:`~nnode.population.likelihood.RestartNoise`;
             empty: people do not sway.
         acceleration: standard deviation of their other accelerations along a coordinate, m/s².
+        loglik: ``(P,)`` log likelihoods of the windows, if people walk straight on and are pushed.
     """
 
     sway: np.ndarray
     acceleration: float
+    loglik: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +112,8 @@ class CrowdPopulation:
         typical: logarithm of the typical one.
         data: the measured paths of D people, linearised.
         posterior: the marginal likelihood, and the deviations from the simulated people.
-        acceleration: see :class:`Gait`.
+        gait: how people walk, whatever the law.
+        left_out: ``(D,)`` log likelihoods of the windows that are left out, see :class:`Gait`.
     """
 
     system: System
@@ -120,7 +123,8 @@ class CrowdPopulation:
     typical: float
     data: Linearised
     posterior: Marginal
-    acceleration: float
+    gait: Gait
+    left_out: np.ndarray
 
     @property
     def has_speed(self) -> int:
@@ -132,7 +136,7 @@ class CrowdPopulation:
         """Whether pushes are small compared to accelerations, see
         :data:`~nnode.population.drivers.EXPLAINED`. Otherwise they stand for a deviation of the
         law."""
-        return float(self.variances.noise[0]) <= EXPLAINED * self.acceleration
+        return float(self.variances.noise[0]) <= EXPLAINED * self.gait.acceleration
 
     @property
     def plausible(self) -> bool:
@@ -152,12 +156,18 @@ class CrowdPopulation:
         return float(self.each.sum()) - self.price
 
     @property
+    def predicts(self) -> bool:
+        """Whether the paths are likelier than if people walk straight on and are pushed."""
+        return self.criterion > float(self.gait.loglik.sum())
+
+    @property
     def each(self) -> np.ndarray:
-        """``(D,)`` terms of the log marginal likelihood, with the loss of outlying windows."""
+        """``(D,)`` terms of the log marginal likelihood, with the loss of outlying windows. Where
+        windows are left out, people walk straight on and are pushed."""
         assert self.data.weight is not None
         lost = -OUTLYING / 2 * np.log(np.maximum(self.data.weight, 1e-12))
         terms: np.ndarray = self.posterior.each - np.where(self.data.observed, lost, 0.0).sum(1)
-        return terms
+        return terms + self.left_out
 
     def by_speed(self, by_deviation: np.ndarray) -> np.ndarray:
         """``(D, K)`` m: the change of positions by the deviations with which people were simulated.
@@ -240,7 +250,7 @@ class People:
         heading = self.joined(np.repeat(way[:, None], windows.length, 1))
         self.heading = heading.reshape(len(heading), -1, 2)
         self._last: tuple[np.ndarray, Surroundings] | None = None
-        self.gait = Gait(np.zeros(0), math.inf)
+        self.gait = Gait(np.zeros(0), math.inf, np.zeros(len(self.unit)))
 
     @property
     def noise(self) -> RestartNoise:
@@ -289,7 +299,8 @@ class People:
         random, weight = differing(system), np.ones(len(self.unit))
         speed, typical = self.speed, float(np.log(self.speed).mean())
         present = self.initial_variances(random) if variances is None else variances
-        if start is not None and start.random == random:
+        anew = start is None or start.random != random
+        if start is not None and not anew:
             speed, typical = start.speed, start.typical
             present = start.variances if variances is None else variances
         share, last_change = 1.0, math.inf
@@ -301,7 +312,9 @@ class People:
                 weight = self._weights(data, self.posterior(data, random, present), present)
             data = self._weighted(data, weight)
             if variances is None:
-                present = self._fitted(data, random, present, several=round_ == 0)
+                tolerance = ROUGH if round_ < ROUNDS - 1 else TOLERANCE
+                several = anew and round_ == 0
+                present = self._fitted(data, random, present, several, tolerance)
             posterior = self.posterior(data, random, present)
             shift, step = 0.0, np.zeros(len(speed))
             if DESIRED_SPEED in random:
@@ -323,11 +336,19 @@ class People:
             typical=typical,
             data=data,
             posterior=posterior,
-            acceleration=self.gait.acceleration,
+            gait=self.gait,
+            left_out=np.bincount(
+                self.unit, np.where(self.parted(data.observed)[:, 0], 0.0, self.gait.loglik)
+            ),
         )
 
     def _fitted(
-        self, data: Linearised, random: list[str], start: Variances, several: bool
+        self,
+        data: Linearised,
+        random: list[str],
+        start: Variances,
+        several: bool,
+        tolerance: float,
     ) -> Variances:
         """The most likely variances; with ``several`` from several correlation times of pushes:
         the likelihood has maxima at short and at long ones."""
@@ -340,7 +361,7 @@ class People:
                 data,
                 self.noise,
                 replace(start, noise=noise),
-                tolerance=TOLERANCE,
+                tolerance=tolerance,
                 low=-limit,
                 high=limit,
             )
@@ -373,12 +394,7 @@ class People:
         assert data.weight is not None
         residual = (data.residual - data.fixed @ posterior.change)[..., None]
         white = self.parted(self.whitening(data, variances)(residual))[..., 0]
-        square = (white**2).sum(1) / self.parted(data.weight)[:, 0]
-        if not square.any():  # no window can be used
-            return np.ones(len(square))
-        limit = OUTLYING * float(np.median(square[square > 0]))
-        weight: np.ndarray = limit / np.maximum(square, limit)
-        return weight
+        return outlying_weights((white**2).sum(1) / self.parted(data.weight)[:, 0])
 
     def _linearised(
         self,
@@ -504,6 +520,16 @@ class People:
     def _surroundings(self, system: System, speed: np.ndarray) -> Surroundings:
         check_model(system)
         return self.windows.around(system, speed[self.unit])
+
+
+def outlying_weights(square: np.ndarray) -> np.ndarray:
+    """``(P,)`` weights of windows by their sums of squares ``(P,)``, see :data:`OUTLYING`; sums are
+    0 where windows are not used."""
+    if not square.any():
+        return np.ones(len(square))
+    limit = OUTLYING * float(np.median(square[square > 0]))
+    weight: np.ndarray = limit / np.maximum(square, limit)
+    return weight
 
 
 def differences_of(system: System) -> Sequence[float]:
