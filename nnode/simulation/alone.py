@@ -293,22 +293,31 @@ class RunAlone:
             steps: ``(K,)`` differences of the parameters. Effects may not be smooth, so a fit
                 needs difference quotients over visible differences of the strength.
         """
-        derivatives: list[Tensor] = []
-        by_law = self._rhs.by_law(self._moment, self._states)
-        for name, value in self._own.items():
-            law_rates = None if name in self._rhs.of_law else by_law
-            for place in range(value.numel()):
-                half = torch.zeros(value.numel(), dtype=value.dtype)
-                half[place] = steps[len(derivatives)] / 2
-                half = half.reshape(value.shape)
-                higher, lower = (
-                    PersonAlone(self.around, self.system, {**self._own, name: value + change})(
-                        self._moment, self._states, law_rates
-                    )
-                    for change in (half, -half)
-                )
-                derivatives.append((higher - lower) / steps[len(derivatives)])
-        return derivatives
+        elements = [(name, i) for name, value in self._own.items() for i in range(value.numel())]
+        return [
+            self.parameter(name, step, place)
+            for (name, place), step in zip(elements, steps, strict=True)
+        ]
+
+    def parameter(self, name: str, step: float, place: int = 0) -> Tensor:
+        """``(F, W, N, 2)`` accelerations per unit of one element of a parameter, by a difference
+        quotient over ``step``."""
+        law_rates, value = None if name in self._rhs.of_law else self._by_law, self._own[name]
+        half = torch.zeros(value.numel(), dtype=value.dtype)
+        half[place] = step / 2
+        half = half.reshape(value.shape)
+        higher, lower = (
+            PersonAlone(self.around, self.system, {**self._own, name: value + change})(
+                self._moment, self._states, law_rates
+            )
+            for change in (half, -half)
+        )
+        return (higher - lower) / step
+
+    @cached_property
+    def _by_law(self) -> Tensor:
+        """``(F, W, N, 2)`` accelerations by the compiled law, m/s²."""
+        return self._rhs.by_law(self._moment, self._states)
 
     @cached_property
     def slopes(self) -> np.ndarray:

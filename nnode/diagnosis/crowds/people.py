@@ -453,9 +453,8 @@ class People:
         self, system: System, run: RunAlone, random: list[str], speed: np.ndarray
     ) -> np.ndarray:
         """``(P, L, 2, Q)`` derivatives of positions by the logarithms of what differs."""
-        fields, names = list[Tensor](), ParameterVector(system).names
-        of_law = set(random) - {DESIRED_SPEED}
-        by_parameter = run.parameters(differences_of(system)) if of_law else []
+        fields = list[Tensor]()
+        differences = dict(zip(ParameterVector(system).names, differences_of(system), strict=True))
         for name in random:
             if name == DESIRED_SPEED:
                 higher, lower = (
@@ -465,7 +464,7 @@ class People:
                 fields.append((higher - lower) / (2 * DIFFERENCE))
             else:
                 value = float(system.get_parameter(name).detach())
-                fields.append(value * by_parameter[names.index(name)])
+                fields.append(value * run.parameter(name, differences[name]))
         return run.displacements(fields)[:, :: self.windows.sub]
 
     def joined(self, values: np.ndarray) -> np.ndarray:
