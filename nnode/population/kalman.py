@@ -23,7 +23,7 @@ CONTINUED, ANEW = 1, 2
 #: Standard deviation of pushes of which nothing is known, m/s².
 UNKNOWN = 5.0
 #: Segments of a block, whose arrays fit the cache.
-BLOCK = 32
+BLOCK = 16
 
 
 @njit(cache=True, nogil=True, **LOOP)
