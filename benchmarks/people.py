@@ -4,7 +4,8 @@ Every case is ``--sequences`` sequences of 8 people who walk both ways through a
 measured for 6 s at 10 Hz, by the elliptical social force ``esf``, in which one effect is hidden or
 none. Desired speeds and relaxation times are log-normal with a standard deviation of ``--spread``
 %, pushes have a standard deviation of ``--push`` m/s² and last for ``--lasts`` s, and places are
-measured with errors of 5 mm. With ``--sway``, measured people sway as they step, each with a size
+measured with errors of 5 mm. With ``--turn``, their desired directions differ from those along the
+corridor that the table gives. With ``--sway``, measured people sway as they step, each with a size
 and a frequency of his own. With ``--nothing``, nothing is hidden in any case, and with
 ``--effects`` one of the named effects in every case. Paths are integrated here; everything else is
 the package's public interface. The cases of a run are fixed by its seed. The table has a row per
@@ -66,6 +67,7 @@ def crowds(
     spread: float = 0.15,
     push: float = 0.1,
     lasts: float = 4.0,
+    turn: float = 0.0,
     sway: float = 0.0,
     sequences: int = 24,
 ) -> pd.DataFrame:
@@ -75,6 +77,7 @@ def crowds(
         effect: a name of :data:`HIDDEN`, or ``none``.
         spread: standard deviation of logarithms of desired speeds and relaxation times.
         push: standard deviation of accelerations that last for ``lasts`` s, m/s².
+        turn: standard deviation of desired directions, rad.
         sway: standard deviation of measured positions across the corridor by people's steps, m.
     """
     draw, shape = np.random.default_rng(seed), (sequences, PEOPLE)
@@ -82,7 +85,8 @@ def crowds(
     lanes = draw.permuted(np.tile(np.linspace(0.6, WIDTH - 0.6, PEOPLE), (sequences, 1)), axis=1)
     x = np.stack([-way * draw.uniform(1.0, 5.0, shape), lanes], -1)
     speed, tau = (m * np.exp(spread * draw.normal(size=(*shape, 1))) for m in (SPEED, TAU))
-    wanted = speed * np.stack([np.broadcast_to(way, shape), np.zeros(shape)], -1)
+    angle = turn * draw.normal(size=shape) if turn else np.zeros(shape)
+    wanted = speed * np.stack([way * np.cos(angle), np.sin(angle)], -1)
     v, path = wanted.copy(), []
     keep, acting = np.exp(-STEP / lasts), push * draw.normal(size=(*shape, 2))
     hidden = _hidden(effect)
@@ -255,6 +259,8 @@ def evaluate(laws: list[str] | None, **case: Any) -> dict[str, Any]:
         "push": case["push"],
         "push_time": case["lasts"],
     }
+    if case["turn"]:
+        true["desired_direction"] = case["turn"]
     variations = {each["name"]: each for each in report["drivers"]}
     for name, value in true.items():
         each = variations.get(name, {})
@@ -275,6 +281,7 @@ def main() -> None:
         ("spread", 15.0, "between people, percent"),
         ("push", 0.1, "standard deviation of pushes, m/s²"),
         ("lasts", 4.0, "of pushes, s"),
+        ("turn", 0.0, "standard deviation of desired directions, rad"),
         ("sway", 0.0, "of people who step, standard deviation across the corridor, m"),
         ("sequences", 24, "in a case"),
         ("processes", 2, "side by side"),
@@ -293,6 +300,7 @@ def main() -> None:
         spread=given.spread / 100,
         push=given.push,
         lasts=given.lasts,
+        turn=given.turn,
         sway=given.sway,
         sequences=given.sequences,
     )

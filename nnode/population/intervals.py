@@ -168,7 +168,7 @@ def variation_rows(
     """The variances over time and between agents, as rows of a table.
 
     Args:
-        random: names of what differs between agents.
+        random: names of what differs between agents, in % if it has no unit in :data:`UNITS`.
         ends: of the intervals. shrinkage: ``(D, Q)`` of the agents. push: the unit of pushes.
 
     Returns:
@@ -182,9 +182,9 @@ def variation_rows(
     bounds = np.where(low < high, at_bounds(logs, low, high, NEAR), "")
     table: dict[str, dict[str, Any]] = {}
     # the standard deviations of starts come after these
+    units = {**UNITS, "push": push}
     for k, name in enumerate([*names, *random]):
-        of_noise = k < len(names)
-        factor, unit = (1.0, push if name == "push" else UNITS[name]) if of_noise else (100.0, "%")
+        factor, unit = (1.0, units[name]) if name in units else (100.0, "%")
         table[name] = {
             "estimate": float(factor * variances.row[k]),
             "lower": float(factor * ends[k, 0]),

@@ -36,7 +36,8 @@ FLAT = 1e-10
 #: Parameters of :class:`PushNoise`: standard deviations of pushes (m/s or m/s²), of white errors of
 #: positions and of autocorrelated ones (m), and correlation times (s).
 NOISE = ("push", "push_time", "measurement", "lasting_error", "lasting_error_time")
-#: Units of these and of the parameters of :class:`RestartNoise`, except pushes.
+#: Units of these and of the parameters of :class:`RestartNoise`, except pushes, and of directions
+#: that differ between agents.
 UNITS = {
     "push_time": "s",
     "measurement": "m",
@@ -47,6 +48,7 @@ UNITS = {
     "sway_along": "m",
     "sway_frequency": "Hz",
     "sway_time": "s",
+    "desired_direction": "rad",
 }
 
 

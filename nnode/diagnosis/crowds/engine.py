@@ -31,7 +31,7 @@ from nnode.diagnosis.crowds.gait import estimated_gait
 from nnode.diagnosis.crowds.people import CrowdPopulation, Gait, People, differences_of
 from nnode.diagnosis.crowds.simulated import simulated_pair
 from nnode.diagnosis.crowds.variables import crowd_variables
-from nnode.diagnosis.crowds.windows import Windows
+from nnode.diagnosis.crowds.windows import DesiredVelocity, Windows
 from nnode.diagnosis.outcome import Simulation
 from nnode.diagnosis.residuals.engine import Squares, of_residuals
 from nnode.diagnosis.residuals.fit import ROUGH as ROUGH_COST
@@ -110,7 +110,7 @@ class CrowdEngine:
         population = self._fitted(system, rows[0])
         differences = self._people.differences(self._states(system, rows))
         joined = self._people.joined(np.moveaxis(differences, 0, -1))
-        return self._whitened(joined + population.by_speed(population.data.fixed)[..., None])
+        return self._whitened(joined + population.by_desired(population.data.fixed)[..., None])
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of positions, with the deviations of people that are most likely under
@@ -122,8 +122,8 @@ class CrowdEngine:
 
     def relevant(self, before: System, after: System, square: float) -> bool:
         """Whether simulated positions with and without an effect differ by the error of measured
-        ones (root mean square), with the same desired speeds. Pushes produce most of the errors, so
-        the decrease of the errors shows no effect."""
+        ones (root mean square), with the same desired velocities. Pushes produce most of the
+        errors, so the decrease of the errors shows no effect."""
         without, with_effect = (
             self._people.differences(self._states(system, ParameterVector(system).row[None]))
             for system in (before, after)
@@ -168,7 +168,7 @@ class CrowdEngine:
         return 2 * self.windows.variance
 
     def fit_whitening(self, system: System, row: Tensor) -> None:
-        """Estimate desired speeds, variances and weights, with the model's parameters.
+        """Estimate desired velocities, variances and weights, with the model's parameters.
 
         Residuals before and after the call cannot be compared.
         """
@@ -263,7 +263,7 @@ class CrowdEngine:
         """A copy whose parameters are fitted to the accelerations of the smoothed paths by
         regression, which avoids distant local minima of calibrations."""
         fitted, batch = copy.deepcopy(system), self.windows.batch
-        vector, around = ParameterVector(fitted), self._people.around(system, self._speed)
+        vector, around = ParameterVector(fitted), self._people.around(system, self._desired)
         states = torch.cat([batch.x, batch.v], -1)[::2]
         moment = 2 * np.arange(len(states))
         measured = torch.gradient(batch.v[::2], spacing=self.windows.step, dim=0)[0]
@@ -281,8 +281,8 @@ class CrowdEngine:
 
     def log_likelihoods(self, *starts: System) -> tuple[np.ndarray, System]:
         """``(G,)`` log marginal likelihoods of the clusters under a law with parameters, desired
-        speeds and variances of its own, minus their share of the number of parameters times half
-        the logarithm of the number of people (BIC); and the calibrated law.
+        velocities and variances of its own, minus their share of the number of parameters times
+        half the logarithm of the number of people (BIC); and the calibrated law.
 
         Args:
             starts: the law with different parameters, from each of which it is calibrated, and
@@ -311,7 +311,7 @@ class CrowdEngine:
         model, used = with_parameters(system, row), self.windows.used
         variances = self._fitted(system, row).variances
         preferred = {i: self.windows.preferred[i].copy() for i in used}
-        for (b, i), speed in zip(self._people.pairs, self._speed, strict=True):
+        for (b, i), speed in zip(self._people.pairs, self._desired.speed, strict=True):
             preferred[b][i] *= speed / max(float(np.hypot(*preferred[b][i])), 1e-9)
         measured = [replace(self.sequences[i], preferred=preferred[i]) for i in used]
         engines = []
@@ -404,9 +404,9 @@ class CrowdEngine:
     # -- parts -----------------------------------------------------------------------------
 
     @property
-    def _speed(self) -> np.ndarray:
-        """``(D,)`` desired speeds of the simulated people, m/s."""
-        return self._people.speed if self.population is None else self.population.speed
+    def _desired(self) -> DesiredVelocity:
+        """Of the D simulated people."""
+        return self._people.desired if self.population is None else self.population.desired
 
     def _fitted(self, system: System, row: Tensor) -> CrowdPopulation:
         """The last estimate; at first that with usual variances. Those of a model that is not yet
@@ -418,15 +418,15 @@ class CrowdEngine:
 
     def _states(self, system: System, rows: Tensor) -> Tensor:
         """``(F, R, W, N, 4)`` simulated states."""
-        return self._people.states(system, rows, self._speed)
+        return self._people.states(system, rows, self._desired)
 
     def _errors(self, system: System, row: Tensor) -> np.ndarray:
         """``(P, L, 2)`` m: measured minus simulated positions, with the most likely deviations."""
         people, population = self._people, self._fitted(system, row)
         fixed = population.data.fixed
         difference = people.joined(people.differences(self._states(system, row[None]))[0])
-        by_speed = np.where(population.data.observed, population.by_speed(fixed), 0.0)
-        data = replace(population.data, residual=difference + by_speed)
+        by_desired = np.where(population.data.observed, population.by_desired(fixed), 0.0)
+        data = replace(population.data, residual=difference + by_desired)
         posterior = people.posterior(data, population.random, population.variances)
         deviations = (posterior.change + posterior.deviations)[:, None]
         # where paths are chaotic, nothing is known of the deviations
@@ -445,7 +445,7 @@ class CrowdEngine:
         self._fitted(system, row)
         if self._run is None or self._run[0] is not system or not torch.equal(self._run[1], row):
             states = self._states(system, row[None])[:, 0]
-            around = self._people.around(system, self._speed)
+            around = self._people.around(system, self._desired)
             self._run = system, row.clone(), RunAlone(around, with_parameters(system, row), states)
         return self._run[-1]
 

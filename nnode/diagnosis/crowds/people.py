@@ -1,9 +1,9 @@
-"""People who differ: their desired speeds, and the variances between them and over time.
+"""People who differ: their desired velocities, and the variances between them and over time.
 
 In each of a person's windows, the person is simulated alone among the measured and smoothed paths
 of the others. The desired speed and the relaxation time are those of the typical person times
-log-normal factors. With X the derivatives by the logarithm of the typical desired speed, the
-measured positions y are
+log-normal factors, and the direction to the destination is turned by a normal angle. With X the
+derivatives by the logarithm of the typical desired speed, the measured positions y are
 
     y = f(theta, b) + X d + Z (b* - b) + e,    b* ~ N(0, Omega),
 
@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
-from nnode.diagnosis.crowds.windows import Windows
+from nnode.diagnosis.crowds.windows import DesiredVelocity, Windows
 from nnode.diagnosis.eligibility import check_model
 from nnode.model.effects.base import Effect
 from nnode.model.expression import symbols
@@ -72,17 +72,18 @@ ORDINARY = 0.5
 #: Windows are left out if a change of a start grows by more than this factor: people who touch
 #: make paths chaotic.
 GROWTH = 4.0
-#: Smallest and largest number of linearisations in which desired speeds, variances and weights are
-#: estimated, and the change of desired speeds (root mean square, as a share) at which they end.
+#: Smallest and largest number of linearisations in which desired velocities, variances and weights
+#: are estimated, and the change (root mean square) of the logarithms of desired speeds and of
+#: directions (rad) at which they end.
 ROUNDS, MOST_ROUNDS, CLOSE = 3, 8, 0.01
 #: Number of pairs of people in the largest intermediate result.
 CHUNK = 100_000
-#: Difference of the logarithm of desired speeds for derivatives.
+#: Difference of the logarithm of desired speeds, and of directions (rad), for derivatives.
 DIFFERENCE = 1e-3
 #: Smallest desired speed, m/s.
 SLOWEST = 0.05
-#: Name of the desired speed among the quantities in which people differ.
-DESIRED_SPEED = "desired_speed"
+#: Names of the desired speed and of its direction among the quantities in which people differ.
+DESIRED_SPEED, DESIRED_DIRECTION = "desired_speed", "desired_direction"
 
 
 class Gait(NamedTuple):
@@ -108,8 +109,8 @@ class CrowdPopulation:
         system: the model.
         random: names of the Q quantities in which people differ.
         variances: the noise is that of :class:`~nnode.population.likelihood.RestartNoise`.
-        speed: ``(D,)`` desired speeds of the simulated people, m/s.
-        typical: logarithm of the typical one.
+        desired: of the D simulated people.
+        typical: logarithm of the typical desired speed.
         data: the measured paths of D people, linearised.
         posterior: the marginal likelihood, and the deviations from the simulated people.
         gait: how people walk, whatever the law.
@@ -119,7 +120,7 @@ class CrowdPopulation:
     system: System
     random: list[str]
     variances: Variances
-    speed: np.ndarray
+    desired: DesiredVelocity
     typical: float
     data: Linearised
     posterior: Marginal
@@ -148,7 +149,7 @@ class CrowdPopulation:
         """Half the number of parameters times the logarithm of the number of people (BIC)."""
         free = int(np.count_nonzero(self.variances.low < self.variances.high))
         number = len(ParameterVector(self.system).row) + free
-        return number * math.log(max(len(self.speed), 2)) / 2
+        return number * math.log(max(len(self.desired.speed), 2)) / 2
 
     @property
     def criterion(self) -> float:
@@ -169,24 +170,26 @@ class CrowdPopulation:
         terms: np.ndarray = self.posterior.each - np.where(self.data.observed, lost, 0.0).sum(1)
         return terms + self.left_out
 
-    def by_speed(self, by_deviation: np.ndarray) -> np.ndarray:
+    def by_desired(self, by_deviation: np.ndarray) -> np.ndarray:
         """``(D, K)`` m: the change of positions by the deviations with which people were simulated.
-        They have their own desired speeds, and their other parameters are typical."""
-        return _by_speed(by_deviation, self.random, self.speed, self.typical)
+        They have their own desired velocities, and their other parameters are typical."""
+        return _by_desired(by_deviation, self.random, self.desired, self.typical)
 
 
-def _by_speed(
-    by_deviation: np.ndarray, random: list[str], speed: np.ndarray, typical: float
+def _by_desired(
+    by_deviation: np.ndarray, random: list[str], desired: DesiredVelocity, typical: float
 ) -> np.ndarray:
     if DESIRED_SPEED not in random:
         return np.zeros(by_deviation.shape[:-1])
-    change: np.ndarray = by_deviation[..., 0] * (np.log(speed) - typical)[:, None]
+    own = np.stack([np.log(desired.speed) - typical, desired.turn], -1)
+    change: np.ndarray = (by_deviation[..., :2] * own[:, None]).sum(-1)
     return change
 
 
 def differing(system: System) -> list[str]:
-    """Names of the quantities in which people differ: the desired speed if the model contains it,
-    and positive parameters of its law that are in no sum over others or walls."""
+    """Names of the quantities in which people differ: the desired speed and its direction if the
+    model contains it, and positive parameters of its law that are in no sum over others or walls.
+    """
     assert isinstance(system, Crowd)
     law = system.law_formula
     if law is None:
@@ -204,12 +207,14 @@ def differing(system: System) -> list[str]:
         and symbol not in in_sums
     ]
     has_speed = system.desired != "last" and "pace" in law.symbols
-    return [DESIRED_SPEED, *names] if has_speed else names
+    return [DESIRED_SPEED, DESIRED_DIRECTION, *names] if has_speed else names
 
 
 def parameters_differ(system: System) -> bool:
     """Whether people differ in parameters of the law besides their desired speeds."""
-    return system.domain == "crowd" and bool(set(differing(system)) - {DESIRED_SPEED})
+    return system.domain == "crowd" and bool(
+        set(differing(system)) - {DESIRED_SPEED, DESIRED_DIRECTION}
+    )
 
 
 class People:
@@ -221,7 +226,7 @@ class People:
     Attributes:
         unit: ``(P,)`` number of the person of each of the P windows of single people.
         pairs: of each person the sequence and the place in it.
-        speed: ``(D,)`` preferred speeds as measured, m/s.
+        desired: of the people, at first: preferred speeds as measured, to the destinations.
         heading: ``(D, T, 2)`` unit vectors from the start to the end of each window, at all T times
             of a person.
         gait: at first without sway.
@@ -244,12 +249,12 @@ class People:
         preferred = windows.batch.preferred
         assert preferred is not None
         speed = np.hypot(*preferred[window, place].numpy()[first].T)
-        self.speed = np.maximum(speed, SLOWEST)
+        self.desired = DesiredVelocity(np.maximum(speed, SLOWEST), np.zeros(len(speed)))
         x = windows.batch.x[:, window, place].numpy()
         way = (x[-1] - x[0]) / np.maximum(np.hypot(*(x[-1] - x[0]).T), 1e-9)[:, None]
         heading = self.joined(np.repeat(way[:, None], windows.length, 1))
         self.heading = heading.reshape(len(heading), -1, 2)
-        self._last: tuple[np.ndarray, Surroundings] | None = None
+        self._last: tuple[DesiredVelocity, Surroundings] | None = None
         self.gait = Gait(np.zeros(0), math.inf, np.zeros(len(self.unit)))
 
     @property
@@ -290,22 +295,22 @@ class People:
         start: CrowdPopulation | None = None,
         variances: Variances | None = None,
     ) -> CrowdPopulation:
-        """Desired speeds, variances and weights of windows, with the parameters of a model.
+        """Desired velocities, variances and weights of windows, with the parameters of a model.
 
         Args:
             start: where the search starts, if the same quantities differ.
             variances: of people and of noise, if they are not estimated.
         """
         random, weight = differing(system), np.ones(len(self.unit))
-        speed, typical = self.speed, float(np.log(self.speed).mean())
+        desired, typical = self.desired, float(np.log(self.desired.speed).mean())
         present = self.initial_variances(random) if variances is None else variances
         anew = start is None or start.random != random
         if start is not None and not anew:
-            speed, typical = start.speed, start.typical
+            desired, typical = start.desired, start.typical
             present = start.variances if variances is None else variances
         share, last_change = 1.0, math.inf
         for round_ in range(MOST_ROUNDS):
-            data = self._linearised(system, random, speed, typical)
+            data = self._linearised(system, random, desired, typical)
             if round_ > 0:
                 # weights of the linearisation before would count windows fully that it left out
                 data = self._weighted(data, weight)
@@ -316,30 +321,30 @@ class People:
                 several = anew and round_ == 0
                 present = self._fitted(data, random, present, several, tolerance)
             posterior = self.posterior(data, random, present)
-            shift, step = 0.0, np.zeros(len(speed))
+            shift, steps = 0.0, np.zeros((2, len(self.pairs)))
             if DESIRED_SPEED in random:
-                shift = float(posterior.change[0])
-                modes = np.exp(typical + shift + posterior.deviations[:, 0])
-                step = np.log(np.maximum(modes, SLOWEST)) - np.log(speed)
-            change = math.sqrt(np.mean(step**2))
+                shift, deviations = float(posterior.change[0]), posterior.deviations
+                speed = np.maximum(np.exp(typical + shift + deviations[:, 0]), SLOWEST)
+                steps[:] = np.log(speed / desired.speed), deviations[:, 1] - desired.turn
+            change = math.sqrt(np.mean(steps**2))
             if round_ >= ROUNDS - 1 and (change < CLOSE or round_ == MOST_ROUNDS - 1):
                 break
             share = share / 2 if change > last_change else share
             last_change = change
             typical += share * shift
-            speed = speed * np.exp(share * step)
+            faster, turned = share * steps
+            desired = DesiredVelocity(desired.speed * np.exp(faster), desired.turn + turned)
+        left_out = np.where(self.parted(data.observed)[:, 0], 0.0, self.gait.loglik)
         return CrowdPopulation(
             system=system,
             random=random,
             variances=present,
-            speed=speed,
+            desired=desired,
             typical=typical,
             data=data,
             posterior=posterior,
             gait=self.gait,
-            left_out=np.bincount(
-                self.unit, np.where(self.parted(data.observed)[:, 0], 0.0, self.gait.loglik)
-            ),
+            left_out=np.bincount(self.unit, left_out),
         )
 
     def _fitted(
@@ -400,13 +405,13 @@ class People:
         self,
         system: System,
         random: list[str],
-        speed: np.ndarray,
+        desired: DesiredVelocity,
         typical: float,
     ) -> Linearised:
-        """The measured paths, linearised at desired speeds ``(D,)``, without weights."""
+        """The measured paths, linearised at desired velocities, without weights."""
         windows, row = self.windows, ParameterVector(system).row[None]
-        states = self.states(system, row, speed)
-        run = RunAlone(self.around(system, speed), system, states[:, 0])
+        states = self.states(system, row, desired)
+        run = RunAlone(self.around(system, desired), system, states[:, 0])
         stride, dt, times = windows.sub, windows.interval, windows.length
         # a free person's position changes by a unit with the first position, by the time with speed
         growth = np.abs(run.by_start()) / np.repeat([1.0, dt * times], 2)
@@ -417,10 +422,10 @@ class People:
             np.pad(part.numpy().swapaxes(0, 1), ((0, 0), (0, 1), (0, 0), (0, 0)))
             for part in matrices
         )
-        fixed = self.joined(self._random_columns(system, run, random, speed))
+        fixed = self.joined(self._random_columns(system, run, random, desired))
         residual = self.joined(self.differences(states)[0])
         return Linearised(
-            residual=residual + _by_speed(fixed, random, speed, typical),
+            residual=residual + _by_desired(fixed, random, desired, typical),
             fixed=fixed,
             random=np.arange(len(random)),
             start=np.zeros((*residual.shape, 0)),
@@ -450,15 +455,16 @@ class People:
         return restart
 
     def _random_columns(
-        self, system: System, run: RunAlone, random: list[str], speed: np.ndarray
+        self, system: System, run: RunAlone, random: list[str], desired: DesiredVelocity
     ) -> np.ndarray:
-        """``(P, L, 2, Q)`` derivatives of positions by the logarithms of what differs."""
+        """``(P, L, 2, Q)`` derivatives of positions by the logarithms of what differs, or by
+        directions."""
         fields = list[Tensor]()
         differences = dict(zip(ParameterVector(system).names, differences_of(system), strict=True))
         for name in random:
-            if name == DESIRED_SPEED:
+            if name in (DESIRED_SPEED, DESIRED_DIRECTION):
                 higher, lower = (
-                    run.accelerations(self._surroundings(system, speed * math.exp(change)))
+                    run.accelerations(self._changed(system, desired, name, change))
                     for change in (DIFFERENCE, -DIFFERENCE)
                 )
                 fields.append((higher - lower) / (2 * DIFFERENCE))
@@ -485,13 +491,13 @@ class People:
 
     # -- simulation ------------------------------------------------------------------------
 
-    def states(self, system: System, rows: Tensor, speed: np.ndarray) -> Tensor:
+    def states(self, system: System, rows: Tensor, desired: DesiredVelocity) -> Tensor:
         """``(F, R, W, N, 4)`` simulated positions (m) and velocities (m/s) at the steps.
 
         Args:
-            rows: ``(R, K)`` parameters. speed: ``(D,)`` desired speeds, m/s.
+            rows: ``(R, K)`` parameters. desired: of the D people.
         """
-        windows, around = self.windows, self.around(system, speed)
+        windows, around = self.windows, self.around(system, desired)
         w, n = windows.batch.agent.shape
         first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
         states = []
@@ -509,16 +515,27 @@ class People:
         limited = difference.nan_to_num(LIMIT, LIMIT, -LIMIT).clamp(-LIMIT, LIMIT)
         return np.asarray(limited.numpy())
 
-    def around(self, system: System, speed: np.ndarray) -> Surroundings:
-        """The surroundings of people with desired speeds; the last ones are cached. All systems of
-        one diagnosis share walls, radii and masses."""
-        if self._last is None or not np.array_equal(self._last[0], speed):
-            self._last = speed, self._surroundings(system, speed)
+    def around(self, system: System, desired: DesiredVelocity) -> Surroundings:
+        """The surroundings of people with desired velocities; the last ones are cached. All systems
+        of one diagnosis share walls, radii and masses."""
+        if self._last is None or not np.array_equal(self._last[0], desired):
+            self._last = desired, self._surroundings(system, desired)
         return self._last[1]
 
-    def _surroundings(self, system: System, speed: np.ndarray) -> Surroundings:
+    def _surroundings(self, system: System, desired: DesiredVelocity) -> Surroundings:
         check_model(system)
-        return self.windows.around(system, speed[self.unit])
+        of_window = DesiredVelocity(desired.speed[self.unit], desired.turn[self.unit])
+        return self.windows.around(system, of_window)
+
+    def _changed(
+        self, system: System, desired: DesiredVelocity, name: str, change: float
+    ) -> Surroundings:
+        """The surroundings if the logarithms of desired speeds, or their directions, change."""
+        if name == DESIRED_SPEED:
+            changed = desired._replace(speed=desired.speed * math.exp(change))
+        else:
+            changed = desired._replace(turn=desired.turn + change)
+        return self._surroundings(system, changed)
 
 
 def outlying_weights(square: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as Many
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,6 +27,19 @@ LEFT_OUT = 0.1
 CUT = 11.0
 #: How far a simulated person may stray from the measured path before walls are missed, m.
 STRAY = 0.5
+
+
+class DesiredVelocity(NamedTuple):
+    """With what velocities people want to walk.
+
+    Attributes:
+        speed: ``(P,)`` m/s.
+        turn: ``(P,)`` by which their directions are turned to the left from those to the
+            destinations, rad.
+    """
+
+    speed: np.ndarray
+    turn: np.ndarray
 
 
 class Windows:
@@ -107,17 +120,24 @@ class Windows:
         """Steps of the simulation of a window."""
         return self.sub * (self.length - 1)
 
-    def around(self, system: System, speed: np.ndarray | None = None) -> Surroundings:
+    def around(self, system: System, desired: DesiredVelocity | None = None) -> Surroundings:
         """The surroundings of the people whom ``system`` simulates.
 
         Args:
-            speed: ``(P,)`` their desired speeds, m/s; None: the measured preferred speeds.
+            desired: of the P people; None: the measured preferred speeds, towards the destinations.
         """
         scene = system.scene(self.batch)
         window, person = torch.from_numpy(self.person).T
-        if speed is not None:
+        if desired is not None:
+            speed, turn = map(torch.from_numpy, desired)
             scene.preferred = torch.zeros_like(scene.preferred)
-            scene.preferred[window, person, 0] = torch.from_numpy(speed)
+            scene.preferred[window, person, 0] = speed
+            start = self.batch.x[0, window, person]
+            x, y = (scene.destination[window, person] - start).unbind(-1)
+            cosine, sine = turn.cos(), turn.sin()
+            turned = torch.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
+            scene.destination = scene.destination.clone()
+            scene.destination[window, person] = start + turned
         # terms read the paths from ``Surroundings``, so copies for many runs need only two samples
         scene.measured, scene.measured_rate = scene.measured[:2], scene.measured_rate[:2]
         force: Any = system.find_law("social_force")

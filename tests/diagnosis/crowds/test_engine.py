@@ -134,9 +134,10 @@ def with_speeds() -> Crowd:
     return Crowd([make_law("esf", tau=TAU, **LAW)], desired="exit").double()
 
 
-def people_who_differ(seed: int) -> list[Sequence]:
-    """People with desired speeds and relaxation times of their own, whom pushes of 4 s disturb."""
-    table = crowds("none", seed, spread=SPREAD, push=PUSH, sequences=16)
+def people_who_differ(seed: int, lasts: float = 4.0, turn: float = 0.0) -> list[Sequence]:
+    """People with desired velocities and relaxation times of their own, whom pushes of ``lasts`` s
+    disturb."""
+    table = crowds("none", seed, spread=SPREAD, push=PUSH, lasts=lasts, turn=turn, sequences=16)
     return [replace(s, walls=WALLS.to_numpy()) for s in nnode.sequences(table)]
 
 
@@ -205,18 +206,30 @@ def test_residuals_of_true_model_are_white() -> None:
 
 
 def test_differences_between_people_and_pushes_are_estimated() -> None:
-    engine, system = CrowdEngine(people_who_differ(2)), with_speeds()
+    engine, system = CrowdEngine(people_who_differ(2, lasts=0.7)), with_speeds()
     engine.fit_whitening(system, ParameterVector(system).row)
     population = engine.population
     assert population is not None
     push, time, error, _ = population.variances.noise
-    assert population.random == ["desired_speed", "terms.0.tau"]
-    assert population.variances.spread == pytest.approx([SPREAD, SPREAD], rel=0.35)
+    assert population.random == ["desired_speed", "desired_direction", "terms.0.tau"]
+    speed, direction, relaxation = population.variances.spread
+    assert (speed, relaxation) == pytest.approx((SPREAD, SPREAD), rel=0.35)
+    assert direction < 0.03  # the destinations of the table are those of the people
     assert push == pytest.approx(PUSH, rel=0.25)
-    assert 0.5 < time <= 2.0
+    assert 0.35 < time < 1.0  # 0.7 s in truth
     assert error == pytest.approx(0.005, rel=0.1)
-    assert np.log(population.speed).std() == pytest.approx(SPREAD, rel=0.25)
-    assert np.median(population.speed) == pytest.approx(1.3, rel=0.05)
+    assert np.log(population.desired.speed).std() == pytest.approx(SPREAD, rel=0.25)
+    assert np.median(population.desired.speed) == pytest.approx(1.3, rel=0.05)
+
+
+def test_directions_that_differ_are_estimated() -> None:
+    engine, system = CrowdEngine(people_who_differ(2, turn=0.2)), with_speeds()
+    engine.fit_whitening(system, ParameterVector(system).row)
+    rows = engine.variations()
+    direction = rows["desired_direction"]
+    assert direction["unit"] == "rad"
+    assert direction["estimate"] == pytest.approx(0.2, rel=0.2)
+    assert rows["desired_speed"]["estimate"] == pytest.approx(100 * SPREAD, rel=0.35)
 
 
 def test_estimate_of_people_converges_where_windows_are_left_out() -> None:
@@ -439,10 +452,10 @@ def test_hidden_effect_is_recovered(
 
 
 def test_what_differs_between_people() -> None:
-    assert differing(with_speeds()) == ["desired_speed", "terms.0.tau"]
+    assert differing(with_speeds()) == ["desired_speed", "desired_direction", "terms.0.tau"]
     assert differing(model()) == []  # desired speeds and tau are not part of this law
     drift, _ = extended(with_speeds(), Drift(a_x=0.1, a_y=0.1))
-    assert differing(drift) == ["desired_speed", "terms.0.tau"]
+    assert differing(drift) == ["desired_speed", "desired_direction", "terms.0.tau"]
     unbounded = with_speeds()
     unbounded.term_list[0].bounds.pop("tau")
-    assert differing(unbounded) == ["desired_speed"]
+    assert differing(unbounded) == ["desired_speed", "desired_direction"]
