@@ -100,7 +100,7 @@ _SIMULATED = {
     "are most likely for that driver",
     "crowd": "of each person at each compared sample. Everyone is simulated for about 2 s at a "
     "time among the measured paths of the others, from the smoothed place and velocity and with "
-    "the desired speed and relaxation time that are most likely for that person",
+    "the desired velocity and relaxation time that are most likely for that person",
 }
 
 
