@@ -4,13 +4,14 @@ Every case is ``--sequences`` sequences of 8 people who walk both ways through a
 measured for 6 s at 10 Hz, by the elliptical social force ``esf``, in which one effect is hidden or
 none. Desired speeds and relaxation times are log-normal with a standard deviation of ``--spread``
 %, pushes have a standard deviation of ``--push`` m/s² and last for ``--lasts`` s, and places are
-measured with errors of 5 mm. With ``--turn``, their desired directions differ from those along the
-corridor that the table gives. With ``--sway``, measured people sway as they step, each with a size
-and a frequency of his own. With ``--nothing``, nothing is hidden in any case, and with
-``--effects`` one of the named effects in every case. Paths are integrated here; everything else is
-the package's public interface. The cases of a run are fixed by its seed. The table has a row per
-case; the last lines count right and false answers, with exact intervals of 95 %. Laws are not
-compared before a diagnosis; with ``--default`` they are, as in every diagnosis by default.
+measured with errors of 5 mm. With ``--turn``, their desired directions differ from that of their
+stream, which the model is given in place of destinations. With ``--sway``, measured people sway as
+they step, each with a size and a frequency of his own. With ``--nothing``, nothing is hidden in any
+case, and with ``--effects`` one of the named effects in every case. Paths are integrated here;
+everything else is the package's public interface. The cases of a run are fixed by its seed. The
+table has a row per case; the last lines count right and false answers, with exact intervals of 95
+%. Laws are not compared before a diagnosis; with ``--default`` they are, as in every diagnosis by
+default.
 """
 
 from __future__ import annotations
@@ -247,7 +248,7 @@ def evaluate(laws: list[str] | None, **case: Any) -> dict[str, Any]:
         report = nnode.diagnose(
             crowds(**case),
             "crowd",
-            model={**model_options("esf"), "desired": "exit"},
+            model={**model_options("esf"), "desired": "direction" if case["turn"] else "exit"},
             options=DiscoverOptions(page=False, replay=False, compare=laws),
             walls=walls,
         ).plain()

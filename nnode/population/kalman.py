@@ -22,7 +22,7 @@ from nnode.simulation.kernels.functions import INLINE, LOOP
 CONTINUED, ANEW = 1, 2
 #: Standard deviation of pushes of which nothing is known, as a multiple of that of pushes. A fixed
 #: one would make long pushes unlikely. docs/method.md has the likelihoods of several values.
-UNKNOWN = 2.0
+UNKNOWN = 5.0
 #: Segments of a block, whose arrays fit the cache.
 BLOCK = 16
 

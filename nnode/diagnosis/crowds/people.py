@@ -2,8 +2,9 @@
 
 In each of a person's windows, the person is simulated alone among the measured and smoothed paths
 of the others. The desired speed and the relaxation time are those of the typical person times
-log-normal factors, and the direction to the destination is turned by a normal angle. With X the
-derivatives by the logarithm of the typical desired speed, the measured positions y are
+log-normal factors. If only the direction of the stream is given, that of the person is turned by a
+normal angle. With X the derivatives by the logarithm of the typical desired speed, the measured
+positions y are
 
     y = f(theta, b) + X d + Z (b* - b) + e,    b* ~ N(0, Omega),
 
@@ -179,17 +180,19 @@ class CrowdPopulation:
 def _by_desired(
     by_deviation: np.ndarray, random: list[str], desired: DesiredVelocity, typical: float
 ) -> np.ndarray:
-    if DESIRED_SPEED not in random:
-        return np.zeros(by_deviation.shape[:-1])
-    own = np.stack([np.log(desired.speed) - typical, desired.turn], -1)
-    change: np.ndarray = (by_deviation[..., :2] * own[:, None]).sum(-1)
+    own = np.zeros((len(desired.speed), len(random)))
+    if DESIRED_SPEED in random:
+        own[:, random.index(DESIRED_SPEED)] = np.log(desired.speed) - typical
+    if DESIRED_DIRECTION in random:
+        own[:, random.index(DESIRED_DIRECTION)] = desired.turn
+    change: np.ndarray = (by_deviation * own[:, None]).sum(-1)
     return change
 
 
 def differing(system: System) -> list[str]:
-    """Names of the quantities in which people differ: the desired speed and its direction if the
-    model contains it, and positive parameters of its law that are in no sum over others or walls.
-    """
+    """Names of the quantities in which people differ: the desired speed if the model contains it,
+    its direction if that of the stream is given, and positive parameters of the law that are in no
+    sum over others or walls."""
     assert isinstance(system, Crowd)
     law = system.law_formula
     if law is None:
@@ -206,8 +209,10 @@ def differing(system: System) -> list[str]:
         and symbol in symbols(law.rate)
         and symbol not in in_sums
     ]
-    has_speed = system.desired != "last" and "pace" in law.symbols
-    return [DESIRED_SPEED, DESIRED_DIRECTION, *names] if has_speed else names
+    if system.desired == "last" or "pace" not in law.symbols:
+        return names
+    directions = [DESIRED_DIRECTION] if system.desired == "direction" else []
+    return [DESIRED_SPEED, *directions, *names]
 
 
 def parameters_differ(system: System) -> bool:
@@ -325,8 +330,11 @@ class People:
             if DESIRED_SPEED in random:
                 shift, deviations = float(posterior.change[0]), posterior.deviations
                 speed = np.maximum(np.exp(typical + shift + deviations[:, 0]), SLOWEST)
-                steps[:] = np.log(speed / desired.speed), deviations[:, 1] - desired.turn
-            change = math.sqrt(np.mean(steps**2))
+                steps[0] = np.log(speed / desired.speed)
+            if DESIRED_DIRECTION in random:
+                turn = posterior.deviations[:, random.index(DESIRED_DIRECTION)]
+                steps[1] = turn - desired.turn
+            change = float(np.sqrt((steps**2).mean(1)).max())
             if round_ >= ROUNDS - 1 and (change < CLOSE or round_ == MOST_ROUNDS - 1):
                 break
             share = share / 2 if change > last_change else share
