@@ -428,7 +428,7 @@ def _explore(
             # a strong missing effect is attributed to pushes
             start = populations[0].system
             usual = engine.with_usual_variances(start)
-            extensions = likely_extensions(usual, refine(usual, start), effects)
+            extensions = likely_extensions(usual, refine(usual, copy.deepcopy(start)), effects)
             hints += extensions
             for extension in extensions:
                 with suppress(SimulationError):

@@ -20,8 +20,7 @@ from nnode.simulation.kernels.functions import INLINE, LOOP
 
 #: Restarts of simulated paths: pushes continue, or nothing is known of them.
 CONTINUED, ANEW = 1, 2
-#: Standard deviation of pushes of which nothing is known, as a multiple of that of pushes. A fixed
-#: one would make long pushes unlikely. docs/method.md has the likelihoods of several values.
+#: Standard deviation of pushes of which nothing is known, m/s².
 UNKNOWN = 5.0
 #: Segments of a block, whose arrays fit the cache.
 BLOCK = 16
@@ -88,7 +87,7 @@ def filtered(
             for b in range(len(restart[block, k])):
                 kind, segment = restart[first + b, k], spread[..., b]
                 if kind:
-                    _restart(mean[..., b], segment, start, sigma, oscillating, kind == ANEW)
+                    _restart(mean[..., b], segment, start, oscillating, kind == ANEW)
                     ways = direction[first + b, k]
                     _restart_swaying(mean[..., b], segment, oscillating, ways, omega)
             for at in range(k * axes, (k + 1) * axes):
@@ -140,12 +139,7 @@ def _fill(out: np.ndarray, values: np.ndarray) -> None:
 
 @njit(**INLINE)
 def _restart(
-    mean: np.ndarray,
-    spread: np.ndarray,
-    start: np.ndarray,
-    sigma: np.ndarray,
-    oscillating: int,
-    anew: bool,
+    mean: np.ndarray, spread: np.ndarray, start: np.ndarray, oscillating: int, anew: bool
 ) -> None:
     """Restart d of one segment with the variances ``start``, and forget e if nothing is known of
     it: by a push, speeds at a restart already differ from those of the law, so that e depends on
@@ -155,7 +149,7 @@ def _restart(
         mean[i] = 0.0
         spread[i] = 0.0
         spread[:, i] = 0.0
-        spread[i, i] = start[i] if i < m else (UNKNOWN * sigma[i - m]) ** 2
+        spread[i, i] = start[i] if i < m else UNKNOWN**2
 
 
 @njit(**INLINE)

@@ -217,7 +217,7 @@ def restarting_covariance(
             ]
             d = drawn([POSITION] * 2 + [speed] * 2) - np.concatenate([place, sum(turning)])
         if data.restart[person, k] == ANEW:
-            e = drawn([UNKNOWN * SIGMA] * 2)
+            e = drawn([UNKNOWN] * 2)
         rows += list(d[:2] + place)
     map_ = np.array(rows)
     random = data.by_deviation[person] * SPREAD
