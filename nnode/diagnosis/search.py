@@ -80,15 +80,10 @@ def initial_fit(engine: Engine, system: System) -> Fit | None:
     of both diverge."""
     regression = getattr(engine, "regression_start", None)
     starts = [copy.deepcopy(system), *([] if regression is None else [regression(system)])]
-    return best_fit(engine, starts, tolerance=ROUGH)
-
-
-def best_fit(engine: Engine, starts: list[System], tolerance: float = 1e-4) -> Fit | None:
-    """The calibration with the lowest cost from several starts; None if all simulations diverge."""
     fits = []
     for start in starts:
         with suppress(SimulationError):
-            fits.append(refine(engine, start, tolerance=tolerance))
+            fits.append(refine(engine, start, tolerance=ROUGH))
     return min(fits, key=lambda fit: fit.cost, default=None)
 
 
