@@ -307,16 +307,14 @@ class Pushes:
             self._process = _next(self._process, shock, STEP, LASTS)
 
 
-def _next(
-    now: np.ndarray, shock: np.ndarray, step: float, lasts: float, size: float = 1.0
-) -> np.ndarray:
-    """The next value, ``step`` s later, of what lasts for some s and has a standard deviation.
+def _next(now: np.ndarray, shock: np.ndarray, step: float, lasts: float) -> np.ndarray:
+    """The next value, ``step`` s later, of what lasts for some s and has a standard deviation of 1.
 
     Args:
-        shock: standard normal numbers. size: the standard deviation.
+        shock: standard normal numbers.
     """
     keep = np.exp(-step / lasts)
-    return keep * now + size * np.sqrt(1 - keep**2) * shock
+    return keep * now + np.sqrt(1 - keep**2) * shock
 
 
 def _table(x: np.ndarray, columns: dict[str, np.ndarray]) -> pd.DataFrame:

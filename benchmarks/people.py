@@ -261,7 +261,8 @@ def evaluate(laws: list[str] | None, **case: Any) -> dict[str, Any]:
         "push_time": case["lasts"],
     }
     if case["turn"]:
-        true["desired_direction"] = case["turn"]
+        # directions differ from the mean of the stream, of half of the people
+        true["desired_direction"] = case["turn"] * np.sqrt(1 - 2 / PEOPLE)
     variations = {each["name"]: each for each in report["drivers"]}
     for name, value in true.items():
         each = variations.get(name, {})

@@ -43,13 +43,12 @@ def estimated_gait(people: People) -> Gait:
     plain = fit_variances(data, people.noise, plain, tolerance=TOLERANCE)
     low, start, high = np.array(SWAY).T
 
-    def gait(variances: Variances, sway: np.ndarray) -> Gait:
+    def gait(variances: Variances) -> Gait:
         terms = window_log_likelihoods(people, windows, variances.noise)
-        return Gait(sway, float(variances.noise[0]), terms)
+        return Gait(variances.noise[len(plain.noise) :], float(variances.noise[0]), terms)
 
-    without = gait(plain, np.zeros(0))
     if data.dt > RESOLVED:
-        return without
+        return gait(plain)
     swaying = replace(
         plain,
         noise=np.concatenate([plain.noise, start]),
@@ -62,7 +61,7 @@ def estimated_gait(people: People) -> Gait:
     price = len(sway) * math.log(max(len(people.pairs), 2)) / 2
     at_bound = at_bounds(np.log(sway), np.log(low), np.log(high), NEAR)[FREQUENCY]
     found = after > before + price and not at_bound
-    return gait(swaying, sway) if found else without
+    return gait(swaying if found else plain)
 
 
 def walking_straight(people: People) -> Linearised:
