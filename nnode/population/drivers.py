@@ -55,9 +55,8 @@ ROUGH = 1.0
 #: Bounds of standard deviations of errors of positions, m, and of the correlation time of
 #: autocorrelated ones, s.
 ERRORS, ERROR_TIMES = (0.001, 1.0), (0.1, 5.0)
-#: Correlation times of errors where searches start, s. From a single start of 1 s, errors of 0.06 m
-#: that last 1 s behind ``lin`` were estimated as white ones of 0.02 m and shorter pushes, with a log
-#: likelihood of 51,499 in place of 51,938.
+#: Correlation times of errors where searches start, s. From a single start of 1 s, errors behind
+#: ``lin`` were attributed to shorter pushes, see docs/method.md.
 ERROR_TIME_STARTS = (0.3, 3.0)
 #: At most so many candidate random effects are estimated before the best is chosen.
 RANKED = 2

@@ -87,7 +87,9 @@ def variance_intervals(
     """``(V, 2)`` intervals of 95 % of standard deviations and times; NaN at a bound, if the
     likelihood is not concave, or of the time of a process whose standard deviation may be 0. The
     likelihood hardly depends on such a process, which is therefore fixed for the intervals of the
-    others.
+    others. NaN also of a standard deviation above 0 of a process whose time is at a bound: pushes
+    that last longer than the record shows cannot be distinguished from differences between agents,
+    and of pushes shorter than a sampling interval only the product of variance and time is known.
 
     Args:
         data, noise: of the likelihood. variances: the most likely ones.
@@ -109,7 +111,8 @@ def variance_intervals(
         ).loglik
 
     names, peak = noise.names[: len(variances.noise)], loglik(slice(None), logs)
-    ends, free = np.full((len(logs), 2), np.nan), at_bounds(logs, low, high, NEAR) == ""
+    bounded = at_bounds(logs, low, high, NEAR) != ""
+    ends, free = np.full((len(logs), 2), np.nan), ~bounded
     n_deviations = len(names) + len(variances.spread)
     for k in map(int, np.flatnonzero((low < high)[:n_deviations])):
         name = names[k] if k < len(names) else ""
@@ -140,7 +143,14 @@ def variance_intervals(
         deviation = np.sqrt(np.diag(np.linalg.inv(curvature)) + added**2)
         half = ndtri(0.5 + LEVEL / 2) * deviation
         ends[places] = np.exp(logs[places, None] + half[:, None] * np.array([-1.0, 1.0]))
+    ends[np.intersect1d(places, _with_bounded_times(names, bounded))] = np.nan
     return ends
+
+
+def _with_bounded_times(names: tuple[str, ...], bounded: np.ndarray) -> np.ndarray:
+    """Places of the standard deviations of processes whose times are at a bound."""
+    at_bound = dict(zip(names, bounded, strict=False))
+    return np.flatnonzero([at_bound.get(f"{name}_time", False) for name in names])
 
 
 def variations(population: Population) -> dict[str, dict[str, Any]]:

@@ -20,8 +20,10 @@ from nnode.simulation.kernels.functions import INLINE, LOOP
 
 #: Restarts of simulated paths: pushes continue, or nothing is known of them.
 CONTINUED, ANEW = 1, 2
-#: Standard deviation of pushes of which nothing is known, m/s².
-UNKNOWN = 5.0
+#: Standard deviation of pushes of which nothing is known, relative to that of all. It exceeds 1,
+#: because speeds at a restart depend on earlier pushes. The table in docs/method.md has the
+#: likelihood of other values.
+FIRST = 2.0
 #: Segments of a block, whose arrays fit the cache.
 BLOCK = 16
 
@@ -87,7 +89,7 @@ def filtered(
             for b in range(len(restart[block, k])):
                 kind, segment = restart[first + b, k], spread[..., b]
                 if kind:
-                    _restart(mean[..., b], segment, start, oscillating, kind == ANEW)
+                    _restart(mean[..., b], segment, start, sigma[: oscillating - m], kind == ANEW)
                     ways = direction[first + b, k]
                     _restart_swaying(mean[..., b], segment, oscillating, ways, omega)
             for at in range(k * axes, (k + 1) * axes):
@@ -139,17 +141,16 @@ def _fill(out: np.ndarray, values: np.ndarray) -> None:
 
 @njit(**INLINE)
 def _restart(
-    mean: np.ndarray, spread: np.ndarray, start: np.ndarray, oscillating: int, anew: bool
+    mean: np.ndarray, spread: np.ndarray, start: np.ndarray, sigma: np.ndarray, anew: bool
 ) -> None:
-    """Restart d of one segment with the variances ``start``, and forget e if nothing is known of
-    it: by a push, speeds at a restart already differ from those of the law, so that e depends on
-    them. The states from ``oscillating`` on continue."""
+    """Restart d of one segment with the variances ``start``, and forget e, whose standard
+    deviations are ``sigma``, if nothing is known of it. The other states continue."""
     m = len(start)
-    for i in range(oscillating if anew else m):
+    for i in range(m + len(sigma) if anew else m):
         mean[i] = 0.0
         spread[i] = 0.0
         spread[:, i] = 0.0
-        spread[i, i] = start[i] if i < m else UNKNOWN**2
+        spread[i, i] = start[i] if i < m else (FIRST * sigma[i - m]) ** 2
 
 
 @njit(**INLINE)

@@ -35,6 +35,17 @@ def test_options_of_commands_exist(page: Path) -> None:
                 composed(*command)
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_nothing_stands_twice(page: Path) -> None:
+    """No heading, anchor or paragraph; edits of pages have doubled sections before."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
+    paragraphs = [part.strip() for part in text.split("\n\n")]
+    long = [part for part in paragraphs if len(part) > 150]
+    anchors = re.findall(r"<a id=.*?>", text)
+    for parts in (re.findall(r"^#+ .*", text, re.M), anchors, long):
+        assert sorted(parts) == sorted(set(parts))
+
+
 def test_links_exist() -> None:
     links = re.findall(r"\]\(([^)#]+)", README.read_text())
     assert len(links) > 10

@@ -173,6 +173,16 @@ def test_interval_of_absent_pushes_starts_at_zero() -> None:
     assert np.isnan(push_time).all()
 
 
+def test_pushes_with_a_time_at_its_bound_have_no_interval(population: Population) -> None:
+    before = population.estimate.variances
+    high = before.high.copy()
+    high[1] = before.noise[1]
+    bounded = replace(population.estimate, variances=replace(before, high=high))
+    ends = deviation_intervals(Population.uncorrected(population.model, bounded))
+    assert np.isnan(ends[:2]).all()
+    assert ends[3, 0] < ends[3, 1]  # that of differences between drivers remains
+
+
 def test_negligible_autocorrelated_errors_do_not_change_other_intervals(
     population: Population,
 ) -> None:

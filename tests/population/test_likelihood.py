@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from nnode.population.kalman import ANEW, CONTINUED, UNKNOWN
+from nnode.population.kalman import ANEW, CONTINUED, FIRST
 from nnode.population.likelihood import (
     Linearised,
     Marginal,
@@ -217,7 +217,7 @@ def restarting_covariance(
             ]
             d = drawn([POSITION] * 2 + [speed] * 2) - np.concatenate([place, sum(turning)])
         if data.restart[person, k] == ANEW:
-            e = drawn([UNKNOWN] * 2)
+            e = drawn([FIRST * SIGMA] * 2)
         rows += list(d[:2] + place)
     map_ = np.array(rows)
     random = data.by_deviation[person] * SPREAD
