@@ -87,9 +87,10 @@ def variance_intervals(
     """``(V, 2)`` intervals of 95 % of standard deviations and times; NaN at a bound, if the
     likelihood is not concave, or of the time of a process whose standard deviation may be 0. The
     likelihood hardly depends on such a process, which is therefore fixed for the intervals of the
-    others. NaN also of a standard deviation above 0 of a process whose time is at a bound: pushes
-    that last longer than the record shows cannot be distinguished from differences between agents,
-    and of pushes shorter than a sampling interval only the product of variance and time is known.
+    others. NaN also where a time may be at its bound, of the time and of the standard deviation of
+    this process: pushes that last longer than the record shows cannot be distinguished from
+    differences between agents, and of pushes shorter than a sampling interval only the product of
+    variance and time is known.
 
     Args:
         data, noise: of the likelihood. variances: the most likely ones.
@@ -143,14 +144,16 @@ def variance_intervals(
         deviation = np.sqrt(np.diag(np.linalg.inv(curvature)) + added**2)
         half = ndtri(0.5 + LEVEL / 2) * deviation
         ends[places] = np.exp(logs[places, None] + half[:, None] * np.array([-1.0, 1.0]))
-    ends[np.intersect1d(places, _with_bounded_times(names, bounded))] = np.nan
+    beyond = (ends[:, 0] < variances.low) | (ends[:, 1] > variances.high)
+    ends[np.intersect1d(places, _of_times(names, bounded | beyond))] = np.nan
     return ends
 
 
-def _with_bounded_times(names: tuple[str, ...], bounded: np.ndarray) -> np.ndarray:
-    """Places of the standard deviations of processes whose times are at a bound."""
-    at_bound = dict(zip(names, bounded, strict=False))
-    return np.flatnonzero([at_bound.get(f"{name}_time", False) for name in names])
+def _of_times(names: tuple[str, ...], chosen: np.ndarray) -> np.ndarray:
+    """Places of the chosen times, and of the standard deviations of their processes."""
+    times = [k for k, name in enumerate(names) if name.endswith("_time") and chosen[k]]
+    processes = [names.index(names[k].removesuffix("_time")) for k in times]
+    return np.array(times + processes, dtype=int)
 
 
 def variations(population: Population) -> dict[str, dict[str, Any]]:

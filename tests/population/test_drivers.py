@@ -173,10 +173,13 @@ def test_interval_of_absent_pushes_starts_at_zero() -> None:
     assert np.isnan(push_time).all()
 
 
-def test_pushes_with_a_time_at_its_bound_have_no_interval(population: Population) -> None:
+@pytest.mark.parametrize("longest", [1.0, 1.05])
+def test_pushes_with_a_time_near_its_bound_have_no_interval(
+    longest: float, population: Population
+) -> None:
     before = population.estimate.variances
     high = before.high.copy()
-    high[1] = before.noise[1]
+    high[1] = longest * before.noise[1]
     bounded = replace(population.estimate, variances=replace(before, high=high))
     ends = deviation_intervals(Population.uncorrected(population.model, bounded))
     assert np.isnan(ends[:2]).all()
