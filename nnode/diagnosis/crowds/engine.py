@@ -311,11 +311,13 @@ class CrowdEngine:
         model, used = with_parameters(system, row), self.windows.used
         variances = self._fitted(system, row).variances
         preferred = {i: self.windows.preferred[i].copy() for i in used}
-        for (b, i), speed in zip(self._people.pairs, self._desired.speed, strict=True):
+        turn = {i: np.zeros(self.sequences[i].n_agents) for i in used}
+        for (b, i), speed, left in zip(self._people.pairs, *self._desired, strict=True):
             preferred[b][i] *= speed / max(float(np.hypot(*preferred[b][i])), 1e-9)
+            turn[b][i] = left
         measured = [replace(self.sequences[i], preferred=preferred[i]) for i in used]
         engines = []
-        for crowd in simulated_pair(model, measured, seed):
+        for crowd in simulated_pair(model, measured, [turn[i] for i in used], seed):
             if not all(np.isfinite(s.x).all() for s in crowd):
                 raise SimulationError("the simulated crowd diverges")
             sequences = list(self.sequences)

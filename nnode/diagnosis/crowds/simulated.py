@@ -21,6 +21,7 @@ from torch import Tensor
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.diagnosis.crowds.paths import Path, Smoother
+from nnode.diagnosis.crowds.windows import turn_destinations
 from nnode.model.system import System
 from nnode.simulation.alone import PersonAlone, Surroundings
 from nnode.simulation.numpy import simulated
@@ -30,7 +31,7 @@ STEPS = 2
 
 
 def simulated_pair(
-    system: System, sequences: Many[Sequence], seed: int
+    system: System, sequences: Many[Sequence], turn: Many[np.ndarray], seed: int
 ) -> tuple[list[Sequence], list[Sequence]]:
     """Two simulations of sequences whose random numbers have opposite signs, so that linear terms
     cancel.
@@ -38,18 +39,21 @@ def simulated_pair(
     Args:
         system: the calibrated model.
         sequences: as they were measured, with the people's desired speeds as ``preferred``.
+        turn: of each sequence ``(N,)``, by which people's desired directions are turned to the
+            left from those to the destinations, rad.
         seed: of signs and errors.
     """
     smoother, rng = Smoother(sequences), np.random.default_rng(seed)
     paths = [smoother.path(s, s.dt * np.arange(s.n_samples)) for s in sequences]
     smoothed = [replace(s, x=p.x, v=p.v) for s, p in zip(sequences, paths, strict=True)]
     batch, error = collate(smoothed), np.sqrt(smoother.variance)
-    disturbances = _disturbances(system, batch, paths)
+    turns = torch.from_numpy(np.concatenate(turn))
+    disturbances = _disturbances(system, batch, paths, turns)
     kicks = [kick * rng.choice([-1.0, 1.0], (1, kick.shape[1], 1)) for kick in disturbances]
     errors = [error * rng.standard_normal(path.x.shape) for path in paths]
 
     def crowd(sign: float) -> list[Sequence]:
-        simulated_paths = _simulated(system, batch, [sign * kick for kick in kicks])
+        simulated_paths = _simulated(system, batch, [sign * kick for kick in kicks], turns)
         return [
             replace(s, x=x + sign * e, v=None, preferred=None)
             for s, x, e in zip(sequences, simulated_paths, errors, strict=True)
@@ -58,18 +62,22 @@ def simulated_pair(
     return crowd(1.0), crowd(-1.0)
 
 
-def _disturbances(system: System, batch: Batch, paths: list[Path]) -> list[np.ndarray]:
+def _disturbances(
+    system: System, batch: Batch, paths: list[Path], turns: Tensor
+) -> list[np.ndarray]:
     """``(K, N, 2)`` accelerations of the measured people that the model does not explain, m/s²."""
-    among_measured = _people(system, batch, batch.x, batch.v, 2 * batch.dt)
+    among_measured = _people(system, batch, batch.x, batch.v, 2 * batch.dt, turns)
     states = torch.cat([batch.x, batch.v], -1)
     explained = among_measured(np.arange(len(states)), states).numpy()
     return [path.a - explained[: len(path.x), b, : path.x.shape[1]] for b, path in enumerate(paths)]
 
 
-def _simulated(system: System, batch: Batch, kicks: list[np.ndarray]) -> list[np.ndarray]:
+def _simulated(
+    system: System, batch: Batch, kicks: list[np.ndarray], turns: Tensor
+) -> list[np.ndarray]:
     """``(K, N, 2)`` positions of each sequence's people with all interactions, m."""
     step = batch.dt / STEPS
-    people = _people(system, batch, batch.x[:1], batch.v[:1], step)
+    people = _people(system, batch, batch.x[:1], batch.v[:1], step, turns)
     push = np.zeros(batch.x.shape)
     for b, kick in enumerate(kicks):
         push[: len(kick), b, : kick.shape[1]] = kick
@@ -87,9 +95,14 @@ def _simulated(system: System, batch: Batch, kicks: list[np.ndarray]) -> list[np
     return [states[: len(kick), b, : kick.shape[1], :2] for b, kick in enumerate(kicks)]
 
 
-def _people(system: System, batch: Batch, x: Tensor, v: Tensor, step: float) -> PersonAlone:
-    """The people of a batch among positions and velocities ``(H, B, N, 2)``."""
+def _people(
+    system: System, batch: Batch, x: Tensor, v: Tensor, step: float, turns: Tensor
+) -> PersonAlone:
+    """The people of a batch among positions and velocities ``(H, B, N, 2)``, whose desired
+    directions are turned by ``(P,)`` rad."""
     window, person = torch.nonzero(batch.agent, as_tuple=True)
-    around = Surroundings(system.scene(batch), x, v, window, person, step)
+    scene = system.scene(batch)
+    turn_destinations(scene, batch.x[0], window, person, turns)
+    around = Surroundings(scene, x, v, window, person, step)
     vector = ParameterVector(system)
     return PersonAlone(around, system, vector.runs(vector.row[None]))

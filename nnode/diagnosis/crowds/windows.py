@@ -132,12 +132,7 @@ class Windows:
             speed, turn = map(torch.from_numpy, desired)
             scene.preferred = torch.zeros_like(scene.preferred)
             scene.preferred[window, person, 0] = speed
-            start = self.batch.x[0, window, person]
-            x, y = (scene.destination[window, person] - start).unbind(-1)
-            cosine, sine = turn.cos(), turn.sin()
-            turned = torch.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
-            scene.destination = scene.destination.clone()
-            scene.destination[window, person] = start + turned
+            turn_destinations(scene, self.batch.x[0], window, person, turn)
         # terms read the paths from ``Surroundings``, so copies for many runs need only two samples
         scene.measured, scene.measured_rate = scene.measured[:2], scene.measured_rate[:2]
         force: Any = system.find_law("social_force")
@@ -145,6 +140,23 @@ class Windows:
             reach = force.r + CUT * force.B + STRAY
             scene.near = _near(scene, self.batch.x[:: 2 * self.sub], reach)
         return Surroundings(scene, self.batch.x, self.batch.v, window, person, self.step)
+
+
+def turn_destinations(
+    scene: Scene, start: Tensor, window: Tensor, person: Tensor, turn: Tensor
+) -> None:
+    """Turn the ways of P people to their destinations to the left.
+
+    Args:
+        start: ``(B, N, 2)`` where they start, m. window, person: ``(P,)`` of the people.
+        turn: ``(P,)`` rad.
+    """
+    first = start[window, person]
+    x, y = (scene.destination[window, person] - first).unbind(-1)
+    cosine, sine = turn.cos(), turn.sin()
+    scene.destination = scene.destination.clone()
+    turned = torch.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
+    scene.destination[window, person] = first + turned
 
 
 def _preferred(item: Sequence, smoother: Smoother) -> np.ndarray:
