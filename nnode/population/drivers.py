@@ -452,17 +452,16 @@ def _with_lasting_errors(best: Population) -> Population:
     low, high = before.variances.low.copy(), before.variances.high.copy()
     low[2], high[2] = ERRORS
     only_white = replace(before.variances, low=low, high=high)
-    starts = [
-        replace(
-            only_white,
-            noise=np.array([push, push_time, white, white, time]),
-            low=np.insert(low, 3, [ERRORS[0], ERROR_TIMES[0]]),
-            high=np.insert(high, 3, [ERRORS[1], ERROR_TIMES[1]]),
-        )
-        for time in ERROR_TIME_STARTS
-    ]
+    extended = replace(
+        before.variances,
+        low=np.insert(low, 3, [ERRORS[0], ERROR_TIMES[0]]),
+        high=np.insert(high, 3, [ERRORS[1], ERROR_TIMES[1]]),
+    )
     limit = _refitted(best, before.data, only_white)[0] + 2 * _price(len(before.agents))
-    refitted = [_refitted(best, before.data, start) for start in starts]
+    refitted = []
+    for time in ERROR_TIME_STARTS:
+        start = replace(extended, noise=np.array([push, push_time, white, white, time]))
+        refitted.append(_refitted(best, before.data, start))
     loglik, variances = max(refitted, key=lambda fit: fit[0])
     if loglik <= limit:
         return best

@@ -22,6 +22,7 @@ from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.diagnosis.crowds.paths import Path, Smoother
 from nnode.diagnosis.crowds.windows import turn_destinations
+from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.simulation.alone import PersonAlone, Surroundings
 from nnode.simulation.numpy import simulated
@@ -47,13 +48,15 @@ def simulated_pair(
     paths = [smoother.path(s, s.dt * np.arange(s.n_samples)) for s in sequences]
     smoothed = [replace(s, x=p.x, v=p.v) for s, p in zip(sequences, paths, strict=True)]
     batch, error = collate(smoothed), np.sqrt(smoother.variance)
+    scene, (window, person) = system.scene(batch), torch.nonzero(batch.agent, as_tuple=True)
     turns = torch.from_numpy(np.concatenate(turn))
-    disturbances = _disturbances(system, batch, paths, turns)
+    turn_destinations(scene, batch.x[0], window, person, turns)
+    disturbances = _disturbances(system, batch, scene, paths)
     kicks = [kick * rng.choice([-1.0, 1.0], (1, kick.shape[1], 1)) for kick in disturbances]
     errors = [error * rng.standard_normal(path.x.shape) for path in paths]
 
     def crowd(sign: float) -> list[Sequence]:
-        simulated_paths = _simulated(system, batch, [sign * kick for kick in kicks], turns)
+        simulated_paths = _simulated(system, batch, scene, [sign * kick for kick in kicks])
         return [
             replace(s, x=x + sign * e, v=None, preferred=None)
             for s, x, e in zip(sequences, simulated_paths, errors, strict=True)
@@ -63,21 +66,21 @@ def simulated_pair(
 
 
 def _disturbances(
-    system: System, batch: Batch, paths: list[Path], turns: Tensor
+    system: System, batch: Batch, scene: Scene, paths: list[Path]
 ) -> list[np.ndarray]:
     """``(K, N, 2)`` accelerations of the measured people that the model does not explain, m/s²."""
-    among_measured = _people(system, batch, batch.x, batch.v, 2 * batch.dt, turns)
+    among_measured = _people(system, scene, batch.x, batch.v, 2 * batch.dt)
     states = torch.cat([batch.x, batch.v], -1)
     explained = among_measured(np.arange(len(states)), states).numpy()
     return [path.a - explained[: len(path.x), b, : path.x.shape[1]] for b, path in enumerate(paths)]
 
 
 def _simulated(
-    system: System, batch: Batch, kicks: list[np.ndarray], turns: Tensor
+    system: System, batch: Batch, scene: Scene, kicks: list[np.ndarray]
 ) -> list[np.ndarray]:
     """``(K, N, 2)`` positions of each sequence's people with all interactions, m."""
     step = batch.dt / STEPS
-    people = _people(system, batch, batch.x[:1], batch.v[:1], step, turns)
+    people = _people(system, scene, batch.x[:1], batch.v[:1], step)
     push = np.zeros(batch.x.shape)
     for b, kick in enumerate(kicks):
         push[: len(kick), b, : kick.shape[1]] = kick
@@ -95,14 +98,9 @@ def _simulated(
     return [states[: len(kick), b, : kick.shape[1], :2] for b, kick in enumerate(kicks)]
 
 
-def _people(
-    system: System, batch: Batch, x: Tensor, v: Tensor, step: float, turns: Tensor
-) -> PersonAlone:
-    """The people of a batch among positions and velocities ``(H, B, N, 2)``, whose desired
-    directions are turned by ``(P,)`` rad."""
-    window, person = torch.nonzero(batch.agent, as_tuple=True)
-    scene = system.scene(batch)
-    turn_destinations(scene, batch.x[0], window, person, turns)
+def _people(system: System, scene: Scene, x: Tensor, v: Tensor, step: float) -> PersonAlone:
+    """The people of a scene among positions and velocities ``(H, B, N, 2)``."""
+    window, person = torch.nonzero(scene.agent, as_tuple=True)
     around = Surroundings(scene, x, v, window, person, step)
     vector = ParameterVector(system)
     return PersonAlone(around, system, vector.runs(vector.row[None]))

@@ -233,9 +233,9 @@ def test_directions_that_differ_are_estimated() -> None:
     assert direction["estimate"] == pytest.approx(0.2 * np.sqrt(3 / 4), rel=0.2)
     assert rows["desired_speed"]["estimate"] == pytest.approx(100 * SPREAD, rel=0.35)
     assert engine.population is not None
-    for simulated in engine.simulated_engines(system, ParameterVector(system).row, 0):
-        assert simulated.population is not None
-        turns = engine.population.desired.turn, simulated.population.desired.turn
+    for crowd in engine.simulated_engines(system, ParameterVector(system).row, 0):
+        assert crowd.population is not None
+        turns = engine.population.desired.turn, crowd.population.desired.turn
         assert np.corrcoef(*turns)[0, 1] > 0.8
 
 
