@@ -37,8 +37,8 @@ from studies.runner import Task
 #: speeds at the start depend on pushes.
 DT, STEP, SAMPLES, BEFORE = 0.1, 0.02, 61, 2.0
 PEOPLE, RADIUS, ERROR = 8, 0.25, 0.005
-#: Width and half the length of the corridor, m; distance of destinations, m.
-WIDTH, HALF, FAR = 4.5, 8.0, 1000.0
+#: Width and half the length of the corridor, m, which nobody leaves; distance of destinations, m.
+WIDTH, HALF, FAR = 4.5, 30.0, 1000.0
 WALLS = pd.DataFrame(
     [(-HALF, 0.0, HALF, 0.0), (HALF, WIDTH, -HALF, WIDTH)], columns=["x1", "y1", "x2", "y2"]
 )
