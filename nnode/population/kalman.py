@@ -23,7 +23,7 @@ CONTINUED, ANEW = 1, 2
 #: Standard deviation of pushes of which nothing is known, relative to that of all. It exceeds 1,
 #: because speeds at a restart depend on earlier pushes. The table in docs/method.md has the
 #: likelihood of other values.
-FIRST = 2.0
+FIRST = 1.4
 #: Segments of a block, whose arrays fit the cache.
 BLOCK = 16
 

@@ -341,13 +341,14 @@ class RunAlone:
         return [RungeKuttaSolver(part, self.around.step) for part in parts]
 
     def by_start(self) -> np.ndarray:
-        """``(P, F, 2, 4)`` derivatives of positions by the states at the start."""
+        """``(P, F, 4, 4)`` derivatives of the states by those at the start."""
         start = np.zeros((2, 2, 4, 1))
         start[0, 0, 0] = start[0, 1, 1] = start[1, 0, 2] = start[1, 1, 3] = 1.0
-        return self._positions(np.zeros((len(self._states), 2, 2, 4, 1)), start)
+        return self._changes(np.zeros((len(self._states), 2, 2, 4, 1)), start)
 
     def displacements(self, fields: Sequence[Tensor]) -> np.ndarray:
-        """``(P, F, 2, C)`` changes of positions by C additional accelerations, m.
+        """``(P, F, 4, C)`` changes of positions, m, and velocities, m/s, by C additional
+        accelerations.
 
         Args:
             fields: each ``(F W, N, 2)`` or ``(F, W, N, 2)``.
@@ -357,10 +358,10 @@ class RunAlone:
         for c, rate in enumerate(fields):
             people = rate.reshape(times, -1, 2).index_select(1, place)
             source[:, 1, :, c] = people.movedim(1, 2).numpy()
-        return self._positions(source)
+        return self._changes(source)
 
-    def _positions(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-        """``(P, F, 2, C)`` changes of positions by sources ``(F, 2, 2, C, P or 1)`` and starts
+    def _changes(self, source: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+        """``(P, F, 4, C)`` changes of the states by sources ``(F, 2, 2, C, P or 1)`` and starts
         ``(2, 2, C, 1)``."""
         parts, first = [], 0
         for solver in self._solvers:
@@ -368,6 +369,6 @@ class RunAlone:
             part = source if source.shape[-1] == 1 else source[..., first:last]
             shape = (*part.shape[:-1], solver.number)
             initial = None if start is None else np.repeat(start, solver.number, -1)
-            parts.append(solver.response(np.broadcast_to(part, shape), initial))
+            parts.append(solver.states(np.broadcast_to(part, shape), initial).numpy())
             first = last
-        return np.concatenate(parts, -1).transpose(3, 0, 1, 2)
+        return np.concatenate(parts, 1).swapaxes(0, 1)

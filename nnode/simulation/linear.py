@@ -52,6 +52,12 @@ class DenseSolver:
                 rates do not change.
             start: ``(M, N, C, B)`` changes of the states at the start; None for 0.
         """
+        n = source.shape[2]
+        positions: np.ndarray = self.states(source, start)[:, :, :n].permute(0, 2, 3, 1).numpy()
+        return positions
+
+    def states(self, source: np.ndarray, start: np.ndarray | None = None) -> Tensor:
+        """``(K, B, M N, C)`` changes of all states, see :meth:`response`."""
         k, w, n, c, b = source.shape
         all_sources = np.zeros((k, self._width, n, c, b))
         all_sources[:, :w] = source
@@ -63,8 +69,7 @@ class DenseSolver:
         states = [state]
         for step, change in zip(self._step, forced, strict=True):
             states.append(step @ states[-1] + change)
-        positions: np.ndarray = torch.stack(states)[:, :, :n].permute(0, 2, 3, 1).numpy()
-        return positions
+        return torch.stack(states)
 
     @property
     def number(self) -> int:

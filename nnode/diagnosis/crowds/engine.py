@@ -109,7 +109,7 @@ class CrowdEngine:
         """``(R, n)``: whitened differences, measured minus simulated, of R runs of one model."""
         population = self._fitted(system, rows[0])
         differences = self._people.differences(self._states(system, rows))
-        joined = self._people.joined(np.moveaxis(differences, 0, -1))
+        joined = self._people.continued(differences, population.continuation)
         return self._whitened(joined + population.by_desired(population.data.fixed)[..., None])
 
     def squares(self, system: System, row: Tensor) -> Squares:
@@ -128,7 +128,8 @@ class CrowdEngine:
             self._people.differences(self._states(system, ParameterVector(system).row[None]))
             for system in (before, after)
         )
-        return not math.sqrt(np.mean((with_effect - without) ** 2)) < self._people.error
+        moved = with_effect.position - without.position
+        return not math.sqrt(np.mean(moved**2)) < self._people.error
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """The windows in sequence, with the deviations of :meth:`squares`."""
@@ -425,15 +426,16 @@ class CrowdEngine:
     def _errors(self, system: System, row: Tensor) -> np.ndarray:
         """``(P, L, 2)`` m: measured minus simulated positions, with the most likely deviations."""
         people, population = self._people, self._fitted(system, row)
-        fixed = population.data.fixed
-        difference = people.joined(people.differences(self._states(system, row[None]))[0])
-        by_desired = np.where(population.data.observed, population.by_desired(fixed), 0.0)
-        data = replace(population.data, residual=difference + by_desired)
+        difference = people.differences(self._states(system, row[None]))
+        joined = people.continued(difference, population.continuation)[..., 0]
+        residual = joined + population.by_desired(population.data.fixed)
+        data = replace(population.data, residual=residual)
         posterior = people.posterior(data, population.random, population.variances)
+        # of windows by themselves; where paths are chaotic, nothing is known of the deviations
+        by_deviation = np.where(data.observed[..., None], population.by_deviation, 0.0)
         deviations = (posterior.change + posterior.deviations)[:, None]
-        # where paths are chaotic, nothing is known of the deviations
-        explained = np.where(data.observed, (fixed * deviations).sum(-1), 0.0)
-        errors = people.parted(data.residual - explained)
+        explained = (by_deviation * deviations).sum(-1) - population.by_desired(by_deviation)
+        errors = people.parted(people.joined(difference.position)[..., 0] - explained)
         return errors.reshape(len(errors), -1, 2)
 
     def _whitened(self, columns: np.ndarray) -> Tensor:
@@ -455,6 +457,8 @@ class CrowdEngine:
         """``(C, n)`` changes of the residuals by accelerations of the people."""
         parts = []
         for first in range(0, len(fields), COLUMNS):
-            moved = run.displacements(fields[first : first + COLUMNS])[:, :: self.windows.sub]
-            parts.append(self._whitened(-self._people.joined(moved)))
+            moved = self._people.change(run.displacements(fields[first : first + COLUMNS]))
+            assert self.population is not None
+            joined = self._people.continued(moved, self.population.continuation)
+            parts.append(self._whitened(-joined))
         return torch.cat(parts) if parts else torch.zeros(0, len(self.unit), dtype=torch.float64)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from nnode.calibrate.intervals import at_bounds
-from nnode.diagnosis.crowds.people import OUTLYING, Gait, People, outlying_weights
+from nnode.diagnosis.crowds.people import OUTLYING, Gait, People, lost, outlying_weights
 from nnode.population.drivers import TOLERANCE
 from nnode.population.estimate import Variances, fit_variances
 from nnode.population.kalman import ANEW
@@ -29,8 +29,8 @@ FREQUENCY, NEAR = 2, 1e-3
 
 
 def estimated_gait(people: People) -> Gait:
-    """The gait without a law, so that all laws are compared with the same: in each window everybody
-    walks on with the smoothed velocity at its start, and is pushed.
+    """The gait without a law, so that all laws are compared with the same: everybody walks on with
+    the smoothed velocity at the start of the record, and is pushed.
 
     Sway is found if it raises the likelihood by more than its parameters need (Schwarz 1978), and
     if its frequency is within its bounds.
@@ -39,13 +39,20 @@ def estimated_gait(people: People) -> Gait:
         people: their gait is not used.
     """
     windows, plain = walking_straight(people), people.initial_variances([])
-    data = _joined(people, windows)
+    data = _records(people)
     plain = fit_variances(data, people.noise, plain, tolerance=TOLERANCE)
     low, start, high = np.array(SWAY).T
 
     def gait(variances: Variances) -> Gait:
-        terms = window_log_likelihoods(people, windows, variances.noise)
-        return Gait(variances.noise[len(plain.noise) :], float(variances.noise[0]), terms)
+        weight, terms = window_log_likelihoods(people, windows, variances.noise)
+        weights = people.joined(np.repeat(weight[:, None], 2 * people.windows.length, 1))
+        records = replace(data, weight=weights)
+        return Gait(
+            sway=variances.noise[len(plain.noise) :],
+            acceleration=float(variances.noise[0]),
+            window_loglik=terms,
+            loglik=people.posterior(records, [], variances).loglik - float(lost(records).sum()),
+        )
 
     if data.dt > RESOLVED:
         return gait(plain)
@@ -84,13 +91,24 @@ def walking_straight(people: People) -> Linearised:
     )
 
 
-def _joined(people: People, windows: Linearised) -> Linearised:
-    """The windows of each person one after the other."""
+def _records(people: People) -> Linearised:
+    """The records of people who walk on with the velocity at their start."""
+    windows, dt = people.windows, people.windows.interval
+    window, place = windows.person.T
+    measured = people.coordinates(windows.measured[:, window, place].swapaxes(0, 1)[..., None])
+    measured = measured.reshape(len(people.pairs), -1, 2)
+    x, v = (
+        people.by_number(array[0, window, place].numpy())[:, :1]
+        for array in (windows.batch.x, windows.batch.v)
+    )
+    straight = x + dt * np.arange(measured.shape[1])[:, None] * v
+    restart = np.zeros(measured.shape[:2], dtype=np.int8)
+    restart[:, 0] = ANEW
     return _free(
-        windows.dt,
-        residual=people.joined(windows.residual),
-        observed=people.joined(windows.observed),
-        restart=people.restarts(),
+        dt,
+        residual=(measured - straight).reshape(len(measured), -1),
+        observed=people.joined(np.ones((len(window), 2 * windows.length), dtype=bool)),
+        restart=restart,
         heading=people.heading,
     )
 
@@ -124,11 +142,14 @@ def _free(
     )
 
 
-def window_log_likelihoods(people: People, windows: Linearised, noise: np.ndarray) -> np.ndarray:
-    """``(P,)`` log likelihoods of the windows by themselves, with the loss of outlying ones."""
+def window_log_likelihoods(
+    people: People, windows: Linearised, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """``(P,)`` weights and log likelihoods of the windows by themselves, with the loss of outlying
+    ones."""
     products = people.noise.products(windows, noise)
     square, samples = products.gram[:, 0, 0], windows.residual.shape[1]
     weight = outlying_weights(square)
     robust = weight * square - OUTLYING * samples * np.log(weight)
     terms: np.ndarray = -(robust + products.logdet + samples * math.log(2 * math.pi)) / 2
-    return terms
+    return weight, terms

@@ -9,8 +9,9 @@ positions y are
     y = f(theta, b) + X d + Z (b* - b) + e,    b* ~ N(0, Omega),
 
 where b are the deviations with which people are simulated, and e has the covariance of
-autocorrelated pushes, of measurement errors, and of errors of the smoothed states in which windows
-start. Pushes continue from one window of a person to the next.
+autocorrelated pushes, of measurement errors, and of the error of the smoothed state in which a
+record starts. The windows of a person continue each other, see
+:mod:`nnode.diagnosis.crowds.continuation`.
 
 Source: the statistical model is that of :mod:`nnode.population`.
 """
@@ -27,6 +28,7 @@ import torch
 from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
+from nnode.diagnosis.crowds.continuation import Change, Continuation, not_grown
 from nnode.diagnosis.crowds.windows import DesiredVelocity, Windows
 from nnode.diagnosis.eligibility import check_model
 from nnode.model.effects.base import Effect
@@ -68,7 +70,7 @@ LIMIT = 3.0
 #: Windows whose sum of squares Q is above this multiple q of the median m have less weight: the
 #: loss is q m (1 + log(Q / (q m))).
 OUTLYING = 2.0
-#: What pushes were is not carried into the next window from windows with a smaller weight.
+#: Windows do not continue those with a smaller weight.
 ORDINARY = 0.5
 #: Windows are left out if a change of a start grows by more than this factor: people who touch
 #: make paths chaotic.
@@ -94,12 +96,15 @@ class Gait(NamedTuple):
         sway: ``(4,)`` the last parameters of :class:`~nnode.population.likelihood.RestartNoise`;
             empty: people do not sway.
         acceleration: standard deviation of their other accelerations along a coordinate, m/s².
-        loglik: ``(P,)`` log likelihoods of the windows, if people walk straight on and are pushed.
+        window_loglik: ``(P,)`` log likelihoods of the windows by themselves, if people walk
+            straight on and are pushed.
+        loglik: of the records.
     """
 
     sway: np.ndarray
     acceleration: float
-    loglik: np.ndarray
+    window_loglik: np.ndarray
+    loglik: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,6 +118,8 @@ class CrowdPopulation:
         desired: of the D simulated people.
         typical: logarithm of the typical desired speed.
         data: the measured paths of D people, linearised.
+        continuation: of their windows.
+        by_deviation: ``(D, K, Q)`` the columns Z of windows that do not continue those before, m.
         posterior: the marginal likelihood, and the deviations from the simulated people.
         gait: how people walk, whatever the law.
         left_out: ``(D,)`` log likelihoods of the windows that are left out, see :class:`Gait`.
@@ -124,6 +131,8 @@ class CrowdPopulation:
     desired: DesiredVelocity
     typical: float
     data: Linearised
+    continuation: Continuation
+    by_deviation: np.ndarray
     posterior: Marginal
     gait: Gait
     left_out: np.ndarray
@@ -160,33 +169,60 @@ class CrowdPopulation:
     @property
     def predicts(self) -> bool:
         """Whether the paths are likelier than if people walk straight on and are pushed."""
-        return self.criterion > float(self.gait.loglik.sum())
+        return self.criterion > self.gait.loglik
 
     @property
     def each(self) -> np.ndarray:
         """``(D,)`` terms of the log marginal likelihood, with the loss of outlying windows. Where
         windows are left out, people walk straight on and are pushed."""
-        assert self.data.weight is not None
-        lost = -OUTLYING / 2 * np.log(np.maximum(self.data.weight, 1e-12))
-        terms: np.ndarray = self.posterior.each - np.where(self.data.observed, lost, 0.0).sum(1)
+        terms: np.ndarray = self.posterior.each - lost(self.data)
         return terms + self.left_out
 
     def by_desired(self, by_deviation: np.ndarray) -> np.ndarray:
         """``(D, K)`` m: the change of positions by the deviations with which people were simulated.
         They have their own desired velocities, and their other parameters are typical."""
-        return _by_desired(by_deviation, self.random, self.desired, self.typical)
+        own = own_deviations(self.random, self.desired, self.typical)
+        change: np.ndarray = (by_deviation * own[:, None]).sum(-1)
+        return change
 
 
-def _by_desired(
-    by_deviation: np.ndarray, random: list[str], desired: DesiredVelocity, typical: float
-) -> np.ndarray:
+def lost(data: Linearised) -> np.ndarray:
+    """``(D,)`` terms of the log likelihood that outlying windows lose by their weights, see
+    :data:`OUTLYING`."""
+    assert data.weight is not None
+    terms = -OUTLYING / 2 * np.log(np.maximum(data.weight, 1e-12))
+    total: np.ndarray = np.where(data.observed, terms, 0.0).sum(1)
+    return total
+
+
+def own_deviations(random: list[str], desired: DesiredVelocity, typical: float) -> np.ndarray:
+    """``(D, Q)`` deviations with which people are simulated."""
     own = np.zeros((len(desired.speed), len(random)))
     if DESIRED_SPEED in random:
         own[:, random.index(DESIRED_SPEED)] = np.log(desired.speed) - typical
     if DESIRED_DIRECTION in random:
         own[:, random.index(DESIRED_DIRECTION)] = desired.turn
-    change: np.ndarray = (by_deviation * own[:, None]).sum(-1)
-    return change
+    return own
+
+
+class LinearisedWindows(NamedTuple):
+    """The P windows of single people, linearised by themselves.
+
+    Attributes:
+        residual: of one column, measured minus simulated; with the deviations with which people are
+            simulated, see :class:`~nnode.population.likelihood.Linearised`.
+        by_deviation: of the Q columns Z. by_start: of four, the state at the start.
+        used: ``(P,)`` False where windows are left out, see :data:`GROWTH`.
+        step, forced: ``(P, L, 4, 4)`` and ``(P, L, 4, 2)``, see
+            :class:`~nnode.population.likelihood.Linearised`.
+    """
+
+    residual: Change
+    by_deviation: Change
+    by_start: Change
+    used: np.ndarray
+    step: np.ndarray
+    forced: np.ndarray
 
 
 def differing(system: System) -> list[str]:
@@ -260,7 +296,7 @@ class People:
         heading = self.joined(np.repeat(way[:, None], windows.length, 1))
         self.heading = heading.reshape(len(heading), -1, 2)
         self._last: tuple[DesiredVelocity, Surroundings] | None = None
-        self.gait = Gait(np.zeros(0), math.inf, np.zeros(len(self.unit)))
+        self.gait = Gait(np.zeros(0), math.inf, np.zeros(len(self.unit)), -math.inf)
 
     @property
     def noise(self) -> RestartNoise:
@@ -315,12 +351,12 @@ class People:
             present = start.variances if variances is None else variances
         share, last_change = 1.0, math.inf
         for round_ in range(MOST_ROUNDS):
-            data = self._linearised(system, random, desired, typical)
+            windows = self._linearised(system, random, desired, typical)
             if round_ > 0:
                 # weights of the linearisation before would count windows fully that it left out
-                data = self._weighted(data, weight)
+                data, _ = self._continued(windows, weight)
                 weight = self._weights(data, self.posterior(data, random, present), present)
-            data = self._weighted(data, weight)
+            data, continuation = self._continued(windows, weight)
             if variances is None:
                 tolerance = ROUGH if round_ < ROUNDS - 1 else TOLERANCE
                 several = anew and round_ == 0
@@ -342,7 +378,7 @@ class People:
             typical += share * shift
             faster, turned = share * steps
             desired = DesiredVelocity(desired.speed * np.exp(faster), desired.turn + turned)
-        left_out = np.where(self.parted(data.observed)[:, 0], 0.0, self.gait.loglik)
+        left_out = np.where(self.parted(data.observed)[:, 0], 0.0, self.gait.window_loglik)
         return CrowdPopulation(
             system=system,
             random=random,
@@ -350,6 +386,8 @@ class People:
             desired=desired,
             typical=typical,
             data=data,
+            continuation=continuation,
+            by_deviation=self.joined(windows.by_deviation.position),
             posterior=posterior,
             gait=self.gait,
             left_out=np.bincount(self.unit, left_out),
@@ -415,58 +453,71 @@ class People:
         random: list[str],
         desired: DesiredVelocity,
         typical: float,
-    ) -> Linearised:
-        """The measured paths, linearised at desired velocities, without weights."""
+    ) -> LinearisedWindows:
+        """The windows, linearised at desired velocities."""
         windows, row = self.windows, ParameterVector(system).row[None]
         states = self.states(system, row, desired)
         run = RunAlone(self.around(system, desired), system, states[:, 0])
         stride, dt, times = windows.sub, windows.interval, windows.length
+        by_start = run.by_start()
         # a free person's position changes by a unit with the first position, by the time with speed
-        growth = np.abs(run.by_start()) / np.repeat([1.0, dt * times], 2)
-        used = growth.max((1, 2, 3)) < GROWTH
-        matrices = trapezoidal(run.slopes[::stride], dt)
-        # there is no interval after the last sample of a window
-        step, after = (
-            np.pad(part.numpy().swapaxes(0, 1), ((0, 0), (0, 1), (0, 0), (0, 0)))
-            for part in matrices
-        )
-        fixed = self.joined(self._random_columns(system, run, random, desired))
-        residual = self.joined(self.differences(states)[0])
-        return Linearised(
-            residual=residual + _by_desired(fixed, random, desired, typical),
-            fixed=fixed,
-            random=np.arange(len(random)),
-            start=np.zeros((*residual.shape, 0)),
-            observed=self.joined(np.repeat(used[:, None], 2 * times, 1)),
-            agent=np.arange(len(self.pairs)),
-            step=self.joined(step)[:, :-1],
-            forced=self.joined(dt / 2 * after[..., 2:])[:, :-1],
-            heading=self.heading,
-            dt=dt,
+        growth = np.abs(by_start[:, :, :2]) / np.repeat([1.0, dt * times], 2)
+        step, after = trapezoidal(run.slopes[::stride], dt)
+        by_deviation = self.change(run.displacements(self._fields(system, run, random, desired)))
+        own = own_deviations(random, desired, typical)[self.unit, :, None]
+        residual = self.differences(states)
+        return LinearisedWindows(
+            residual=Change(
+                residual.position + by_deviation.position @ own[:, None],
+                residual.end + by_deviation.end @ own,
+            ),
+            by_deviation=by_deviation,
+            by_start=self.change(by_start),
+            used=growth.max((1, 2, 3)) < GROWTH,
+            step=step.numpy().swapaxes(0, 1),
+            forced=(dt / 2 * after[..., 2:]).numpy().swapaxes(0, 1),
         )
 
-    def _weighted(self, data: Linearised, weight: np.ndarray) -> Linearised:
-        """The paths with weights ``(P,)`` of the windows, which also decide where pushes
-        continue."""
-        times, restart = self.windows.length, self.restarts()
-        used = self.parted(data.observed)[:, 0]
-        ordinary = self.joined((used & (weight > ORDINARY))[:, None])
-        restart[:, times::times][~ordinary[:, :-1]] = ANEW
-        weights = self.joined(np.repeat(weight[:, None], 2 * times, 1))
-        return replace(data, restart=restart, weight=weights)
-
-    def restarts(self) -> np.ndarray:
-        """``(D, T)`` where windows begin, see :class:`~nnode.population.likelihood.Linearised`."""
+    def _continued(
+        self, windows: LinearisedWindows, weight: np.ndarray
+    ) -> tuple[Linearised, Continuation]:
+        """The measured paths of people, with weights ``(P,)`` of the windows, which also decide
+        where windows continue those before."""
+        times = self.windows.length
+        ordinary = self.by_number(windows.used & (weight > ORDINARY))
+        follows = np.pad(ordinary[:, :-1], ((0, 0), (1, 0)))
+        end = self.by_number(windows.by_start.end)
+        continuation = Continuation(
+            position=self.coordinates(windows.by_start.position),
+            end=end,
+            continues=not_grown(end, follows),
+        )
         restart = np.zeros(self.heading.shape[:2], dtype=np.int8)
-        restart[:, :: self.windows.length] = CONTINUED
-        restart[:, 0] = ANEW
-        return restart
+        restart[:, ::times] = np.where(follows, CONTINUED, ANEW)
+        restart[:, ::times][continuation.continues] = 0
+        by_deviation = self.continued(windows.by_deviation, continuation)
+        residual = self.continued(windows.residual, continuation)[..., 0]
+        data = Linearised(
+            residual=residual,
+            fixed=by_deviation,
+            random=np.arange(by_deviation.shape[-1]),
+            start=np.zeros((*residual.shape, 0)),
+            observed=self.joined(np.repeat(windows.used[:, None], 2 * times, 1)),
+            agent=np.arange(len(self.pairs)),
+            step=self.joined(windows.step)[:, :-1],
+            forced=self.joined(windows.forced)[:, :-1],
+            restart=restart,
+            weight=self.joined(np.repeat(weight[:, None], 2 * times, 1)),
+            heading=self.heading,
+            dt=self.windows.interval,
+        )
+        return data, continuation
 
-    def _random_columns(
+    def _fields(
         self, system: System, run: RunAlone, random: list[str], desired: DesiredVelocity
-    ) -> np.ndarray:
-        """``(P, L, 2, Q)`` derivatives of positions by the logarithms of what differs, or by
-        directions."""
+    ) -> list[Tensor]:
+        """Q accelerations ``(F, W, N, 2)`` per unit of the logarithm of what differs, or of the
+        direction."""
         fields = list[Tensor]()
         differences = dict(zip(ParameterVector(system).names, differences_of(system), strict=True))
         for name in random:
@@ -479,7 +530,21 @@ class People:
             else:
                 value = float(system.get_parameter(name).detach())
                 fields.append(value * run.parameter(name, differences[name]))
-        return run.displacements(fields)[:, :: self.windows.sub]
+        return fields
+
+    def change(self, states: np.ndarray) -> Change:
+        """Of changes ``(P, F, 4, C)`` of the states."""
+        position = states[:, :: self.windows.sub, :2][:, : self.windows.length]
+        return Change(position, states[:, -1])
+
+    def continued(self, change: Change, continuation: Continuation) -> np.ndarray:
+        """``(D, W K, C)`` changes of positions, with those of earlier windows."""
+        return continuation(self.coordinates(change.position), self.by_number(change.end))
+
+    def coordinates(self, position: np.ndarray) -> np.ndarray:
+        """``(D, W, 2 L, C)`` of people's windows, from ``(P, L, 2, C)``, see :meth:`by_number`."""
+        flat = position.reshape(len(position), 2 * self.windows.length, position.shape[-1])
+        return self.by_number(flat)
 
     def joined(self, values: np.ndarray) -> np.ndarray:
         """``(D, W K, ...)``: people's W windows one after the other, from ``(P, K, ...)``; 0 where
@@ -487,9 +552,14 @@ class People:
         samples = 2 * self.windows.length
         if values.ndim > 2 and values.shape[1:3] == (self.windows.length, 2):
             values = values.reshape(len(values), samples, *values.shape[3:])
-        joined = np.zeros((len(self.pairs), self._number, *values.shape[1:]), values.dtype)
-        joined[self._place] = values
+        joined = self.by_number(values)
         return joined.reshape(len(joined), self._number * values.shape[1], *values.shape[2:])
+
+    def by_number(self, values: np.ndarray) -> np.ndarray:
+        """``(D, W, ...)``: of people's W windows, from ``(P, ...)``; 0 where a person has less."""
+        windows = np.zeros((len(self.pairs), self._number, *values.shape[1:]), values.dtype)
+        windows[self._place] = values
+        return windows
 
     def parted(self, joined: np.ndarray) -> np.ndarray:
         """``(P, 2 L, ...)`` from ``(D, W 2 L, ...)``, see :meth:`joined`."""
@@ -514,14 +584,17 @@ class People:
             states.append(rhs.simulated(first, windows.steps))
         return torch.cat(states, 1)
 
-    def differences(self, states: Tensor) -> np.ndarray:
-        """``(R, P, L, 2)`` m: measured minus simulated positions, of :meth:`states`."""
+    def differences(self, states: Tensor) -> Change:
+        """Measured minus simulated :meth:`states`, of R runs; where the next window starts the
+        smoothed state is the measured one."""
         window, place = self.windows.person.T
-        x = states[:: self.windows.sub, :, window, place, :2]
-        measured = torch.from_numpy(self.windows.measured[:, window, place])
-        difference = (measured[:, None] - x).permute(1, 2, 0, 3)
-        limited = difference.nan_to_num(LIMIT, LIMIT, -LIMIT).clamp(-LIMIT, LIMIT)
-        return np.asarray(limited.numpy())
+        simulated = states[:, :, window, place]
+        x = torch.from_numpy(self.windows.measured[:, window, place])[:, None]
+        position = x - simulated[:: self.windows.sub][: len(x), ..., :2]
+        batch = self.windows.batch
+        end = torch.cat([batch.x[-1], batch.v[-1]], -1)[window, place] - simulated[-1]
+        position, end = (part.nan_to_num(LIMIT).clamp(-LIMIT, LIMIT) for part in (position, end))
+        return Change(position.permute(2, 0, 3, 1).numpy(), end.permute(1, 2, 0).numpy())
 
     def around(self, system: System, desired: DesiredVelocity) -> Surroundings:
         """The surroundings of people with desired velocities; the last ones are cached. All systems

@@ -51,7 +51,7 @@ class Windows:
 
     Attributes:
         batch: one simulation per window. Positions and velocities are the smoothed ones, at half
-            steps of the simulation.
+            steps of the simulation; after the last sample of a sequence they do not change.
         measured: ``(L, W, N, 2)`` m: positions as they were measured, at the L residual times.
         person: ``(P, 2)`` window and place of the P people of all windows who are real.
         sequence, number: ``(W,)`` position of a window's sequence, and its own within it.
@@ -85,7 +85,7 @@ class Windows:
         self.sub = max(1, int(np.ceil(stride * dt / STEP)))
         self.step = stride * dt / self.sub
         self.length = length
-        half = np.arange(2 * self.sub * (length - 1) + 1) * self.step / 2
+        half = np.arange(2 * self.steps + 1) * self.step / 2
         pieces, measured, sequence, number = [], [], [], []
         self.compared: dict[int, tuple[int, int]] = {}
         self.preferred: dict[int, np.ndarray] = {}
@@ -96,7 +96,7 @@ class Windows:
             preferred = self.preferred[i] = _preferred(item, smoother)
             for w in range(windows):
                 first = (spare + w * length) * stride
-                path = smoother.path(item, first * dt + half)
+                path = smoother.path(item, np.minimum(first * dt + half, dt * (item.n_samples - 1)))
                 time = item.time[0] + first * dt + half
                 pieces.append(_piece(item, time, path.x, path.v, preferred))
                 measured.append(item.x[first::stride][:length])
@@ -117,8 +117,8 @@ class Windows:
 
     @property
     def steps(self) -> int:
-        """Steps of the simulation of a window."""
-        return self.sub * (self.length - 1)
+        """Steps of the simulation of a window, to the start of the next one."""
+        return self.sub * self.length
 
     def around(self, system: System, desired: DesiredVelocity | None = None) -> Surroundings:
         """The surroundings of the people whom ``system`` simulates.

@@ -36,7 +36,7 @@ def gait_of(walking: list[Sequence]) -> Gait:
 
 
 def test_parameters_of_sway(swaying: People) -> None:
-    (across, along, frequency, lasts), acceleration, _ = estimated_gait(swaying)
+    (across, along, frequency, lasts), acceleration, *_ = estimated_gait(swaying)
     assert across == pytest.approx(0.02 * np.exp(0.3**2), rel=0.2)
     # smoothed speeds at starts contain less of the sway along the direction, which is fast
     assert 0.3 * across < along < 0.6 * across
@@ -50,7 +50,7 @@ def test_likelihood_of_windows_in_which_people_walk_straight_on() -> None:
     people = People(Windows(sequences(0.0), SECONDS))
     variances = people.initial_variances([])
     windows = walking_straight(people)
-    terms = window_log_likelihoods(people, windows, variances.noise)
+    _, terms = window_log_likelihoods(people, windows, variances.noise)
     push, lasts, error, speed = variances.noise
     start, times, dt = people.noise.position, people.windows.length, windows.dt
     step, forced, keep = windows.step[0, 0], windows.forced[0, 0], np.exp(-dt / lasts)
@@ -75,7 +75,7 @@ def test_likelihood_of_windows_in_which_people_walk_straight_on() -> None:
 
 
 def test_people_without_sway() -> None:
-    sway, acceleration, _ = gait_of(sequences(0.0))
+    sway, acceleration, *_ = gait_of(sequences(0.0))
     assert not len(sway)
     assert 0.1 < acceleration < 0.4
 
@@ -87,7 +87,7 @@ def test_sway_is_not_resolved_by_few_samples() -> None:
 def test_given_sway_is_kept() -> None:
     given = np.array([0.01, 0.003, 0.8, 4.0])
     people = People(Windows(sequences(0.0), SECONDS))
-    people.gait = Gait(given, 0.2, people.gait.loglik)
+    people.gait = people.gait._replace(sway=given, acceleration=0.2)
     variances = people.initial_variances(["desired_speed"])
     np.testing.assert_array_equal(variances.noise[-4:], given)
     fixed = variances.low == variances.high
