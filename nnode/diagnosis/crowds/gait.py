@@ -24,8 +24,8 @@ RESOLVED = 0.15
 #: along the direction of walking, m, the frequency, Hz, and the time for which sway lasts, s. Slow
 #: turns of the path, such as evasions, have lower frequencies.
 SWAY = ((1e-4, 0.02, 0.2), (1e-4, 0.005, 0.1), (0.65, 0.95, 1.3), (0.5, 3.0, 30.0))
-#: Place of the frequency, and how close its logarithm is to a bound if it is at the bound.
-FREQUENCY, NEAR = 2, 1e-3
+#: Place of the frequency.
+FREQUENCY = 2
 
 
 def estimated_gait(people: People) -> Gait:
@@ -66,7 +66,7 @@ def estimated_gait(people: People) -> Gait:
     before, after = (people.posterior(data, [], each).loglik for each in (plain, swaying))
     sway = swaying.noise[len(plain.noise) :]
     price = len(sway) * math.log(max(len(people.pairs), 2)) / 2
-    at_bound = at_bounds(np.log(sway), np.log(low), np.log(high), NEAR)[FREQUENCY]
+    at_bound = at_bounds(np.log(sway), np.log(low), np.log(high), TOLERANCE)[FREQUENCY]
     found = after > before + price and not at_bound
     return gait(swaying if found else plain)
 
