@@ -18,8 +18,6 @@ from numba import njit
 
 from nnode.simulation.kernels.functions import INLINE, LOOP
 
-#: Restarts of simulated paths: pushes continue, or nothing is known of them.
-CONTINUED, ANEW = 1, 2
 #: Standard deviation of pushes of which nothing is known, relative to that of all. It exceeds 1,
 #: because speeds at a restart depend on earlier pushes. The table in docs/method.md has the
 #: likelihood of other values.
@@ -87,9 +85,9 @@ def filtered(
                     _add_error(spread, m + processes, fresh[processes])
                 _oscillate(mean, spread, oscillating, turn, fresh)
             for b in range(len(restart[block, k])):
-                kind, segment = restart[first + b, k], spread[..., b]
-                if kind:
-                    _restart(mean[..., b], segment, start, sigma[: oscillating - m], kind == ANEW)
+                if restart[first + b, k]:
+                    segment = spread[..., b]
+                    _restart(mean[..., b], segment, start, sigma[: oscillating - m])
                     ways = direction[first + b, k]
                     _restart_swaying(mean[..., b], segment, oscillating, ways, omega)
             for at in range(k * axes, (k + 1) * axes):
@@ -140,13 +138,11 @@ def _fill(out: np.ndarray, values: np.ndarray) -> None:
 
 
 @njit(**INLINE)
-def _restart(
-    mean: np.ndarray, spread: np.ndarray, start: np.ndarray, sigma: np.ndarray, anew: bool
-) -> None:
+def _restart(mean: np.ndarray, spread: np.ndarray, start: np.ndarray, sigma: np.ndarray) -> None:
     """Restart d of one segment with the variances ``start``, and forget e, whose standard
-    deviations are ``sigma``, if nothing is known of it. The other states continue."""
+    deviations are ``sigma``. The other states continue."""
     m = len(start)
-    for i in range(m + len(sigma) if anew else m):
+    for i in range(m + len(sigma)):
         mean[i] = 0.0
         spread[i] = 0.0
         spread[:, i] = 0.0

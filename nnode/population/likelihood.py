@@ -74,10 +74,8 @@ class Linearised:
         leader: standard deviation and correlation time of the error of the leader's path, m and s;
             it is neglected if the former is 0.
         dt: sampling interval, s.
-        restart: ``(S, K / A)`` where the simulated path restarts from a smoothed measured state:
-            :data:`~nnode.population.kalman.CONTINUED` where pushes continue,
-            :data:`~nnode.population.kalman.ANEW` where nothing is known of them, 0 elsewhere; None:
-            nowhere.
+        restart: ``(S, K / A)`` where the simulated path restarts from a smoothed measured state,
+            and nothing is known of pushes; None: nowhere.
         weight: ``(S, K)`` of the whitened samples' squares; None: 1.
         heading: ``(S, K / A, A)`` unit vectors in the direction of walking, along and across which
             people sway; None: they do not sway.
@@ -313,7 +311,7 @@ def _whitened(
     sigma, time = np.array([*processes, lasting]).T
     restart, times = data.restart, data.step.shape[1] + 1
     if restart is None:
-        restart = np.zeros((len(columns), times), dtype=np.int8)
+        restart = np.zeros((len(columns), times), dtype=bool)
     keep, omega = np.exp(-data.dt / time), np.zeros(0)
     direction = np.zeros((len(columns), times, 0, data.axes))
     if oscillation is not None:

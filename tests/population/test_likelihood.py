@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from nnode.population.kalman import ANEW, CONTINUED, FIRST
+from nnode.population.kalman import FIRST
 from nnode.population.likelihood import (
     Linearised,
     Marginal,
@@ -153,13 +153,13 @@ def test_bounded_change_maximises_the_likelihood() -> None:
 
 
 def restarting(seed: int) -> Linearised:
-    """Two people in two dimensions, each with three segments of four times; the second person's
-    last segment is missing."""
+    """Two people in two dimensions, whose paths restart after eight of twelve times; the last four
+    of the second person are missing."""
     rng = np.random.default_rng(seed)
     people, times = 2, 12
     step = 0.9 * np.eye(4) + 0.05 * rng.normal(size=(people, times - 1, 4, 4))
-    restart = np.zeros((people, times), dtype=np.int8)
-    restart[:, [0, 8]], restart[:, 4] = ANEW, CONTINUED
+    restart = np.zeros((people, times), dtype=bool)
+    restart[:, [0, 8]] = True
     observed = np.ones((people, 2 * times), dtype=bool)
     observed[1, 16:] = False
     observed[0, 5] = False
@@ -216,7 +216,6 @@ def restarting_covariance(
                 for number, (way, swing) in enumerate(zip(ways, swings, strict=True))
             ]
             d = drawn([POSITION] * 2 + [speed] * 2) - np.concatenate([place, sum(turning)])
-        if data.restart[person, k] == ANEW:
             e = drawn([FIRST * SIGMA] * 2)
         rows += list(d[:2] + place)
     map_ = np.array(rows)

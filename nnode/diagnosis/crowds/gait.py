@@ -15,7 +15,6 @@ from nnode.calibrate.intervals import at_bounds
 from nnode.diagnosis.crowds.people import OUTLYING, Gait, People, lost, outlying_weights
 from nnode.population.drivers import TOLERANCE
 from nnode.population.estimate import Variances, fit_variances
-from nnode.population.kalman import ANEW
 from nnode.population.likelihood import Linearised
 
 #: s; sampled more coarsely, sway is not resolved: people make two steps per second.
@@ -80,8 +79,8 @@ def walking_straight(people: People) -> Linearised:
     x, v = (array[0, window, place].numpy() for array in (windows.batch.x, windows.batch.v))
     straight = x[:, None] + dt * np.arange(times)[:, None] * v[:, None]
     measured = windows.measured[:, window, place].swapaxes(0, 1)
-    restart = np.zeros((number, times), dtype=np.int8)
-    restart[:, 0] = ANEW
+    restart = np.zeros((number, times), dtype=bool)
+    restart[:, 0] = True
     return _free(
         dt,
         residual=(measured - straight).reshape(number, -1),
@@ -102,8 +101,8 @@ def _records(people: People) -> Linearised:
         for array in (windows.batch.x, windows.batch.v)
     )
     straight = x + dt * np.arange(measured.shape[1])[:, None] * v
-    restart = np.zeros(measured.shape[:2], dtype=np.int8)
-    restart[:, 0] = ANEW
+    restart = np.zeros(measured.shape[:2], dtype=bool)
+    restart[:, 0] = True
     return _free(
         dt,
         residual=(measured - straight).reshape(len(measured), -1),

@@ -51,7 +51,6 @@ from nnode.population.drivers import (
 )
 from nnode.population.estimate import Variances, fit_variances
 from nnode.population.intervals import variance_intervals, variation_rows
-from nnode.population.kalman import ANEW, CONTINUED
 from nnode.population.likelihood import (
     Linearised,
     Marginal,
@@ -492,9 +491,8 @@ class People:
             end=end,
             continues=not_grown(end, follows),
         )
-        restart = np.zeros(self.heading.shape[:2], dtype=np.int8)
-        restart[:, ::times] = np.where(follows, CONTINUED, ANEW)
-        restart[:, ::times][continuation.continues] = 0
+        restart = np.zeros(self.heading.shape[:2], dtype=bool)
+        restart[:, ::times] = ~continuation.continues
         by_deviation = self.continued(windows.by_deviation, continuation)
         residual = self.continued(windows.residual, continuation)[..., 0]
         data = Linearised(
