@@ -21,7 +21,8 @@ STEP = 0.13
 INTERVAL = 0.1
 #: Smallest number of samples of a window; a start state has four numbers.
 LEAST = 5
-#: Windows are shortened until at most this share of the usable sequences is shorter.
+#: Windows are shortened until at most this share of the usable sequences is shorter, and then, to a
+#: half at most, until they leave out at most this share of the samples that shorter ones use.
 LEFT_OUT = 0.1
 #: A wall point further away than r + CUT * B is left out: exp(-CUT) of the force at contact.
 CUT = 11.0
@@ -47,7 +48,7 @@ class Windows:
 
     Args:
         sequences: of people, equally sampled.
-        window: length, s.
+        window: largest length, s, see :data:`LEFT_OUT`.
 
     Attributes:
         batch: one simulation per window. Positions and velocities are the smoothed ones, at half
@@ -78,7 +79,13 @@ class Windows:
             )
         # a few long sequences must not exclude the short ones
         longest = sufficient[int(LEFT_OUT * len(sufficient))]
-        length = min(max(LEAST + 1, round(window / (stride * dt))), longest)
+        most = min(max(LEAST + 1, round(window / (stride * dt))), longest)
+        samples = {
+            length: sum(number // length * length for number in count)
+            for length in range(most, max(LEAST, most // 2) - 1, -1)
+        }
+        used = (1 - LEFT_OUT) * max(samples.values())
+        length = next(length for length, number in samples.items() if number >= used)
         self.used = [i for i, number in enumerate(count) if number >= length]
         smoother = Smoother([sequences[i] for i in self.used])
         self.variance = smoother.variance

@@ -74,13 +74,19 @@ def test_windows_do_not_overlap() -> None:
 
 
 @pytest.mark.parametrize(
-    ("samples", "dt", "expected"), [(100, 0.04, (19, 1, 0.08)), (30, 0.25, (6, 2, 0.125))]
+    ("samples", "dt", "expected"), [(100, 0.04, (16, 1, 0.08)), (30, 0.25, (6, 2, 0.125))]
 )
 def test_windows_of_fast_and_slow_cameras(
     samples: int, dt: float, expected: tuple[int, int, float]
 ) -> None:
     windows = Windows([track(np.zeros((samples, 2, 2)), dt=dt)], 1.5)
     assert (windows.length, windows.sub, windows.step) == expected
+
+
+def test_windows_are_shortened_to_use_most_samples() -> None:
+    windows = Windows([track(np.zeros((29, 2, 2)))], 2.0)
+    assert windows.length == 14
+    assert windows.number.tolist() == [0, 1]
 
 
 def test_short_sequences_are_used_beside_a_long_one() -> None:
