@@ -25,7 +25,7 @@ class Change(NamedTuple):
     """C changes of people's paths in windows.
 
     Attributes:
-        position: ``(P, L, 2, C)`` m, at the residual times.
+        position: ``(P, 2 L, C)`` m, both coordinates at each of the L residual times.
         end: ``(P, 4, C)`` of the positions (m) and velocities (m/s) where the next window starts.
     """
 

@@ -44,8 +44,7 @@ def estimated_gait(people: People) -> Gait:
 
     def gait(variances: Variances) -> Gait:
         weight, terms = window_log_likelihoods(people, windows, variances.noise)
-        weights = people.joined(np.repeat(weight[:, None], 2 * people.windows.length, 1))
-        records = replace(data, weight=weights)
+        records = replace(data, weight=people.at_samples(weight))
         return Gait(
             sway=variances.noise[len(plain.noise) :],
             acceleration=float(variances.noise[0]),
@@ -73,68 +72,66 @@ def estimated_gait(people: People) -> Gait:
 def walking_straight(people: People) -> Linearised:
     """The windows of people who walk on with the velocity at the start of a window; each is a
     segment."""
-    windows, dt = people.windows, people.windows.interval
-    number, times = len(people.unit), windows.length
-    window, place = windows.person.T
-    x, v = (array[0, window, place].numpy() for array in (windows.batch.x, windows.batch.v))
-    straight = x[:, None] + dt * np.arange(times)[:, None] * v[:, None]
-    measured = windows.measured[:, window, place].swapaxes(0, 1)
-    restart = np.zeros((number, times), dtype=bool)
-    restart[:, 0] = True
-    return _free(
-        dt,
-        residual=(measured - straight).reshape(number, -1),
-        observed=np.ones((number, 2 * times), dtype=bool),
-        restart=restart,
-        heading=people.parted(people.heading.reshape(len(people.pairs), -1)).reshape(-1, times, 2),
+    x, v, measured = _walks(people)
+    heading = people.parted(people.heading.reshape(len(people.pairs), -1))
+    return _straight(
+        people.windows.interval,
+        x,
+        v,
+        measured,
+        observed=np.ones((len(x), 2 * people.windows.length), dtype=bool),
+        heading=heading.reshape(measured.shape),
     )
 
 
 def _records(people: People) -> Linearised:
     """The records of people who walk on with the velocity at their start."""
-    windows, dt = people.windows, people.windows.interval
-    window, place = windows.person.T
-    measured = people.coordinates(windows.measured[:, window, place].swapaxes(0, 1)[..., None])
-    measured = measured.reshape(len(people.pairs), -1, 2)
-    x, v = (
-        people.by_number(array[0, window, place].numpy())[:, :1]
-        for array in (windows.batch.x, windows.batch.v)
-    )
-    straight = x + dt * np.arange(measured.shape[1])[:, None] * v
-    restart = np.zeros(measured.shape[:2], dtype=bool)
-    restart[:, 0] = True
-    return _free(
-        dt,
-        residual=(measured - straight).reshape(len(measured), -1),
-        observed=people.joined(np.ones((len(window), 2 * windows.length), dtype=bool)),
-        restart=restart,
+    x, v, measured = _walks(people)
+    return _straight(
+        people.windows.interval,
+        people.by_number(x)[:, 0],
+        people.by_number(v)[:, 0],
+        people.joined(measured),
+        observed=people.at_samples(np.ones(len(x), dtype=bool)),
         heading=people.heading,
     )
 
 
-def _free(
+def _walks(people: People) -> tuple[np.ndarray, ...]:
+    """Smoothed positions (m) and velocities (m/s) at the starts of windows, ``(P, 2)``, and
+    measured positions ``(P, L, 2)``, m."""
+    windows, (window, place) = people.windows, people.windows.person.T
+    x, v = (array[0, window, place].numpy() for array in (windows.batch.x, windows.batch.v))
+    return x, v, windows.measured[:, window, place].swapaxes(0, 1)
+
+
+def _straight(
     dt: float,
+    x: np.ndarray,
+    v: np.ndarray,
+    measured: np.ndarray,
     *,
-    residual: np.ndarray,
     observed: np.ndarray,
-    restart: np.ndarray,
     heading: np.ndarray,
 ) -> Linearised:
-    """Paths of people without a law."""
+    """S segments ``(S, T, 2)`` of people without a law, who start at ``x`` with ``v``."""
+    number, times = measured.shape[:2]
+    straight = x[:, None] + dt * np.arange(times)[:, None] * v[:, None]
+    restart = np.zeros((number, times), dtype=bool)
+    restart[:, 0] = True
     one, zero = np.eye(2), np.zeros((2, 2))
     free = np.block([[one, dt * one], [zero, one]])
     pushed = np.concatenate([dt**2 / 4 * one, dt / 2 * one])
-    none = np.zeros((*residual.shape, 0))
-    intervals = len(residual), residual.shape[1] // 2 - 1
+    none = np.zeros((number, 2 * times, 0))
     return Linearised(
-        residual=residual,
+        residual=(measured - straight).reshape(number, -1),
         fixed=none,
         random=np.zeros(0, dtype=int),
         start=none,
         observed=observed,
-        agent=np.arange(len(residual)),
-        step=np.broadcast_to(free, (*intervals, 4, 4)),
-        forced=np.broadcast_to(pushed, (*intervals, 4, 2)),
+        agent=np.arange(number),
+        step=np.broadcast_to(free, (number, times - 1, 4, 4)),
+        forced=np.broadcast_to(pushed, (number, times - 1, 4, 2)),
         restart=restart,
         heading=heading,
         dt=dt,

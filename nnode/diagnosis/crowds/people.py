@@ -180,9 +180,7 @@ class CrowdPopulation:
     def by_desired(self, by_deviation: np.ndarray) -> np.ndarray:
         """``(D, K)`` m: the change of positions by the deviations with which people were simulated.
         They have their own desired velocities, and their other parameters are typical."""
-        own = own_deviations(self.random, self.desired, self.typical)
-        change: np.ndarray = (by_deviation * own[:, None]).sum(-1)
-        return change
+        return displaced(by_deviation, own_deviations(self.random, self.desired, self.typical))
 
 
 def lost(data: Linearised) -> np.ndarray:
@@ -204,19 +202,27 @@ def own_deviations(random: list[str], desired: DesiredVelocity, typical: float) 
     return own
 
 
+def displaced(by_deviation: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """``(D, K)`` m: changes of positions by deviations ``(D, Q)``, with the columns Z ``(D, K, Q)``
+    of people."""
+    change: np.ndarray = (by_deviation * own[:, None]).sum(-1)
+    return change
+
+
 class LinearisedWindows(NamedTuple):
     """The P windows of single people, linearised by themselves.
 
     Attributes:
-        residual: of one column, measured minus simulated; with the deviations with which people are
-            simulated, see :class:`~nnode.population.likelihood.Linearised`.
+        difference: of one column, measured minus simulated.
+        own: ``(D, Q)`` deviations with which people are simulated.
         by_deviation: of the Q columns Z. by_start: of four, the state at the start.
         used: ``(P,)`` False where windows are left out, see :data:`GROWTH`.
         step, forced: ``(P, L, 4, 4)`` and ``(P, L, 4, 2)``, see
             :class:`~nnode.population.likelihood.Linearised`.
     """
 
-    residual: Change
+    difference: Change
+    own: np.ndarray
     by_deviation: Change
     by_start: Change
     used: np.ndarray
@@ -292,8 +298,7 @@ class People:
         self.desired = DesiredVelocity(np.maximum(speed, SLOWEST), np.zeros(len(speed)))
         x = windows.batch.x[:, window, place].numpy()
         way = (x[-1] - x[0]) / np.maximum(np.hypot(*(x[-1] - x[0]).T), 1e-9)[:, None]
-        heading = self.joined(np.repeat(way[:, None], windows.length, 1))
-        self.heading = heading.reshape(len(heading), -1, 2)
+        self.heading = self.joined(np.repeat(way[:, None], windows.length, 1))
         self._last: tuple[DesiredVelocity, Surroundings] | None = None
         self.gait = Gait(np.zeros(0), math.inf, np.zeros(len(self.unit)), -math.inf)
 
@@ -377,7 +382,7 @@ class People:
             typical += share * shift
             faster, turned = share * steps
             desired = DesiredVelocity(desired.speed * np.exp(faster), desired.turn + turned)
-        left_out = np.where(self.parted(data.observed)[:, 0], 0.0, self.gait.window_loglik)
+        left_out = np.where(windows.used, 0.0, self.gait.window_loglik)
         return CrowdPopulation(
             system=system,
             random=random,
@@ -462,15 +467,11 @@ class People:
         # a free person's position changes by a unit with the first position, by the time with speed
         growth = np.abs(by_start[:, :, :2]) / np.repeat([1.0, dt * times], 2)
         step, after = trapezoidal(run.slopes[::stride], dt)
-        by_deviation = self.change(run.displacements(self._fields(system, run, random, desired)))
-        own = own_deviations(random, desired, typical)[self.unit, :, None]
-        residual = self.differences(states)
+        fields = self._fields(system, run, random, desired)
         return LinearisedWindows(
-            residual=Change(
-                residual.position + by_deviation.position @ own[:, None],
-                residual.end + by_deviation.end @ own,
-            ),
-            by_deviation=by_deviation,
+            difference=self.differences(states),
+            own=own_deviations(random, desired, typical),
+            by_deviation=self.change(run.displacements(fields)),
             by_start=self.change(by_start),
             used=growth.max((1, 2, 3)) < GROWTH,
             step=step.numpy().swapaxes(0, 1),
@@ -482,30 +483,29 @@ class People:
     ) -> tuple[Linearised, Continuation]:
         """The measured paths of people, with weights ``(P,)`` of the windows, which also decide
         where windows continue those before."""
-        times = self.windows.length
         ordinary = self.by_number(windows.used & (weight > ORDINARY))
         follows = np.pad(ordinary[:, :-1], ((0, 0), (1, 0)))
         end = self.by_number(windows.by_start.end)
         continuation = Continuation(
-            position=self.coordinates(windows.by_start.position),
+            position=self.by_number(windows.by_start.position),
             end=end,
             continues=not_grown(end, follows),
         )
         restart = np.zeros(self.heading.shape[:2], dtype=bool)
-        restart[:, ::times] = ~continuation.continues
+        restart[:, :: self.windows.length] = ~continuation.continues
         by_deviation = self.continued(windows.by_deviation, continuation)
-        residual = self.continued(windows.residual, continuation)[..., 0]
+        difference = self.continued(windows.difference, continuation)[..., 0]
         data = Linearised(
-            residual=residual,
+            residual=difference + displaced(by_deviation, windows.own),
             fixed=by_deviation,
             random=np.arange(by_deviation.shape[-1]),
-            start=np.zeros((*residual.shape, 0)),
-            observed=self.joined(np.repeat(windows.used[:, None], 2 * times, 1)),
+            start=np.zeros((*difference.shape, 0)),
+            observed=self.at_samples(windows.used),
             agent=np.arange(len(self.pairs)),
             step=self.joined(windows.step)[:, :-1],
             forced=self.joined(windows.forced)[:, :-1],
             restart=restart,
-            weight=self.joined(np.repeat(weight[:, None], 2 * times, 1)),
+            weight=self.at_samples(weight),
             heading=self.heading,
             dt=self.windows.interval,
         )
@@ -533,23 +533,21 @@ class People:
     def change(self, states: np.ndarray) -> Change:
         """Of changes ``(P, F, 4, C)`` of the states."""
         position = states[:, :: self.windows.sub, :2][:, : self.windows.length]
-        return Change(position, states[:, -1])
+        coordinates = 2 * self.windows.length
+        flat = position.reshape(len(states), coordinates, states.shape[-1])
+        return Change(flat, states[:, -1])
 
     def continued(self, change: Change, continuation: Continuation) -> np.ndarray:
         """``(D, W K, C)`` changes of positions, with those of earlier windows."""
-        return continuation(self.coordinates(change.position), self.by_number(change.end))
+        return continuation(self.by_number(change.position), self.by_number(change.end))
 
-    def coordinates(self, position: np.ndarray) -> np.ndarray:
-        """``(D, W, 2 L, C)`` of people's windows, from ``(P, L, 2, C)``, see :meth:`by_number`."""
-        flat = position.reshape(len(position), 2 * self.windows.length, position.shape[-1])
-        return self.by_number(flat)
+    def at_samples(self, values: np.ndarray) -> np.ndarray:
+        """``(D, W 2 L)``: values ``(P,)`` of windows at all of their samples."""
+        return self.joined(np.repeat(values[:, None], 2 * self.windows.length, 1))
 
     def joined(self, values: np.ndarray) -> np.ndarray:
         """``(D, W K, ...)``: people's W windows one after the other, from ``(P, K, ...)``; 0 where
-        a person has less. A window's coordinates ``(P, L, 2, ...)`` are samples."""
-        samples = 2 * self.windows.length
-        if values.ndim > 2 and values.shape[1:3] == (self.windows.length, 2):
-            values = values.reshape(len(values), samples, *values.shape[3:])
+        a person has less."""
         joined = self.by_number(values)
         return joined.reshape(len(joined), self._number * values.shape[1], *values.shape[2:])
 
@@ -592,7 +590,8 @@ class People:
         batch = self.windows.batch
         end = torch.cat([batch.x[-1], batch.v[-1]], -1)[window, place] - simulated[-1]
         position, end = (part.nan_to_num(LIMIT).clamp(-LIMIT, LIMIT) for part in (position, end))
-        return Change(position.permute(2, 0, 3, 1).numpy(), end.permute(1, 2, 0).numpy())
+        coordinates = position.permute(2, 0, 3, 1).flatten(1, 2)
+        return Change(coordinates.numpy(), end.permute(1, 2, 0).numpy())
 
     def around(self, system: System, desired: DesiredVelocity) -> Surroundings:
         """The surroundings of people with desired velocities; the last ones are cached. All systems

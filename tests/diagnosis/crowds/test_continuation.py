@@ -58,7 +58,7 @@ def test_windows_of_a_linear_law_are_one_simulation() -> None:
     np.testing.assert_array_equal(continued.restart, expected.restart)
     np.testing.assert_allclose(continued.residual, expected.residual, atol=1e-4)
     # windows by themselves begin with small residuals
-    alone = people[1].joined(windows[1].residual.position)[..., 0]
+    alone = people[1].joined(windows[1].difference.position)[..., 0]
     assert np.abs(alone - expected.residual).max() > 0.1
 
 
