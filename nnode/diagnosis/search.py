@@ -115,6 +115,22 @@ def converged_fit(engine: Engine, system: System, rounds: int = 2) -> Fit:
     return fit
 
 
+def calibrated_without(engine: Engine, before: Fit, after: Fit, *names: str) -> Fit:
+    """A model, calibrated from its own parameters, or from those that it has with further effects
+    if it fits better then. Otherwise an effect could pass because the model with it was calibrated
+    to a better minimum.
+
+    Args:
+        before: the model. after: with the effects. names: of the effects.
+    """
+    own = refine(engine, before.system)
+    with suppress(SimulationError):
+        other = refine(engine, without(after.system, *names))
+        if other.cost < (1 - ROUGH) * own.cost:
+            return other
+    return own
+
+
 def search(
     engine: Engine,
     fit: Fit,
@@ -341,7 +357,7 @@ def _ranked(
         followed = significant or len(candidates) > 1 or isinstance(engine, AgentsEngine)
         if not followed and not _significant_held_out(candidates[0], screen, len(selection.scores)):
             return []
-    if isinstance(engine, AgentsEngine):
+    if candidates and isinstance(engine, AgentsEngine):
         candidates = _with_refitted_variances(engine, candidates, selection)
     return _refined(engine, sorted(candidates, key=lambda c: -c.gain.gain), selection)
 
@@ -349,25 +365,28 @@ def _ranked(
 def _with_refitted_variances(
     engine: AgentsEngine, candidates: list[Candidate], selection: Selection
 ) -> list[Candidate]:
-    """The candidates with variances refitted under the most likely of them. The variances of the
-    model without a strong effect would attribute it to autocorrelated pushes."""
+    """The candidates with variances refitted under the most likely of them, if it is likelier than
+    the model without it. The variances of the model without a strong effect would attribute it to
+    autocorrelated pushes."""
     assert selection.screen is not None
+    assert engine.population is not None
     by_cost = sorted(candidates, key=lambda c: c.fit.cost)
     refitted_first = by_cost[:LIKELY] + [c for c in by_cost[LIKELY:] if c.score.effect.covariate]
     populations = dict[str, Any]()
     for candidate in refitted_first:
         with suppress(SimulationError):
             populations[candidate.name] = engine.population_of(candidate.fit.system)
-    if populations:
-        engine.set_population(engine.reselected(likeliest(populations.values())))
-    selection.fit = refine(engine, selection.fit.system)
-    refitted = []
+    likely = likeliest([engine.population, *populations.values()])
+    if likely is not engine.population:
+        engine.set_population(engine.reselected(likely))
+    fits = list[tuple[Fit, Candidate]]()
     for candidate in candidates:
         population = populations.get(candidate.name)
         start = candidate.fit.system if population is None else population.system
-        fit = refine(engine, start, tolerance=ROUGH)
-        refitted.append(_candidate(candidate.score, fit, selection.fit, selection.screen))
-    return refitted
+        fits.append((refine(engine, start, tolerance=ROUGH), candidate))
+    best, candidate = min(fits, key=lambda each: each[0].cost)
+    selection.fit = calibrated_without(engine, selection.fit, best, candidate.name)
+    return [_candidate(c.score, fit, selection.fit, selection.screen) for fit, c in fits]
 
 
 def _is_rival(best: Candidate, rival: Candidate, test: Comparison) -> bool:

@@ -42,6 +42,7 @@ from nnode.diagnosis.result import (
 )
 from nnode.diagnosis.search import (
     Selection,
+    calibrated_without,
     converged_fit,
     initial_fit,
     likely_extensions,
@@ -50,6 +51,7 @@ from nnode.diagnosis.search import (
 )
 from nnode.diagnosis.statistics.bounds import parameters_at_bounds
 from nnode.diagnosis.statistics.combination import least_confirmation
+from nnode.diagnosis.statistics.paired import compare, heldout
 from nnode.diagnosis.statistics.power import PowerSimulation
 from nnode.diagnosis.statistics.random_effects import IndividualEstimate, estimate_individual
 from nnode.diagnosis.statistics.simultaneous import Simultaneous, simultaneous
@@ -234,7 +236,7 @@ def diagnose_law(
         verdict=_verdict(
             selection,
             unexplained,
-            1 - square_of(engine, selection.fit.system) / square_of(engine, base_system),
+            _insufficient(exploration, selection, unexplained),
             bool(named_individuals),
             testable,
             bool(imitations or law_at_bounds),
@@ -283,7 +285,22 @@ def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves
     if selection.fit is not exploration.base:
         remaining = curves(engine, selection.fit, exploration.variables)
         remaining = significant_curves(engine, selection.fit, remaining, thresholds.STRICT)
-    return [c for c in remaining if c.relevant and c.removed > thresholds.SMALLEST_SHARE]
+    return [c for c in remaining if c.relevant]
+
+
+def _insufficient(
+    exploration: _Exploration, selection: Selection, unexplained: list[Curves]
+) -> bool:
+    """Whether remaining structure would lower held-out costs by more than
+    :data:`~nnode.diagnosis.thresholds.UNEXPLAINED` of what the selected effects do."""
+    if not (selection.steps and unexplained):
+        return False
+    engine = exploration.engine
+    alone = refine(engine, copy.deepcopy(exploration.base_system))
+    costs = [heldout(fit, engine.cluster) for fit in (alone, selection.fit)]
+    lowered = compare(*costs).gain
+    largest = max(curve.gain.gain for curve in unexplained)
+    return largest * (1 - lowered) > thresholds.UNEXPLAINED * lowered
 
 
 def _offered(
@@ -366,8 +383,9 @@ def _drivers(engine: Engine, fit: Fit, seed: int, notes: list[str]) -> list[Vari
 def _without_imitations(
     exploration: _Exploration, nearer: BetterLaw | None, notes: list[str], seed: int
 ) -> tuple[Selection, list[NamedEffect], set[str]]:
-    """Remove effects that imitate another law; they become hypotheses. They are those that a
-    better-fitting law does not need, and all if parameters of the diagnosed law end at bounds.
+    """Remove effects that may imitate something else; they become hypotheses. They are those that a
+    better-fitting law does not need, and all if parameters of the diagnosed law end at bounds or if
+    much structure remains: then no set of effects suffices.
 
     Args:
         notes: the reason is added to them.
@@ -378,8 +396,17 @@ def _without_imitations(
     """
     engine, selection, division = exploration.engine, exploration.selection, exploration.division
     law_at_bounds = parameters_at_bounds(exploration.base_system, selection.fit, engine, seed)
-    steps = selection.steps if law_at_bounds else []
-    if nearer is not None and selection.steps and not law_at_bounds:
+    unexplained = _unexplained(exploration, selection) if selection.steps else []
+    insufficient = _insufficient(exploration, selection, unexplained)
+    steps = selection.steps if law_at_bounds or insufficient else []
+    if insufficient:
+        names = ", ".join(step.chosen.name for step in steps)
+        variables = ", ".join(curve.variable.name for curve in unexplained)
+        notes.append(
+            f"{names}: deviations by {variables} remain in the model with these effects. They may "
+            "imitate something that the catalogue lacks, and are hypotheses."
+        )
+    if nearer is not None and selection.steps and not steps:
         label = division.exploration.label
         steps, p_value = explained_by_law(engine, selection, label, nearer)
         if steps:
@@ -460,6 +487,11 @@ def _explore(
         within=stages.within,
         hints=hints,
     )
+    if selection.steps:
+        names = [step.chosen.name for step in selection.steps]
+        alone = calibrated_without(engine, base, selection.fit, *names)
+        if alone.system is not base.system:
+            base_system = alone.system
     # a missing effect correlates the residuals of all clusters, so they are tested after selection
     simultaneity = simultaneous(engine, selection.fit, options.seed)
     clock.lap("name")
@@ -552,7 +584,7 @@ def _excess(engine: Engine, fit: Fit) -> float:
 def _verdict(
     selection: Selection,
     unexplained: list[Curves],
-    removed: float,
+    insufficient: bool,
     individuals_named: bool,
     testable: bool,
     law_is_wrong: bool,
@@ -561,19 +593,17 @@ def _verdict(
     """The verdict.
 
     Args:
-        removed: share of the squared errors that the named effects removed.
+        insufficient: whether the selected effects do not suffice.
         individuals_named: whether agent-specific parameters were confirmed.
-        law_is_wrong: whether effects were selected that a better-fitting law does not need, or
-            its own parameters are at bounds.
+        law_is_wrong: whether effects were selected that may imitate something else, or the law's
+            own parameters are at bounds.
         absences: the effects that were not found.
     """
     if not testable:
         return "not_testable"
+    if insufficient:
+        return "unknown"
     if selection.steps:
-        # the named effects may have removed less than nothing, without any structure that is left
-        limit = thresholds.UNEXPLAINED * removed
-        if unexplained and unexplained[0].removed * (1 - removed) > limit:
-            return "unknown"
         return "indistinguishable" if any(step.rivals for step in selection.steps) else "named"
     if individuals_named:
         return "named"

@@ -22,8 +22,9 @@ NEGLIGIBLE = 0.1
 RIVAL = 0.25
 #: Share of the best held-out gain from which a simpler effect is as good.
 AS_GOOD = 0.97
-#: Largest ratio of unexplained structure to what the named effects removed.
-UNEXPLAINED = 0.5
+#: Largest ratio of the decreases of held-out costs by a remaining curve and by the named effects.
+#: The table in docs/discovery.md has these ratios for data with known effects.
+UNEXPLAINED = 0.25
 #: Smallest share of an effect's estimate inside its plausible range, below which it indicates
 #: another effect; the linear estimate of a strong effect may overshoot.
 PLAUSIBLE = 0.2

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from torch import Tensor
 
 import nnode
 from benchmarks import drivers
@@ -20,13 +22,19 @@ from nnode.diagnosis import search as module
 from nnode.diagnosis.crowds.engine import CrowdEngine
 from nnode.diagnosis.lanes.engine import TrafficEngine
 from nnode.diagnosis.lanes.followers import FollowersEngine
-from nnode.diagnosis.residuals.fit import Fit, refine
-from nnode.diagnosis.search import _hinted, _with_best_ends, converged_fit, search
+from nnode.diagnosis.residuals.fit import Fit, evaluated, refine
+from nnode.diagnosis.search import (
+    _hinted,
+    _with_best_ends,
+    calibrated_without,
+    converged_fit,
+    search,
+)
 from nnode.diagnosis.statistics.score import Score, Screen, Trace
 from nnode.errors import SimulationError
 from nnode.model import System, Traffic, build_model, make_law
-from nnode.model.effects import CATALOGUE
-from nnode.model.effects.lane import SpeedPeriod
+from nnode.model.effects import CATALOGUE, Effect
+from nnode.model.effects.lane import RelativeSpeed, SpeedPeriod
 from nnode.model.extend import effects_of
 from tests.diagnosis.agreement import residuals
 from tests.diagnosis.platoons import lin, platoons, relative_speed
@@ -176,3 +184,34 @@ def test_strong_effect_with_a_small_score_is_selected_if_hinted(
         hints=[extension] if hinted else [],
     )
     assert [step.chosen.name for step in result.steps] == (["alignment"] if hinted else [])
+
+
+class TwoMinima:
+    """Residuals with a minimum of the cost near v0 = 20 m/s, and a deeper one at 30 m/s."""
+
+    def residuals(self, system: System, rows: Tensor) -> Tensor:
+        v0 = rows[:, 0]
+        return torch.stack([(v0 - 20) * (v0 - 30) / 10, (v0 - 30) / 20], 1)
+
+    def tangents(self, system: System, row: Tensor) -> Tensor:
+        v0 = row[0]
+        tangents = torch.zeros(len(row), 2, dtype=row.dtype)
+        tangents[0] = torch.stack([(2 * v0 - 50) / 10, torch.ones_like(v0) / 20])
+        return tangents
+
+
+@pytest.mark.parametrize(("extended_v0", "v0"), [(32.0, 30.0), (17.0, 20.0)])
+def test_model_without_effects_is_calibrated_from_both_starts(
+    extended_v0: float, v0: float
+) -> None:
+    """The deeper minimum is used, which only the model with the effect has found."""
+    engine: Any = TwoMinima()
+    before = evaluated(engine, with_v0(18.0))
+    after = evaluated(engine, with_v0(extended_v0, RelativeSpeed(kappa=0.3)))
+    fit = calibrated_without(engine, before, after, "relative_speed")
+    assert fit.row[0] == pytest.approx(v0, abs=0.5)
+
+
+def with_v0(v0: float, *effects: Effect) -> System:
+    system = Traffic([make_law("lin", v0=v0), *effects], leader="measured")
+    return system.double()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from types import SimpleNamespace
-from typing import Any
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +13,10 @@ from nnode.data.sequence import Sequence
 from nnode.diagnosis.options import DiscoverOptions
 from nnode.diagnosis.outcome import DiagnosisOutcome
 from nnode.diagnosis.report.files import verdict
-from nnode.diagnosis.single_law import _verdict, diagnose_law
+from nnode.diagnosis.residuals.engine import Engine
+from nnode.diagnosis.residuals.fit import Fit
+from nnode.diagnosis.residuals.variables import Curves
+from nnode.diagnosis.single_law import diagnose_law
 from nnode.model.extend import effects_of
 from tests.diagnosis.conftest import KAPPA, MANY
 from tests.diagnosis.platoons import LENGTH, V0, lin, platoons, relative_speed
@@ -95,17 +98,33 @@ def test_free_flow_speed_that_is_not_reached_is_not_testable() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shares", "removed", "verdict"),
-    [([], 0.9, "named"), ([], -0.1, "named"), ([0.1], 0.9, "named"), ([0.5], 0.2, "unknown")],
+    ("share", "hypotheses", "verdict"),
+    [(0.1, [], "named"), (0.4, ["relative_speed"], "unknown")],
 )
-def test_remaining_structure_makes_verdict_unknown(
-    shares: list[float], removed: float, verdict: str
+def test_effects_that_leave_structure_are_hypotheses(
+    hidden_reaction: tuple[list[Sequence], DiscoverOptions, DiagnosisOutcome],
+    monkeypatch: pytest.MonkeyPatch,
+    share: float,
+    hypotheses: list[str],
+    verdict: str,
 ) -> None:
-    """Without remaining structure, errors of positions may grow with a confirmed effect."""
-    selection = SimpleNamespace(steps=[SimpleNamespace(rivals=[])])
-    curves = [SimpleNamespace(removed=share) for share in shares]
-    arguments: Any = (selection, curves, removed, False, True, False, [])
-    assert _verdict(*arguments) == verdict
+    """The effect lowers held-out costs by a third, a curve that remains by a share of the rest."""
+    sequences, options, _ = hidden_reaction
+    module = sys.modules[diagnose_law.__module__]
+    monkeypatch.setattr(module, "significant_curves", partial(first_curve, share))
+    d = diagnose_law(LAW, sequences, replace(options, structure=True)).diagnosis
+    assert d.verdict == verdict
+    assert [effect.name for effect in d.hypotheses] == hypotheses
+    assert (d.gap.after == d.gap.before) == bool(hypotheses)
+    assert any("deviations by" in note for note in d.notes) == bool(hypotheses)
+
+
+def first_curve(
+    share: float, engine: Engine, fit: Fit, candidates: list[Curves], alpha: float
+) -> list[Curves]:
+    """The first curve, as one that lowers the costs by a share."""
+    gain = replace(candidates[0].gain, gain=share)
+    return [replace(candidates[0], gain=gain, removed=0.1, relevant=True)]
 
 
 def test_effects_of_law_with_parameters_at_bounds_are_hypotheses(

@@ -18,7 +18,7 @@ from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.paths import noise_variance, smooth, velocity
 from nnode.data.sequence import Sequence, collate
 from nnode.diagnosis import thresholds
-from nnode.diagnosis.lanes.variables import traffic_variables
+from nnode.diagnosis.lanes.variables import platoon_variables
 from nnode.diagnosis.lanes.whitening import PlatoonFilter
 from nnode.diagnosis.outcome import Simulation
 from nnode.diagnosis.residuals.engine import Squares, of_residuals, square_of
@@ -270,7 +270,7 @@ class TrafficEngine:
 
     def variables(self) -> list[Variable]:
         """The variables on which deviations of vehicles may depend."""
-        return traffic_variables(self.smoothed)
+        return platoon_variables(self.smoothed)
 
     def individual(
         self, system: System, row: Tensor, effect: type[IndividualEffect], options: dict[str, Any]

@@ -32,9 +32,10 @@ from nnode.diagnosis.lanes.engine import (
     with_all_strengths,
     with_each_strength,
 )
+from nnode.diagnosis.lanes.variables import place_variables, vehicle_variables
 from nnode.diagnosis.outcome import Simulation
 from nnode.diagnosis.residuals.engine import Squares, of_residuals
-from nnode.diagnosis.residuals.variables import Curve
+from nnode.diagnosis.residuals.variables import Curve, Variable
 from nnode.model.effects import Effect, Probe
 from nnode.model.scene import Scene
 from nnode.model.system import System
@@ -184,6 +185,14 @@ class FollowersEngine(TrafficEngine):
                 x[:, paths.place[f]] = paths.x[f, : len(x)] - errors[f, : len(x)]
             simulations.append(Simulation(s, x[..., None], skip=1))
         return simulations
+
+    def variables(self) -> list[Variable]:
+        """The variables on which deviations of vehicles may depend; none of the vehicle behind, who
+        reacts to the real path."""
+        paths = self._paths(STEP)
+        number = np.array([s.n_agents for s in self.sequences])[paths.sequence]
+        places = place_variables(number - 1 - paths.place, paths.place)
+        return [*vehicle_variables(self.smoothed), *places]
 
     @np.errstate(over="ignore", invalid="ignore")  # of simulations that diverge
     def tangents(self, system: System, row: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -64,41 +65,76 @@ def _rank(state: State) -> Tensor:
     return (number - 1 - place).to(state.x.dtype)
 
 
-def traffic_variables(batch: Batch) -> list[Variable]:
-    """The variables of platoons, with knots where there are data.
+def platoon_variables(batch: Batch) -> list[Variable]:
+    """The variables of vehicles in whole platoons, with knots where there are data.
 
     Args:
         batch: smoothed windows; windows of one sequence bear its name.
     """
-    follower_samples = batch.valid.clone()
+    samples, x, v = _follower_samples(batch), batch.x[..., 0], batch.v[..., 0]
     last = batch.agent.sum(1) - 1
-    follower_samples[:, torch.arange(len(batch)), last] = False
-    x, v = batch.x[..., 0], batch.v[..., 0]
-    gap = torch.cat([torch.diff(x), torch.full_like(x[..., :1], torch.nan)], -1)
+    gap = _measured_gap(batch)
+    behind = torch.cat([gap[..., :1], gap[..., :-1]], -1)
+    leader_speed = v[:, torch.arange(len(batch)), last][..., None].expand(x.shape)
+    rank = (last[:, None] - torch.arange(x.shape[2])).expand(x.shape)
+
+    def of(name: str, unit: str, value: Callable[[State], Tensor], seen: Tensor) -> Variable:
+        return _variable(name, unit, value, seen[samples].numpy())
+
+    return [
+        *vehicle_variables(batch),
+        of("rear gap", "m", _rear_gap, behind),
+        of("speed of the leader", "m/s", _leader_speed, leader_speed),
+        of("place in the platoon", "1", _rank, rank),
+    ]
+
+
+def place_variables(ahead: np.ndarray, behind: np.ndarray) -> list[Variable]:
+    """The variables of followers' places in platoons.
+
+    Args:
+        ahead, behind: ``(F,)`` numbers of vehicles of the platoon, in the order of the followers'
+            states.
+    """
+
+    def of(name: str, number: np.ndarray) -> Variable:
+        def value(state: State) -> Tensor:
+            of_states = torch.from_numpy(number).repeat(len(state.x) // len(number))
+            return of_states[:, None].expand(state.x.shape[:2]).to(state.x.dtype)
+
+        return _variable(name, "1", value, number)
+
+    return [of("place in the platoon", ahead), of("vehicles behind", behind)]
+
+
+def vehicle_variables(batch: Batch) -> list[Variable]:
+    """The variables of vehicles and of those ahead, with knots where there are data.
+
+    Args:
+        batch: smoothed windows; windows of one sequence bear its name.
+    """
+    samples, x, v = _follower_samples(batch), batch.x[..., 0], batch.v[..., 0]
+    gap = _measured_gap(batch)
     difference = torch.cat([torch.diff(v), torch.zeros_like(v[..., :1])], -1)
     times = batch.start[:, None] + batch.dt * torch.arange(len(x))[:, None, None]
     start_of: dict[str, float] = {}
     for name, start in zip(batch.names, batch.start.tolist(), strict=True):
         start_of[name] = min(start_of.get(name, start), start)
     since = times - torch.tensor([start_of[name] for name in batch.names])[:, None]
-    leader_speed = v[:, torch.arange(len(batch)), last][..., None].expand(x.shape)
     ahead = torch.cat([gap[..., 1:], gap[..., -1:]], -1)
     ahead = torch.where(ahead.isnan() | (ahead > PADDING_GAP / 2), gap, ahead)
-    behind = torch.cat([gap[..., :1], gap[..., :-1]], -1)
-    rank = (last[:, None] - torch.arange(x.shape[2])).expand(x.shape)
 
-    def of(name: str, unit: str, value: Callable[[State], Tensor], seen_values: Tensor) -> Variable:
-        values = seen_values.expand(x.shape)[follower_samples].numpy().astype(float)
-        return Variable(name, unit, value, knots_of(values, KNOTS), _followers)
+    def of(name: str, unit: str, value: Callable[[State], Tensor], seen: Tensor) -> Variable:
+        return _variable(name, unit, value, seen.expand(x.shape)[samples].numpy())
 
     def waves(
         name: str,
         unit: str,
         value: Callable[[State], Tensor],
-        seen_values: Tensor,
+        seen: Tensor,
         between: tuple[float, float],
     ) -> list[Variable]:
-        values = seen_values.expand(x.shape)[follower_samples]
+        values = seen.expand(x.shape)[samples]
         return waves_of(name, unit, value, values, between, {"": _followers})
 
     return [
@@ -106,12 +142,27 @@ def traffic_variables(batch: Batch) -> list[Variable]:
         of("speed", "m/s", _speed, v),
         of("speed difference", "m/s", _speed_difference, difference),
         of("next gap", "m", _next_gap, ahead),
-        of("rear gap", "m", _rear_gap, behind),
-        of("speed of the leader", "m/s", _leader_speed, leader_speed),
         of("position", "m", _position, x),
         of("clock time", "s", clock, times),
         of("time since the start", "s", since_start(start_of), since),
-        of("place in the platoon", "1", _rank, rank.to(x.dtype)),
         *waves("position", "m", _position, x, ROAD),
         *waves("clock time", "s", clock, times, (max(CLOCK[0], 4 * batch.dt), CLOCK[1])),
     ]
+
+
+def _variable(name: str, unit: str, value: Callable[[State], Tensor], seen: np.ndarray) -> Variable:
+    """A variable with knots at quantiles of the values that were seen."""
+    return Variable(name, unit, value, knots_of(seen.astype(float), KNOTS), _followers)
+
+
+def _follower_samples(batch: Batch) -> Tensor:
+    """``(K, B, N)`` True at samples of followers."""
+    samples = batch.valid.clone()
+    samples[:, torch.arange(len(batch)), batch.agent.sum(1) - 1] = False
+    return samples
+
+
+def _measured_gap(batch: Batch) -> Tensor:
+    """``(K, B, N)`` m; NaN at the last place."""
+    x = batch.x[..., 0]
+    return torch.cat([torch.diff(x), torch.full_like(x[..., :1], torch.nan)], -1)

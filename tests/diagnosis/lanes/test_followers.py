@@ -12,8 +12,12 @@ import torch
 import nnode
 from benchmarks.drivers import ZONE, platoons
 from nnode.calibrate.parameters import ParameterVector
+from nnode.data.sequence import Sequence
+from nnode.diagnosis import thresholds
+from nnode.diagnosis.curves import curves
 from nnode.diagnosis.lanes.followers import ERROR, FollowersEngine
 from nnode.diagnosis.residuals.fit import evaluated, refine
+from nnode.diagnosis.search import converged_fit
 from nnode.diagnosis.statistics.score import Screen, traces
 from nnode.model import System, Traffic, make_law
 from nnode.model.effects import Effect
@@ -167,3 +171,20 @@ def test_columns_of_zones_are_simulated_for_maps_only(
     monkeypatch.setattr(engine, "_displacement", counted)
     traces(engine, evaluated(engine, system), SpeedZone)
     assert bool(calls) is simulated
+
+
+def test_last_vehicles_that_are_slower_are_located() -> None:
+    data = nnode.sequences(platoons("lin", "none", 0.0, 5, number=14, vehicles=4))
+    engine = FollowersEngine([slowed(sequence) for sequence in data])
+    system = Traffic([make_law("lin")], leader="measured").double()
+    fit = converged_fit(engine, system)
+    variables = [variable for variable in engine.variables() if not variable.lengths]
+    p_values = {c.variable.name: c.p_value for c in curves(engine, fit, variables)}
+    assert p_values["vehicles behind"] < thresholds.STRICT < p_values["gap"]
+
+
+def slowed(sequence: Sequence) -> Sequence:
+    """The last vehicle falls back by 0.3 m/s."""
+    x = sequence.x.copy()
+    x[:, 0] -= 0.3 * (sequence.time - sequence.time[0])[:, None]
+    return replace(sequence, x=x)
