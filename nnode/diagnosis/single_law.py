@@ -167,10 +167,11 @@ def diagnose_law(
     if exploration.simultaneity.together:
         exploration = replace(explore(together=True), simultaneity=exploration.simultaneity)
     division, engine = exploration.division, exploration.engine
-    base_system, selection = exploration.base_system, exploration.selection
+    base_system = exploration.base_system
     notes += [division.note] if division.note else []
+    unexplained, insufficient = _unexplained(exploration, exploration.selection)
     selection, imitations, law_at_bounds = _without_imitations(
-        exploration, nearer, notes, options.seed
+        exploration, nearer, unexplained if insufficient else [], notes, options.seed
     )
     numbers = _clusters(exploration, options, len(effects))
     testable = numbers.exploration >= numbers.least_exploration
@@ -188,7 +189,8 @@ def diagnose_law(
     individuals = [estimate_individual(engine, selection.fit, kind) for kind in kinds]
     selection, unconfirmed = confirmation.confirmed(engine, selection)
     law_at_bounds |= parameters_at_bounds(base_system, selection.fit, engine, options.seed)
-    unexplained = _unexplained(exploration, selection)
+    if selection is not exploration.selection:
+        unexplained, insufficient = _unexplained(exploration, selection)
     assert selection.screen is not None
     power = PowerSimulation(
         selection.screen, options.alpha, numbers.confirmation if testable else 0
@@ -236,7 +238,7 @@ def diagnose_law(
         verdict=_verdict(
             selection,
             unexplained,
-            _insufficient(exploration, selection, unexplained),
+            insufficient,
             bool(named_individuals),
             testable,
             bool(imitations or law_at_bounds),
@@ -279,13 +281,15 @@ def diagnose_law(
     )
 
 
-def _unexplained(exploration: _Exploration, selection: Selection) -> list[Curves]:
-    """The curves that remain significant in the residuals of a selected model."""
+def _unexplained(exploration: _Exploration, selection: Selection) -> tuple[list[Curves], bool]:
+    """The curves that remain significant in the residuals of a selected model, and whether the
+    selected effects do not suffice beside them."""
     engine, remaining = exploration.engine, exploration.base_curves
     if selection.fit is not exploration.base:
         remaining = curves(engine, selection.fit, exploration.variables)
         remaining = significant_curves(engine, selection.fit, remaining, thresholds.STRICT)
-    return [c for c in remaining if c.relevant]
+    unexplained = [c for c in remaining if c.relevant]
+    return unexplained, _insufficient(exploration, selection, unexplained)
 
 
 def _insufficient(
@@ -381,13 +385,18 @@ def _drivers(engine: Engine, fit: Fit, seed: int, notes: list[str]) -> list[Vari
 
 
 def _without_imitations(
-    exploration: _Exploration, nearer: BetterLaw | None, notes: list[str], seed: int
+    exploration: _Exploration,
+    nearer: BetterLaw | None,
+    unexplained: list[Curves],
+    notes: list[str],
+    seed: int,
 ) -> tuple[Selection, list[NamedEffect], set[str]]:
     """Remove effects that may imitate something else; they become hypotheses. They are those that a
     better-fitting law does not need, and all if parameters of the diagnosed law end at bounds or if
     much structure remains: then no set of effects suffices.
 
     Args:
+        unexplained: the curves beside which the selected effects do not suffice.
         notes: the reason is added to them.
         seed: of the simulations that estimate the bias of scores.
 
@@ -396,10 +405,8 @@ def _without_imitations(
     """
     engine, selection, division = exploration.engine, exploration.selection, exploration.division
     law_at_bounds = parameters_at_bounds(exploration.base_system, selection.fit, engine, seed)
-    unexplained = _unexplained(exploration, selection) if selection.steps else []
-    insufficient = _insufficient(exploration, selection, unexplained)
-    steps = selection.steps if law_at_bounds or insufficient else []
-    if insufficient:
+    steps = selection.steps if law_at_bounds or unexplained else []
+    if unexplained:
         names = ", ".join(step.chosen.name for step in steps)
         variables = ", ".join(curve.variable.name for curve in unexplained)
         notes.append(

@@ -33,8 +33,8 @@ from nnode.diagnosis.search import (
 from nnode.diagnosis.statistics.score import Score, Screen, Trace
 from nnode.errors import SimulationError
 from nnode.model import System, Traffic, build_model, make_law
-from nnode.model.effects import CATALOGUE, Effect
-from nnode.model.effects.lane import RelativeSpeed, SpeedPeriod
+from nnode.model.effects import CATALOGUE
+from nnode.model.effects.lane import SpeedPeriod
 from nnode.model.extend import effects_of
 from tests.diagnosis.agreement import residuals
 from tests.diagnosis.platoons import lin, platoons, relative_speed
@@ -206,12 +206,7 @@ def test_model_without_effects_is_calibrated_from_both_starts(
 ) -> None:
     """The deeper minimum is used, which only the model with the effect has found."""
     engine: Any = TwoMinima()
-    before = evaluated(engine, with_v0(18.0))
-    after = evaluated(engine, with_v0(extended_v0, RelativeSpeed(kappa=0.3)))
+    before = evaluated(engine, lin(v0=18.0))
+    after = evaluated(engine, lin({"name": "relative_speed", "kappa": 0.3}, v0=extended_v0))
     fit = calibrated_without(engine, before, after, "relative_speed")
     assert fit.row[0] == pytest.approx(v0, abs=0.5)
-
-
-def with_v0(v0: float, *effects: Effect) -> System:
-    system = Traffic([make_law("lin", v0=v0), *effects], leader="measured")
-    return system.double()
