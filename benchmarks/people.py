@@ -72,7 +72,7 @@ def crowds(
     sway: float = 0.0,
     sequences: int = 24,
 ) -> pd.DataFrame:
-    """A tidy table of measured positions and destinations, m.
+    """A tidy table of measured positions and destinations, m, and of desired directions, rad.
 
     Args:
         effect: a name of :data:`HIDDEN`, or ``none``.
@@ -117,8 +117,27 @@ def crowds(
             "y": measured[..., 1].ravel(),
             "dest_x": FAR * way[i],
             "dest_y": measured[0, s, i, 1],
+            "angle": angle[s, i],
         }
     )
+
+
+def spread_in_streams(table: pd.DataFrame, turn: float) -> float:
+    """Standard deviation of desired directions about those of the streams, rad.
+
+    A stream's direction is that of the mean velocity of its people. Others, walls and pushes turn
+    it away from the mean of their desired directions.
+
+    Args:
+        table: of :func:`crowds`. turn: standard deviation of desired directions, rad.
+    """
+    person = table.groupby(["sequence", "agent"])
+    people = (person[["x", "y"]].last() - person[["x", "y"]].first()).join(person["angle"].first())
+    streams = people.assign(along=np.abs(people["x"])).groupby(["sequence", people["x"] > 0])
+    mean = streams[["along", "y", "angle"]].mean()
+    turned = np.arctan2(mean["y"], mean["along"]) - mean["angle"]
+    # a stream has half of the people
+    return float(np.sqrt(turn**2 * (1 - 2 / PEOPLE) + (turned**2).mean()))
 
 
 def _swaying(size: float, draw: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
@@ -245,8 +264,9 @@ def evaluate(laws: list[str] | None, **case: Any) -> dict[str, Any]:
     with TemporaryDirectory() as folder:
         walls = Path(folder) / "walls.csv"
         WALLS.to_csv(walls, index=False)
+        table = crowds(**case)
         report = nnode.diagnose(
-            crowds(**case),
+            table.drop(columns="angle"),
             "crowd",
             model={**model_options("esf"), "desired": "direction" if case["turn"] else "exit"},
             options=DiscoverOptions(page=False, replay=False, compare=laws),
@@ -261,8 +281,7 @@ def evaluate(laws: list[str] | None, **case: Any) -> dict[str, Any]:
         "push_time": case["lasts"],
     }
     if case["turn"]:
-        # directions differ from the mean of the stream, of half of the people
-        true["desired_direction"] = case["turn"] * np.sqrt(1 - 2 / PEOPLE)
+        true["desired_direction"] = spread_in_streams(table, case["turn"])
     variations = {each["name"]: each for each in report["drivers"]}
     for name, value in true.items():
         each = variations.get(name, {})

@@ -21,6 +21,7 @@ from benchmarks.people import (
     _hidden,
     cases,
     crowds,
+    spread_in_streams,
 )
 from nnode.data.sequence import Batch, collate
 from nnode.model import Crowd, make_law
@@ -41,6 +42,25 @@ def rates(system: Crowd, batch: Batch, sample: int = 0) -> np.ndarray:
     """``(S, N, 2)`` accelerations at a sample, m/s²."""
     state = torch.cat([batch.x[sample], batch.v[sample]], -1)
     return system(torch.tensor(0.0), state, system.scene(batch))[..., 2:].detach().numpy()
+
+
+def test_directions_differ_from_those_of_the_streams_of_the_model() -> None:
+    turn = 0.15
+    table = crowds("none", 4, sequences=6, push=0.1, turn=turn)
+    measured = collate(nnode.sequences(table.drop(columns="angle")))
+    mean = (measured.x[-1] - measured.x[0]) / (measured.dt * (SAMPLES - 1))
+    scene = Crowd([make_law("esf", tau=TAU, **LAW)], desired="direction").scene(
+        replace(measured, preferred=mean)
+    )
+    x, y = (scene.destination - measured.x[0]).numpy().transpose(2, 0, 1)
+    first = table.groupby(["sequence", "agent"])["angle"].first().to_numpy().reshape(x.shape)
+    # angles are those from the way along the corridor, positive towards growing y
+    turned = np.arctan2(y, np.abs(x)) - first
+    streams = np.stack([turned[:, x[0] > 0].mean(1), turned[:, x[0] < 0].mean(1)])
+    expected = np.sqrt(0.75 * turn**2 + (streams**2).mean())
+    assert spread_in_streams(table, turn) == pytest.approx(expected, rel=0.01)
+    # pushes and others turn streams
+    assert (streams**2).mean() > 0.02**2
 
 
 @pytest.mark.parametrize("sample", [0, SAMPLES - 1])
