@@ -18,10 +18,6 @@ from numba import njit
 
 from nnode.simulation.kernels.functions import INLINE, LOOP
 
-#: Standard deviation of pushes of which nothing is known, relative to that of all. It exceeds 1,
-#: because speeds at a restart depend on earlier pushes. The table in docs/method.md has the
-#: likelihood of other values.
-FIRST = 1.4
 #: Segments of a block, whose arrays fit the cache.
 BLOCK = 16
 
@@ -146,7 +142,7 @@ def _restart(mean: np.ndarray, spread: np.ndarray, start: np.ndarray, sigma: np.
         mean[i] = 0.0
         spread[i] = 0.0
         spread[:, i] = 0.0
-        spread[i, i] = start[i] if i < m else (FIRST * sigma[i - m]) ** 2
+        spread[i, i] = start[i] if i < m else sigma[i - m] ** 2
 
 
 @njit(**INLINE)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from nnode.population.kalman import FIRST
 from nnode.population.likelihood import (
     Linearised,
     Marginal,
@@ -216,7 +215,7 @@ def restarting_covariance(
                 for number, (way, swing) in enumerate(zip(ways, swings, strict=True))
             ]
             d = drawn([POSITION] * 2 + [speed] * 2) - np.concatenate([place, sum(turning)])
-            e = drawn([FIRST * SIGMA] * 2)
+            e = drawn([SIGMA] * 2)
         rows += list(d[:2] + place)
     map_ = np.array(rows)
     random = data.by_deviation[person] * SPREAD

@@ -312,6 +312,11 @@ class People:
         """Standard deviation of the errors of positions, m."""
         return max(math.sqrt(self.windows.variance), ERROR)
 
+    @property
+    def _duration(self) -> float:
+        """Of the longest record, s."""
+        return self.windows.interval * self.windows.length * self._number
+
     def initial_variances(self, random: list[str]) -> Variances:
         """Standard deviations and times where a search starts, and their bounds.
 
@@ -322,8 +327,7 @@ class People:
         dt = windows.interval
         low_push, high_push, push = PUSH[2]
         low_speed, high_speed, speed = START_SPEED
-        duration = dt * windows.length * self._number
-        short, long = SHORT * dt, max(LONG * duration, 2 * SHORT * dt)
+        short, long = SHORT * dt, max(self._duration, 2 * SHORT * dt)
         noise = np.array([push, np.clip(LASTING, short, long), self.error, speed])
         low, high = [low_push, short, self.error, low_speed], [high_push, long, self.error]
         return Variances(
@@ -433,8 +437,13 @@ class People:
         return marginal(data, products, variances.spread, variances.start, low=-limit, high=limit)
 
     def variations(self, population: CrowdPopulation) -> dict[str, dict[str, Any]]:
-        """Rows of a table, see :func:`nnode.population.intervals.variation_rows`."""
-        limit, variances = _limit(population.random), population.variances
+        """Rows of a table, see :func:`nnode.population.intervals.variation_rows`.
+
+        Pushes that last longer than a third of a record are not estimable: their time is biased,
+        because they are hardly distinguished from differences between people."""
+        limit, high = _limit(population.random), population.variances.high.copy()
+        high[1] = LONG * self._duration
+        variances = replace(population.variances, high=high)
         ends = variance_intervals(population.data, self.noise, variances, -limit, limit)
         names = [name.rpartition(".")[2] for name in population.random]
         shrinkage = population.posterior.shrinkage

@@ -214,10 +214,15 @@ def test_differences_between_people_and_pushes_are_estimated() -> None:
     assert population.random == ["desired_speed", "terms.0.tau"]
     assert population.variances.spread == pytest.approx([SPREAD, SPREAD], rel=0.35)
     assert push == pytest.approx(PUSH, rel=0.25)
-    assert 0.5 < time <= 2.0
+    assert time == pytest.approx(4.0, rel=0.25)
     assert error == pytest.approx(0.005, rel=0.1)
     assert np.log(population.desired.speed).std() == pytest.approx(SPREAD, rel=0.25)
     assert np.median(population.desired.speed) == pytest.approx(1.3, rel=0.05)
+    # pushes that last longer than a third of the record have no intervals
+    rows = engine.variations()
+    assert [rows[name]["at_bound"] for name in ("push", "push_time")] == ["", "high"]
+    assert np.isnan([rows[name]["lower"] for name in ("push", "push_time")]).all()
+    assert rows["tau"]["lower"] < 100 * SPREAD < rows["tau"]["upper"]
 
 
 def test_directions_that_differ_are_estimated() -> None:

@@ -17,7 +17,6 @@ from nnode.diagnosis.crowds.gait import (
 )
 from nnode.diagnosis.crowds.people import Gait, People
 from nnode.diagnosis.crowds.windows import Windows
-from nnode.population.kalman import FIRST
 
 
 def sequences(sway: float, every: int = 1) -> list[Sequence]:
@@ -55,7 +54,7 @@ def test_likelihood_of_windows_in_which_people_walk_straight_on() -> None:
     start, times, dt = people.noise.position, people.windows.length, windows.dt
     step, forced, keep = windows.step[0, 0], windows.forced[0, 0], np.exp(-dt / lasts)
     # the state of one coordinate (position, speed, push) as a sum of independent numbers
-    state = np.diag([start, speed, FIRST * push]) @ np.eye(3, 3 + times - 1)
+    state = np.diag([start, speed, push]) @ np.eye(3, 3 + times - 1)
     rows = [state[0]]
     for k in range(times - 1):
         push_now = keep * state[2] + push * np.sqrt(1 - keep**2) * np.eye(3 + times - 1)[3 + k]
