@@ -327,7 +327,7 @@ class People:
         dt = windows.interval
         low_push, high_push, push = PUSH[2]
         low_speed, high_speed, speed = START_SPEED
-        short, long = SHORT * dt, max(self._duration, 2 * SHORT * dt)
+        short, long = SHORT * dt, self._duration
         noise = np.array([push, np.clip(LASTING, short, long), self.error, speed])
         low, high = [low_push, short, self.error, low_speed], [high_push, long, self.error]
         return Variances(
