@@ -69,6 +69,10 @@ KINDS: dict[str, str] = {
 #: Kinds that no simulation can start from or be compared with.
 UNUSABLE = frozenset({"gap_in_time", "non_finite", "duplicate"})
 
+#: A step of more than this share of all positions, against the usual direction, begins a new round
+#: of a circular road; the smallest number of such steps.
+ROUND, SOME = 0.9, 3
+
 #: Steps whose median displacement extrapolates a path; more than one, as steps are noisy.
 RECENT = 3
 
@@ -494,6 +498,7 @@ def row_findings(
     yield from _sampling(rows)
     yield from _clock(medians, scale, stated)
     yield from _accelerations(rows)
+    yield from _circular_road(rows, scale.domain)
     yield from _directions(rows, scale.domain)
     yield from _entering_and_leaving(rows, scale.domain, whole)
 
@@ -601,6 +606,27 @@ def _accelerations(rows: Trajectories) -> Iterator[Finding]:
             f"{FRICTION:g} m/s², what friction can give; 99 % are below "
             f"{np.percentile(a, 99):.3g} m/s²: the time scale or the positions are off",
         )
+
+
+def _circular_road(rows: Trajectories, domain: Domain) -> Iterator[Finding]:
+    """Positions that begin again where a vehicle has gone round a circular road (m)."""
+    if domain != "traffic":
+        return
+    moves = displacements(rows, 1)
+    step = (rows.x[moves.last] - rows.x[moves.first])[:, 0]
+    again = np.abs(step) > ROUND * np.ptp(rows.x[:, 0])
+    usual = np.median(step[~again]) if not again.all() else 0.0
+    # a faulty position makes two steps, there and back
+    if again.sum() < SOME or (step[again] * usual >= 0).any():
+        return
+    length = float(np.median(np.abs(step[again]) + abs(usual)))
+    yield Finding(
+        "circular_road",
+        "error",
+        f"positions begin again {again.sum()} times, after about {length:.4g} m, as on a circular "
+        "road; let them go on, for each vehicle of each recording by numpy.unwrap(x, "
+        f"period={length:.4g}) with the length of the road",
+    )
 
 
 def _directions(rows: Trajectories, domain: Domain) -> Iterator[Finding]:

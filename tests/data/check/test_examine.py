@@ -93,6 +93,22 @@ def test_reversed_direction_is_recognised(tmp_path: Path) -> None:
     assert findings(file) == {}
 
 
+def test_circular_road_is_recognised(tmp_path: Path) -> None:
+    table = cars()
+    table["x"] %= 200.0
+    message = findings(examine(saved(table, tmp_path)))["circular_road"]
+    assert "numpy.unwrap" in message
+    found = re.search(r"after about ([\d.]+) m", message)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(200, rel=0.02)
+    unwrapped = table.assign(x=table.groupby("veh")["x"].transform(np.unwrap, period=200.0))
+    assert "circular_road" not in findings(examine(saved(unwrapped, tmp_path)))
+    # a faulty position is no new round
+    table = cars()
+    table.loc[table.index[[50, 500, 900]], "x"] = -5000.0
+    assert "circular_road" not in findings(examine(saved(table, tmp_path)))
+
+
 @pytest.mark.parametrize(
     ("rows", "column", "change", "level", "kind", "message"),
     [
