@@ -343,14 +343,14 @@ def _intervals(
     """Intervals, correlations and the number of clusters, in the form of
     :func:`nnode.calibrate.intervals.intervals`."""
     from nnode.calibrate.intervals import VAGUE
-    from nnode.population.intervals import bounds_reached, influence
+    from nnode.population.intervals import influence
 
     model, theta, paths = population.model, population.estimate.theta, population.model.paths
     agent_cluster = np.zeros(len(paths.names), dtype=int)
     agent_cluster[paths.agent] = cluster[paths.sequence]
     number = len(np.unique(agent_cluster))
     cluster_influence, free = influence(population, agent_cluster)
-    bound = bounds_reached(population)
+    bound = population.model.bounds_reached(population.estimate.theta)
     half = np.full(len(theta), np.inf)
     error, degrees = half.copy(), half.copy()
     half[free], error[free] = cluster_influence.half_widths(), cluster_influence.standard_errors()

@@ -42,8 +42,10 @@ MODES = 0.02
 #: ends may need more: with 20 steps, the log likelihood of one ended at 25,152 in place of 26,914.
 STEPS = 40
 #: A search ends when the log likelihood has not exceeded its maximum for so many steps, for example
-#: because the steps cycle around a kink of the model. It counts as converged if all of these steps
-#: remained within the confidence region of this level around the maximum.
+#: because the steps cycle around a kink of the model, unless the last of them is the likeliest. The
+#: maximum may be that of the first step, whose linearisation without deviations of agents can be
+#: far too optimistic. The search counts as converged if all of these steps remained within the
+#: confidence region of this level around the maximum.
 PATIENCE, REGION = 10, 0.95
 #: The smallest relaxation factor of steps that reverse the previous one.
 LEAST = 0.2
@@ -208,7 +210,8 @@ def estimate(
         n_linearisations += tried
         point = point if accepted is None else accepted
         converged = largest_change < tolerance
-        stalled = max(logliks[-PATIENCE:]) < max(logliks)
+        recent = max(logliks[-PATIENCE:])
+        stalled = logliks[-1] < recent < max(logliks)
         if converged or accepted is None or stalled:
             break
     if not converged:

@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from nnode.calibrate.cost import LEAST_GAP
+from nnode.calibrate.intervals import at_bounds
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.paths import smooth, whittaker
 from nnode.data.sequence import Batch, Sequence, collate
@@ -34,7 +35,7 @@ from nnode.model.system import System
 from nnode.model.term import Term
 from nnode.model.terms import LaneDynamics, parameter_values
 from nnode.population.estimate import Estimate, fit_deviations, fit_variances
-from nnode.population.likelihood import Linearised, PushNoise
+from nnode.population.likelihood import Linearised, PushNoise, flat_solve
 from nnode.simulation.kernels.followers import AHEAD
 from nnode.simulation.kernels.followers import simulate as simulate_compiled
 from nnode.simulation.linear import subdivided, trapezoidal
@@ -69,6 +70,8 @@ DIFFERENCE, START_DIFFERENCE = 1e-6, 1e-4
 #: Antithetic pairs of simulations that estimate the bias. The Monte Carlo error of four pairs is
 #: about 15 % of an estimate's standard error.
 PAIRS = 4
+#: An estimate is at a bound if its logarithm, or the parameter itself, is closer to it than this.
+NEAR = 1e-3
 #: At most so many times as many pairs are simulated as are used, see :func:`simulated_pairs`.
 ATTEMPTS = 3
 #: The push on the highest rate ``(R, F)``, as a function of the index of the time in the paths
@@ -629,6 +632,11 @@ class Followers:
         by_states, by_position, by_speed = np.split(matrix, [disturbed, disturbed + 1], -1)
         return by_states, by_position, by_speed
 
+    def bounds_reached(self, theta: np.ndarray) -> np.ndarray:
+        """``(P,)`` the bounds at which parameters ``(P,)`` are, see
+        :func:`nnode.calibrate.intervals.at_bounds`."""
+        return at_bounds(theta, self.low, self.high, NEAR)
+
     def simulated_paths(self, estimate: Estimate, draw: Draw) -> Paths:
         """Simulated measurements of the estimated model (parametric bootstrap).
 
@@ -706,22 +714,36 @@ def score_biases(simulated: Simulated) -> np.ndarray:
     Simulated data are scored at the parameters that they were simulated with. The mean of a correct
     score is zero; the linearisation at the modes and the errors of smoothed leaders shift it. A
     bias is the Gauss-Newton step of the mean score of an antithetic pair of draws, in which the
-    linear part of the score cancels.
+    linear part of the score cancels. Parameters at bounds are fixed.
     """
-    return np.array(
-        [np.mean([modes.marginal.change for _, modes in pair], 0) for pair in simulated]
-    )
+    return np.array([np.mean([_step(*each) for each in pair], 0) for pair in simulated])
+
+
+def _step(drawn: Followers, modes: Estimate) -> np.ndarray:
+    """``(P,)`` the Gauss-Newton step of the parameters that are not at bounds."""
+    products, free = modes.marginal.agents.sum(0)[1:], drawn.bounds_reached(modes.theta) == ""
+    step = np.zeros(len(free))
+    step[free] = flat_solve(products[free][:, 1:][:, free], products[free, 0])
+    return step
 
 
 def variance_biases(simulated: Simulated) -> np.ndarray:
     """``(pairs, V)`` estimated standard deviations and times relative to the simulated ones, as in
     :attr:`nnode.population.estimate.Variances.row`. They are estimated from the data as linearised
-    at the modes."""
-    return np.array([np.mean([_ratios(modes) for _, modes in pair], 0) for pair in simulated])
+    at the modes, with parameters within their bounds, and without changes of those at bounds, along
+    which the linearised likelihood may rise without limit."""
+    return np.array([np.mean([_ratios(*each) for each in pair], 0) for pair in simulated])
 
 
-def _ratios(modes: Estimate) -> np.ndarray:
-    estimated = fit_variances(modes.data, PushNoise(), modes.variances)
+def _ratios(drawn: Followers, modes: Estimate) -> np.ndarray:
+    fixed = drawn.bounds_reached(modes.theta) != ""
+    estimated = fit_variances(
+        modes.data,
+        PushNoise(),
+        modes.variances,
+        low=np.where(fixed, 0.0, drawn.low - modes.theta),
+        high=np.where(fixed, 0.0, drawn.high - modes.theta),
+    )
     ratios: np.ndarray = estimated.row / modes.variances.row
     return ratios
 

@@ -19,6 +19,7 @@ from nnode.calibrate.intervals import LEVEL, ClusterInfluence, at_bounds
 from nnode.model.term import short_names
 from nnode.population.drivers import Population
 from nnode.population.estimate import Variances
+from nnode.population.followers import NEAR
 from nnode.population.likelihood import (
     UNITS,
     Linearised,
@@ -28,19 +29,10 @@ from nnode.population.likelihood import (
     marginal,
 )
 
-#: An estimate is at a bound if its logarithm, or the parameter itself, is closer to it than this.
-NEAR = 1e-3
 #: Difference of logarithms of standard deviations for second derivatives.
 DIFFERENCE = 1e-2
 #: Difference of log-likelihoods at the ends of an interval: half of the quantile of chi squared.
 DROP = float(gammaincinv(0.5, LEVEL))
-
-
-def bounds_reached(population: Population) -> np.ndarray:
-    """``(P,)`` the bounds at which parameters are, see
-    :func:`nnode.calibrate.intervals.at_bounds`."""
-    model = population.model
-    return at_bounds(population.estimate.theta, model.low, model.high, NEAR)
 
 
 def influence(population: Population, cluster: np.ndarray) -> tuple[ClusterInfluence, np.ndarray]:
@@ -49,7 +41,7 @@ def influence(population: Population, cluster: np.ndarray) -> tuple[ClusterInflu
     Args:
         cluster: ``(D,)`` the driver's cluster.
     """
-    free = bounds_reached(population) == ""
+    free = population.model.bounds_reached(population.estimate.theta) == ""
     member = (np.unique(cluster)[:, None] == cluster).astype(float)
     products = np.tensordot(member, population.marginal.agents, 1)[:, 1:]
     grams = products[:, :, 1:]
