@@ -42,10 +42,9 @@ MODES = 0.02
 #: ends may need more: with 20 steps, the log likelihood of one ended at 25,152 in place of 26,914.
 STEPS = 40
 #: A search ends when the log likelihood has not exceeded its maximum for so many steps, for example
-#: because the steps cycle around a kink of the model, unless the last of them is the likeliest. The
-#: maximum may be that of the first step, whose linearisation without deviations of agents can be
-#: far too optimistic. The search counts as converged if all of these steps remained within the
-#: confidence region of this level around the maximum.
+#: because the steps cycle around a kink of the model. It counts as converged if all of these steps
+#: remained within the confidence region of this level around the maximum. A first step without
+#: deviations of agents does not count: its linearisation can be far too optimistic.
 PATIENCE, REGION = 10, 0.95
 #: The smallest relaxation factor of steps that reverse the previous one.
 LEAST = 0.2
@@ -171,7 +170,7 @@ def estimate(
     best, logliks = (point, variances), list[float]()
     # half of the quantile of chi squared
     region = float(gammaincinv(max(len(theta), 1) / 2, REGION))
-    for _ in range(steps):
+    for number in range(steps):
         before = variances
         to_low, to_high = low - point.theta, high - point.theta
         try:
@@ -195,11 +194,12 @@ def estimate(
                 restricted=restricted,
             )
         except SimulationError:
-            if not logliks:
+            if number == 0:
                 raise
             break  # the last step led to a model without a likelihood
-        logliks.append(current.unchanged)
-        if logliks[-1] == max(logliks):
+        if point.agents.any() or not point.agents.size:
+            logliks.append(current.unchanged)
+        if not logliks or logliks[-1] == max(logliks):
             best = point, variances
         change = current.change
         reversed_step = previous_change @ current.information @ change < 0
@@ -210,8 +210,7 @@ def estimate(
         n_linearisations += tried
         point = point if accepted is None else accepted
         converged = largest_change < tolerance
-        recent = max(logliks[-PATIENCE:])
-        stalled = logliks[-1] < recent < max(logliks)
+        stalled = bool(logliks) and max(logliks[-PATIENCE:]) < max(logliks)
         if converged or accepted is None or stalled:
             break
     if not converged:

@@ -312,3 +312,40 @@ def test_thinned_positions_give_the_same_starts_and_parameters() -> None:
     population = fit_drivers(law(), thinned, "none")
     deviation = 1 / np.sqrt(np.diag(population.marginal.information))
     assert (np.abs(population.estimate.theta - np.log([V0, LENGTH])) < 4 * deviation).all()
+
+
+def circular_roads(spread: float) -> list[Sequence]:
+    """Dense traffic of ``idm`` on circular roads, where nobody drives near v0. Without a vehicle
+    length, s0 contains that of 4.5 m."""
+    rng, cars, step, measured = np.random.default_rng(3), 12, 0.05, []
+    length = 13.6 * cars
+    for run in range(4):
+        headway = 1.2 * np.exp(spread * rng.normal(size=cars))
+        x = length / cars * np.arange(cars) + rng.normal(0, 0.5, cars)
+        v, push, path = np.full(cars, 4.0), np.zeros(cars), []
+        for k in range(1000):
+            if k % 4 == 0:
+                path.append(x + 0.1 * rng.normal(size=cars))
+            gap = np.maximum((np.roll(x, -1) - x) % length - 4.5, 0.5)
+            braking = v * (v - np.roll(v, -1)) / (2 * np.sqrt(1.2 * 1.5))
+            wish = 2 + np.maximum(0, v * headway + braking)
+            push = push * np.exp(-step / 4) + 0.1 * np.sqrt(step / 2) * rng.normal(size=cars)
+            v = np.maximum(v + step * (1.2 * (1 - (v / 12) ** 4 - (wish / gap) ** 2) + push), 0.0)
+            x = x + step * v
+        names = {"name": f"run {run}", "recording": f"run {run}"}
+        positions = np.array(path)[..., None]
+        measured.append(Sequence(**names, time=0.2 * np.arange(len(path)), x=positions))
+    return measured
+
+
+def test_parameter_at_a_bound_is_fixed_in_the_correction_of_biases() -> None:
+    start = make_law("idm", v0=14.0, T=1.3, s0=6.0, a=1.3, b=1.5)
+    paths = paths_of(circular_roads(0.15), 0.2)
+    population = fit_drivers(Traffic([start], leader="measured").double(), paths, ["T"])
+    assert population.estimate.converged
+    reached = population.model.bounds_reached(population.estimate.theta)
+    assert dict(zip(population.model.names, reached, strict=True))["idm.v0"] == "high"
+    assert population.bias[population.model.names.index("idm.v0")] == 0
+    assert np.abs(population.bias).max() < 0.15
+    assert population.estimate.variances.spread == pytest.approx([0.15], rel=0.35)
+    assert population.estimate.agents.std() == pytest.approx(0.15, rel=0.35)
