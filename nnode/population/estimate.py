@@ -170,7 +170,7 @@ def estimate(
     best, logliks = (point, variances), list[float]()
     # half of the quantile of chi squared
     region = float(gammaincinv(max(len(theta), 1) / 2, REGION))
-    for number in range(steps):
+    for _ in range(steps):
         before = variances
         to_low, to_high = low - point.theta, high - point.theta
         try:
@@ -194,12 +194,12 @@ def estimate(
                 restricted=restricted,
             )
         except SimulationError:
-            if number == 0:
+            if not logliks:
                 raise
             break  # the last step led to a model without a likelihood
-        if point.agents.any() or not point.agents.size:
-            logliks.append(current.unchanged)
-        if not logliks or logliks[-1] == max(logliks):
+        counts = point.agents.any() or not point.agents.size
+        logliks.append(current.unchanged if counts else -np.inf)
+        if logliks[-1] == max(logliks):
             best = point, variances
         change = current.change
         reversed_step = previous_change @ current.information @ change < 0
@@ -210,7 +210,7 @@ def estimate(
         n_linearisations += tried
         point = point if accepted is None else accepted
         converged = largest_change < tolerance
-        stalled = bool(logliks) and max(logliks[-PATIENCE:]) < max(logliks)
+        stalled = max(logliks[-PATIENCE:]) < max(logliks)
         if converged or accepted is None or stalled:
             break
     if not converged:

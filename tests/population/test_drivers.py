@@ -332,9 +332,8 @@ def circular_roads(spread: float) -> list[Sequence]:
             push = push * np.exp(-step / 4) + 0.1 * np.sqrt(step / 2) * rng.normal(size=cars)
             v = np.maximum(v + step * (1.2 * (1 - (v / 12) ** 4 - (wish / gap) ** 2) + push), 0.0)
             x = x + step * v
-        names = {"name": f"run {run}", "recording": f"run {run}"}
-        positions = np.array(path)[..., None]
-        measured.append(Sequence(**names, time=0.2 * np.arange(len(path)), x=positions))
+        time, positions = 0.2 * np.arange(len(path)), np.array(path)[..., None]
+        measured.append(Sequence(name=f"{run}", recording=f"{run}", time=time, x=positions))
     return measured
 
 
