@@ -98,7 +98,7 @@ _SIMULATED = {
     "drivers": "of each follower at each sample after the first. They are simulated behind the "
     "measured paths of the vehicles ahead, smoothed, each with the parameters and the start that "
     "are most likely for that driver",
-    "crowd": "of each person at each compared sample. Everyone is simulated for about 2 s at a "
+    "crowd": "of each person at each compared sample. Everyone is simulated for about 1 s at a "
     "time among the measured paths of the others, from the smoothed place and velocity and with "
     "the desired velocity and relaxation time that are most likely for that person",
 }

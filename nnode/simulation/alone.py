@@ -46,6 +46,7 @@ class Surroundings:
             ones hold for all times after.
         window, person: ``(P,)`` window and index of the P real people.
         step: time step of the simulation, s.
+        factors: name of a parameter of the law to ``(P,)`` factors of the people on its value.
     """
 
     scene: Scene
@@ -54,6 +55,7 @@ class Surroundings:
     window: Tensor
     person: Tensor
     step: float
+    factors: dict[str, np.ndarray] = field(default_factory=dict)
     _scenes: dict[int, Scene] = field(default_factory=dict)
 
     def repeated(self, number: int) -> Scene:
@@ -139,7 +141,13 @@ class PersonAlone:
                 torch.as_tensor(value, dtype=torch.float64).detach().expand(self.number)
                 for value in values.values()
             ]
-            self._law = torch.stack(columns, 1).numpy() if columns else np.zeros((self.number, 1))
+            table = torch.stack(columns, 1).numpy() if columns else np.zeros((self.number, 1))
+            # a row for every person of every run, one run after the other
+            self._law = table.repeat(len(around.window), 0)
+            for column, symbol in enumerate(values):
+                name = law.owned[symbol][0] if symbol in law.owned else ""
+                if name in around.factors:
+                    self._law[:, column] *= np.tile(around.factors[name], self.number)
             effects = list(takewhile(_is_formula, terms[len(laws) :]))
         self._runs = [
             {name: value[r] for name, value in parameters.items()} for r in range(self.number)
@@ -226,13 +234,14 @@ class PersonAlone:
         rate = torch.zeros_like(states[..., :2], memory_format=torch.contiguous_format)
         if self.compiled:
             place, number = self.around.place, len(states)
-            row = np.arange(number) if self.number > 1 else np.zeros(number, dtype=int)
+            person = np.tile(np.arange(len(place)), number)
+            run = np.arange(number) if self.number > 1 else np.zeros(number, dtype=int)
             person_states = states.flatten(1, 2).index_select(1, place)
             accelerations = self._kernel.accelerations(
                 person_states.view(-1, 4).numpy(),
-                np.tile(np.arange(len(place)), number),
+                person,
                 np.repeat(self.around.index(moment), len(place)),
-                np.repeat(row, len(place)),
+                np.repeat(run * len(place), len(place)) + person,
                 *self.around.tables,
                 self._law,
             )

@@ -27,11 +27,12 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.data.sequence import Sequence, collate
+from nnode.diagnosis.crowds.continuation import Change
 from nnode.diagnosis.crowds.gait import estimated_gait
 from nnode.diagnosis.crowds.people import CrowdPopulation, Gait, People, differences_of
 from nnode.diagnosis.crowds.simulated import simulated_pair
 from nnode.diagnosis.crowds.variables import crowd_variables
-from nnode.diagnosis.crowds.windows import DesiredVelocity, Windows
+from nnode.diagnosis.crowds.windows import Individuals, Windows
 from nnode.diagnosis.outcome import Simulation
 from nnode.diagnosis.residuals.engine import Squares, of_residuals
 from nnode.diagnosis.residuals.fit import ROUGH as ROUGH_COST
@@ -46,7 +47,7 @@ from nnode.population.drivers import ROUGH
 from nnode.simulation.alone import PersonAlone, RunAlone
 
 #: Length of windows, s.
-SECONDS = 2.0
+SECONDS = 1.0
 #: Antithetic pairs of simulated crowds that estimate the bias of parameters.
 PAIRS = 3
 #: Largest number of alternations between a calibration and an estimate of people.
@@ -110,7 +111,7 @@ class CrowdEngine:
         population = self._fitted(system, rows[0])
         differences = self._people.differences(self._states(system, rows))
         joined = self._people.continued(differences, population.continuation)
-        return self._whitened(joined + population.by_desired(population.data.fixed)[..., None])
+        return self._whitened(joined + population.by_own(population.data.fixed)[..., None])
 
     def squares(self, system: System, row: Tensor) -> Squares:
         """Squared errors of positions, with the deviations of people that are most likely under
@@ -121,15 +122,17 @@ class CrowdEngine:
         return Squares(squares.ravel(), self.windows.sequence[window].repeat(n_samples))
 
     def relevant(self, before: System, after: System, square: float) -> bool:
-        """Whether simulated positions with and without an effect differ by the error of measured
-        ones (root mean square), with the same desired velocities. Pushes produce most of the
+        """Whether records that are simulated with and without an effect differ by the error of
+        measured positions (root mean square), with the same people. Pushes produce most of the
         errors, so the decrease of the errors shows no effect."""
         without, with_effect = (
             self._people.differences(self._states(system, ParameterVector(system).row[None]))
             for system in (before, after)
         )
-        moved = with_effect.position - without.position
-        return not math.sqrt(np.mean(moved**2)) < self._people.error
+        moved = Change(with_effect.position - without.position, with_effect.end - without.end)
+        assert self.population is not None
+        record = self._people.continued(moved, self.population.continuation)
+        return not math.sqrt(np.mean(record**2)) < self._people.error
 
     def simulated(self, system: System, row: Tensor) -> list[Simulation | None]:
         """The windows in sequence, with the deviations of :meth:`squares`."""
@@ -169,7 +172,7 @@ class CrowdEngine:
         return 2 * self.windows.variance
 
     def fit_whitening(self, system: System, row: Tensor) -> None:
-        """Estimate desired velocities, variances and weights, with the model's parameters.
+        """Estimate deviations of people, variances and weights, with the model's parameters.
 
         Residuals before and after the call cannot be compared.
         """
@@ -264,7 +267,7 @@ class CrowdEngine:
         """A copy whose parameters are fitted to the accelerations of the smoothed paths by
         regression, which avoids distant local minima of calibrations."""
         fitted, batch = copy.deepcopy(system), self.windows.batch
-        vector, around = ParameterVector(fitted), self._people.around(system, self._desired)
+        vector, around = ParameterVector(fitted), self._people.around(system, self._simulated)
         states = torch.cat([batch.x, batch.v], -1)[::2]
         moment = 2 * np.arange(len(states))
         measured = torch.gradient(batch.v[::2], spacing=self.windows.step, dim=0)[0]
@@ -312,13 +315,12 @@ class CrowdEngine:
         model, used = with_parameters(system, row), self.windows.used
         variances = self._fitted(system, row).variances
         preferred = {i: self.windows.preferred[i].copy() for i in used}
-        turn = {i: np.zeros(self.sequences[i].n_agents) for i in used}
-        for (b, i), speed, left in zip(self._people.pairs, *self._desired, strict=True):
+        people = self._simulated
+        for (b, i), speed in zip(self._people.pairs, people.speed, strict=True):
             preferred[b][i] *= speed / max(float(np.hypot(*preferred[b][i])), 1e-9)
-            turn[b][i] = left
         measured = [replace(self.sequences[i], preferred=preferred[i]) for i in used]
         engines = []
-        for crowd in simulated_pair(model, measured, [turn[i] for i in used], seed):
+        for crowd in simulated_pair(model, measured, people, seed):
             if not all(np.isfinite(s.x).all() for s in crowd):
                 raise SimulationError("the simulated crowd diverges")
             sequences = list(self.sequences)
@@ -407,9 +409,9 @@ class CrowdEngine:
     # -- parts -----------------------------------------------------------------------------
 
     @property
-    def _desired(self) -> DesiredVelocity:
-        """Of the D simulated people."""
-        return self._people.desired if self.population is None else self.population.desired
+    def _simulated(self) -> Individuals:
+        """The D simulated people."""
+        return self._people.measured if self.population is None else self.population.people
 
     def _fitted(self, system: System, row: Tensor) -> CrowdPopulation:
         """The last estimate; at first that with usual variances. Those of a model that is not yet
@@ -421,20 +423,20 @@ class CrowdEngine:
 
     def _states(self, system: System, rows: Tensor) -> Tensor:
         """``(F, R, W, N, 4)`` simulated states."""
-        return self._people.states(system, rows, self._desired)
+        return self._people.states(system, rows, self._simulated)
 
     def _errors(self, system: System, row: Tensor) -> np.ndarray:
         """``(P, L, 2)`` m: measured minus simulated positions, with the most likely deviations."""
         people, population = self._people, self._fitted(system, row)
         difference = people.differences(self._states(system, row[None]))
         joined = people.continued(difference, population.continuation)[..., 0]
-        residual = joined + population.by_desired(population.data.fixed)
+        residual = joined + population.by_own(population.data.fixed)
         data = replace(population.data, residual=residual)
         posterior = people.posterior(data, population.random, population.variances)
         # of windows by themselves; where paths are chaotic, nothing is known of the deviations
         by_deviation = np.where(data.observed[..., None], population.by_deviation, 0.0)
         deviations = (posterior.change + posterior.deviations)[:, None]
-        explained = (by_deviation * deviations).sum(-1) - population.by_desired(by_deviation)
+        explained = (by_deviation * deviations).sum(-1) - population.by_own(by_deviation)
         errors = people.parted(people.joined(difference.position)[..., 0] - explained)
         return errors.reshape(len(errors), -1, 2)
 
@@ -449,7 +451,7 @@ class CrowdEngine:
         self._fitted(system, row)
         if self._run is None or self._run[0] is not system or not torch.equal(self._run[1], row):
             states = self._states(system, row[None])[:, 0]
-            around = self._people.around(system, self._desired)
+            around = self._people.around(system, self._simulated)
             self._run = system, row.clone(), RunAlone(around, with_parameters(system, row), states)
         return self._run[-1]
 

@@ -2,9 +2,9 @@
 
 In each of a person's windows, the person is simulated alone among the measured and smoothed paths
 of the others. The desired speed and the relaxation time are those of the typical person times
-log-normal factors. If only the direction of the stream is given, that of the person is turned by a
-normal angle. With X the derivatives by the logarithm of the typical desired speed, the measured
-positions y are
+log-normal factors of the person. If only the direction of the stream is given, that of the person
+is turned by a normal angle. With X the derivatives by the logarithm of the typical desired speed,
+the measured positions y are
 
     y = f(theta, b) + X d + Z (b* - b) + e,    b* ~ N(0, Omega),
 
@@ -29,7 +29,7 @@ from torch import Tensor
 
 from nnode.calibrate.parameters import ParameterVector
 from nnode.diagnosis.crowds.continuation import Change, Continuation, not_grown
-from nnode.diagnosis.crowds.windows import DesiredVelocity, Windows
+from nnode.diagnosis.crowds.windows import Individuals, Windows
 from nnode.diagnosis.eligibility import check_model
 from nnode.model.effects.base import Effect
 from nnode.model.expression import symbols
@@ -74,10 +74,10 @@ ORDINARY = 0.5
 #: Windows are left out if a change of a start grows by more than this factor: people who touch
 #: make paths chaotic.
 GROWTH = 4.0
-#: Smallest and largest number of linearisations in which desired velocities, variances and weights
-#: are estimated, and the change (root mean square) of the logarithms of desired speeds and of
-#: directions (rad) at which they end.
-ROUNDS, MOST_ROUNDS, CLOSE = 3, 8, 0.01
+#: Smallest and largest number of linearisations in which people, variances and weights are
+#: estimated, and the change (root mean square) of people's deviations at which they end, as a share
+#: of their standard deviations.
+ROUNDS, MOST_ROUNDS, CLOSE = 3, 8, 0.05
 #: Number of pairs of people in the largest intermediate result.
 CHUNK = 100_000
 #: Difference of the logarithm of desired speeds, and of directions (rad), for derivatives.
@@ -114,7 +114,8 @@ class CrowdPopulation:
         system: the model.
         random: names of the Q quantities in which people differ.
         variances: the noise is that of :class:`~nnode.population.likelihood.RestartNoise`.
-        desired: of the D simulated people.
+        own: ``(D, Q)`` deviations b with which people are simulated.
+        people: the D simulated people.
         typical: logarithm of the typical desired speed.
         data: the measured paths of D people, linearised.
         continuation: of their windows.
@@ -127,7 +128,8 @@ class CrowdPopulation:
     system: System
     random: list[str]
     variances: Variances
-    desired: DesiredVelocity
+    own: np.ndarray
+    people: Individuals
     typical: float
     data: Linearised
     continuation: Continuation
@@ -158,7 +160,7 @@ class CrowdPopulation:
         """Half the number of parameters times the logarithm of the number of people (BIC)."""
         free = int(np.count_nonzero(self.variances.low < self.variances.high))
         number = len(ParameterVector(self.system).row) + free
-        return number * math.log(max(len(self.desired.speed), 2)) / 2
+        return number * math.log(max(len(self.own), 2)) / 2
 
     @property
     def criterion(self) -> float:
@@ -177,10 +179,10 @@ class CrowdPopulation:
         terms: np.ndarray = self.posterior.each - lost(self.data)
         return terms + self.left_out
 
-    def by_desired(self, by_deviation: np.ndarray) -> np.ndarray:
-        """``(D, K)`` m: the change of positions by the deviations with which people were simulated.
-        They have their own desired velocities, and their other parameters are typical."""
-        return displaced(by_deviation, own_deviations(self.random, self.desired, self.typical))
+    def by_own(self, by_deviation: np.ndarray) -> np.ndarray:
+        """``(D, K)`` m: the change of positions by the deviations with which people were simulated,
+        with the columns Z ``(D, K, Q)``."""
+        return displaced(by_deviation, self.own)
 
 
 def lost(data: Linearised) -> np.ndarray:
@@ -190,16 +192,6 @@ def lost(data: Linearised) -> np.ndarray:
     terms = -OUTLYING / 2 * np.log(np.maximum(data.weight, 1e-12))
     total: np.ndarray = np.where(data.observed, terms, 0.0).sum(1)
     return total
-
-
-def own_deviations(random: list[str], desired: DesiredVelocity, typical: float) -> np.ndarray:
-    """``(D, Q)`` deviations with which people are simulated."""
-    own = np.zeros((len(desired.speed), len(random)))
-    if DESIRED_SPEED in random:
-        own[:, random.index(DESIRED_SPEED)] = np.log(desired.speed) - typical
-    if DESIRED_DIRECTION in random:
-        own[:, random.index(DESIRED_DIRECTION)] = desired.turn
-    return own
 
 
 def displaced(by_deviation: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -214,7 +206,6 @@ class LinearisedWindows(NamedTuple):
 
     Attributes:
         difference: of one column, measured minus simulated.
-        own: ``(D, Q)`` deviations with which people are simulated.
         by_deviation: of the Q columns Z. by_start: of four, the state at the start.
         used: ``(P,)`` False where windows are left out, see :data:`GROWTH`.
         step, forced: ``(P, L, 4, 4)`` and ``(P, L, 4, 2)``, see
@@ -222,7 +213,6 @@ class LinearisedWindows(NamedTuple):
     """
 
     difference: Change
-    own: np.ndarray
     by_deviation: Change
     by_start: Change
     used: np.ndarray
@@ -272,7 +262,7 @@ class People:
     Attributes:
         unit: ``(P,)`` number of the person of each of the P windows of single people.
         pairs: of each person the sequence and the place in it.
-        desired: of the people, at first: preferred speeds as measured, to the destinations.
+        measured: the people at first, with preferred speeds as measured, to the destinations.
         heading: ``(D, T, 2)`` unit vectors from the start to the end of each window, at all T times
             of a person.
         gait: at first without sway.
@@ -295,11 +285,11 @@ class People:
         preferred = windows.batch.preferred
         assert preferred is not None
         speed = np.hypot(*preferred[window, place].numpy()[first].T)
-        self.desired = DesiredVelocity(np.maximum(speed, SLOWEST), np.zeros(len(speed)))
+        self.measured = Individuals(np.maximum(speed, SLOWEST), np.zeros(len(speed)), {})
         x = windows.batch.x[:, window, place].numpy()
         way = (x[-1] - x[0]) / np.maximum(np.hypot(*(x[-1] - x[0]).T), 1e-9)[:, None]
         self.heading = self.joined(np.repeat(way[:, None], windows.length, 1))
-        self._last: tuple[DesiredVelocity, Surroundings] | None = None
+        self._last: tuple[Individuals, Surroundings] | None = None
         self.gait = Gait(np.zeros(0), math.inf, np.zeros(len(self.unit)), -math.inf)
 
     @property
@@ -344,54 +334,55 @@ class People:
         start: CrowdPopulation | None = None,
         variances: Variances | None = None,
     ) -> CrowdPopulation:
-        """Desired velocities, variances and weights of windows, with the parameters of a model.
+        """Deviations of people, variances and weights of windows, with the parameters of a model.
 
         Args:
             start: where the search starts, if the same quantities differ.
             variances: of people and of noise, if they are not estimated.
         """
         random, weight = differing(system), np.ones(len(self.unit))
-        desired, typical = self.desired, float(np.log(self.desired.speed).mean())
+        speeds = np.log(self.measured.speed)
+        own, typical = np.zeros((len(speeds), len(random))), float(speeds.mean())
+        if DESIRED_SPEED in random:
+            own[:, 0] = speeds - typical
         present = self.initial_variances(random) if variances is None else variances
         anew = start is None or start.random != random
         if start is not None and not anew:
-            desired, typical = start.desired, start.typical
+            own, typical = start.own, start.typical
+            assert start.data.weight is not None
+            weight = self.parted(start.data.weight)[:, 0]
             present = start.variances if variances is None else variances
-        share, last_change = 1.0, math.inf
+        share, last = np.ones((len(own), 1)), np.zeros_like(own)
         for round_ in range(MOST_ROUNDS):
-            windows = self._linearised(system, random, desired, typical)
+            people = self.individuals(random, own, typical)
+            windows = self._linearised(system, random, people)
             if round_ > 0:
                 # weights of the linearisation before would count windows fully that it left out
-                data, _ = self._continued(windows, weight)
+                data, _ = self._continued(windows, own, weight)
                 weight = self._weights(data, self.posterior(data, random, present), present)
-            data, continuation = self._continued(windows, weight)
+            data, continuation = self._continued(windows, own, weight)
             if variances is None:
                 tolerance = ROUGH if round_ < ROUNDS - 1 else TOLERANCE
                 several = anew and round_ == 0
                 present = self._fitted(data, random, present, several, tolerance)
             posterior = self.posterior(data, random, present)
-            shift, steps = 0.0, np.zeros((2, len(self.pairs)))
-            if DESIRED_SPEED in random:
-                shift, deviations = float(posterior.change[0]), posterior.deviations
-                speed = np.maximum(np.exp(typical + shift + deviations[:, 0]), SLOWEST)
-                steps[0] = np.log(speed / desired.speed)
-            if DESIRED_DIRECTION in random:
-                turn = posterior.deviations[:, random.index(DESIRED_DIRECTION)]
-                steps[1] = turn - desired.turn
-            change = float(np.sqrt((steps**2).mean(1)).max())
+            step = posterior.deviations - own
+            square = ((step**2).mean(0) + posterior.change**2) / present.spread**2
+            change = math.sqrt(square.max(initial=0.0))
             if round_ >= ROUNDS - 1 and (change < CLOSE or round_ == MOST_ROUNDS - 1):
                 break
-            share = share / 2 if change > last_change else share
-            last_change = change
-            typical += share * shift
-            faster, turned = share * steps
-            desired = DesiredVelocity(desired.speed * np.exp(faster), desired.turn + turned)
+            reversed_step = (step * last / present.spread**2).sum(1, keepdims=True) < 0
+            share, last = np.where(reversed_step, share / 2, share), step
+            if DESIRED_SPEED in random:
+                typical += float(posterior.change[0])
+            own = np.clip(own + share * step, *_admissible(system, random, typical))
         left_out = np.where(windows.used, 0.0, self.gait.window_loglik)
         return CrowdPopulation(
             system=system,
             random=random,
             variances=present,
-            desired=desired,
+            own=own,
+            people=people,
             typical=typical,
             data=data,
             continuation=continuation,
@@ -426,6 +417,18 @@ class People:
             )
             fits.append((self.posterior(data, random, fit).loglik, fit))
         return max(fits, key=lambda each: each[0])[1]
+
+    def individuals(self, random: list[str], own: np.ndarray, typical: float) -> Individuals:
+        """People with deviations ``(D, Q)``; typical: logarithm of the typical desired speed."""
+        people = self.measured
+        for name, deviations in zip(random, own.T, strict=True):
+            if name == DESIRED_SPEED:
+                people = people._replace(speed=np.exp(typical + deviations))
+            elif name == DESIRED_DIRECTION:
+                people = people._replace(turn=deviations)
+            else:
+                people = people._replace(factors={**people.factors, name: np.exp(deviations)})
+        return people
 
     def usual(self, system: System, start: CrowdPopulation | None = None) -> CrowdPopulation:
         """The estimate with the variances where searches start."""
@@ -464,22 +467,20 @@ class People:
         self,
         system: System,
         random: list[str],
-        desired: DesiredVelocity,
-        typical: float,
+        people: Individuals,
     ) -> LinearisedWindows:
-        """The windows, linearised at desired velocities."""
+        """The windows, linearised at the deviations of people."""
         windows, row = self.windows, ParameterVector(system).row[None]
-        states = self.states(system, row, desired)
-        run = RunAlone(self.around(system, desired), system, states[:, 0])
+        states = self.states(system, row, people)
+        run = RunAlone(self.around(system, people), system, states[:, 0])
         stride, dt, times = windows.sub, windows.interval, windows.length
         by_start = run.by_start()
         # a free person's position changes by a unit with the first position, by the time with speed
         growth = np.abs(by_start[:, :, :2]) / np.repeat([1.0, dt * times], 2)
         step, after = trapezoidal(run.slopes[::stride], dt)
-        fields = self._fields(system, run, random, desired)
+        fields = self._fields(system, run, random, people)
         return LinearisedWindows(
             difference=self.differences(states),
-            own=own_deviations(random, desired, typical),
             by_deviation=self.change(run.displacements(fields)),
             by_start=self.change(by_start),
             used=growth.max((1, 2, 3)) < GROWTH,
@@ -488,10 +489,10 @@ class People:
         )
 
     def _continued(
-        self, windows: LinearisedWindows, weight: np.ndarray
+        self, windows: LinearisedWindows, own: np.ndarray, weight: np.ndarray
     ) -> tuple[Linearised, Continuation]:
-        """The measured paths of people, with weights ``(P,)`` of the windows, which also decide
-        where windows continue those before."""
+        """The measured paths of people who were simulated with deviations ``(D, Q)``, with weights
+        ``(P,)`` of the windows, which also decide where windows continue those before."""
         ordinary = self.by_number(windows.used & (weight > ORDINARY))
         follows = np.pad(ordinary[:, :-1], ((0, 0), (1, 0)))
         end = self.by_number(windows.by_start.end)
@@ -505,7 +506,7 @@ class People:
         by_deviation = self.continued(windows.by_deviation, continuation)
         difference = self.continued(windows.difference, continuation)[..., 0]
         data = Linearised(
-            residual=difference + displaced(by_deviation, windows.own),
+            residual=difference + displaced(by_deviation, own),
             fixed=by_deviation,
             random=np.arange(by_deviation.shape[-1]),
             start=np.zeros((*difference.shape, 0)),
@@ -521,7 +522,7 @@ class People:
         return data, continuation
 
     def _fields(
-        self, system: System, run: RunAlone, random: list[str], desired: DesiredVelocity
+        self, system: System, run: RunAlone, random: list[str], people: Individuals
     ) -> list[Tensor]:
         """Q accelerations ``(F, W, N, 2)`` per unit of the logarithm of what differs, or of the
         direction."""
@@ -530,7 +531,7 @@ class People:
         for name in random:
             if name in (DESIRED_SPEED, DESIRED_DIRECTION):
                 higher, lower = (
-                    run.accelerations(self._changed(system, desired, name, change))
+                    run.accelerations(self._changed(system, people, name, change))
                     for change in (DIFFERENCE, -DIFFERENCE)
                 )
                 fields.append((higher - lower) / (2 * DIFFERENCE))
@@ -574,13 +575,13 @@ class People:
 
     # -- simulation ------------------------------------------------------------------------
 
-    def states(self, system: System, rows: Tensor, desired: DesiredVelocity) -> Tensor:
+    def states(self, system: System, rows: Tensor, people: Individuals) -> Tensor:
         """``(F, R, W, N, 4)`` simulated positions (m) and velocities (m/s) at the steps.
 
         Args:
-            rows: ``(R, K)`` parameters. desired: of the D people.
+            rows: ``(R, K)`` parameters. people: the D people.
         """
-        windows, around = self.windows, self.around(system, desired)
+        windows, around = self.windows, self.around(system, people)
         w, n = windows.batch.agent.shape
         first = torch.cat([windows.batch.x[0], windows.batch.v[0]], -1)
         states = []
@@ -602,26 +603,25 @@ class People:
         coordinates = position.permute(2, 0, 3, 1).flatten(1, 2)
         return Change(coordinates.numpy(), end.permute(1, 2, 0).numpy())
 
-    def around(self, system: System, desired: DesiredVelocity) -> Surroundings:
-        """The surroundings of people with desired velocities; the last ones are cached. All systems
-        of one diagnosis share walls, radii and masses."""
-        if self._last is None or not np.array_equal(self._last[0], desired):
-            self._last = desired, self._surroundings(system, desired)
+    def around(self, system: System, people: Individuals) -> Surroundings:
+        """The surroundings of the D people; the last ones are cached. All systems of one diagnosis
+        share walls, radii and masses."""
+        if self._last is None or self._last[0] is not people:
+            self._last = people, self._surroundings(system, people)
         return self._last[1]
 
-    def _surroundings(self, system: System, desired: DesiredVelocity) -> Surroundings:
+    def _surroundings(self, system: System, people: Individuals) -> Surroundings:
         check_model(system)
-        of_window = DesiredVelocity(desired.speed[self.unit], desired.turn[self.unit])
-        return self.windows.around(system, of_window)
+        return self.windows.around(system, people.of(self.unit))
 
     def _changed(
-        self, system: System, desired: DesiredVelocity, name: str, change: float
+        self, system: System, people: Individuals, name: str, change: float
     ) -> Surroundings:
         """The surroundings if the logarithms of desired speeds, or their directions, change."""
         if name == DESIRED_SPEED:
-            changed = desired._replace(speed=desired.speed * math.exp(change))
+            changed = people._replace(speed=people.speed * math.exp(change))
         else:
-            changed = desired._replace(turn=desired.turn + change)
+            changed = people._replace(turn=people.turn + change)
         return self._surroundings(system, changed)
 
 
@@ -645,6 +645,19 @@ def differences_of(system: System) -> Sequence[float]:
         size = 1e-3 * max(1.0, float(p.detach().abs().max()))
         differences += [size if strength is None else abs(strength.step)] * p.numel()
     return differences
+
+
+def _admissible(system: System, random: list[str], typical: float) -> np.ndarray:
+    """``(2, Q)`` smallest and largest deviations of people with admissible parameters."""
+    limits = {
+        DESIRED_SPEED: [math.log(SLOWEST) - typical, math.inf],
+        DESIRED_DIRECTION: [-math.inf, math.inf],
+    }
+    for name in [name for name in random if name not in limits]:
+        value, bound = float(system.get_parameter(name).detach()), system.bounds()[name]
+        with np.errstate(divide="ignore"):
+            limits[name] = [np.log(end / value) for end in (bound.low, bound.high)]
+    return np.array([limits[name] for name in random]).reshape(-1, 2).T
 
 
 def _limit(random: list[str]) -> np.ndarray:

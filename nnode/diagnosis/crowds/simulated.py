@@ -21,7 +21,7 @@ from torch import Tensor
 from nnode.calibrate.parameters import ParameterVector
 from nnode.data.sequence import Batch, Sequence, collate
 from nnode.diagnosis.crowds.paths import Path, Smoother
-from nnode.diagnosis.crowds.windows import turn_destinations
+from nnode.diagnosis.crowds.windows import Individuals, turn_destinations
 from nnode.model.scene import Scene
 from nnode.model.system import System
 from nnode.simulation.alone import PersonAlone, Surroundings
@@ -32,7 +32,7 @@ STEPS = 2
 
 
 def simulated_pair(
-    system: System, sequences: Many[Sequence], turn: Many[np.ndarray], seed: int
+    system: System, sequences: Many[Sequence], individuals: Individuals, seed: int
 ) -> tuple[list[Sequence], list[Sequence]]:
     """Two simulations of sequences whose random numbers have opposite signs, so that linear terms
     cancel.
@@ -40,8 +40,7 @@ def simulated_pair(
     Args:
         system: the calibrated model.
         sequences: as they were measured, with the people's desired speeds as ``preferred``.
-        turn: of each sequence ``(N,)``, by which people's desired directions are turned to the
-            left from those to the destinations, rad.
+        individuals: the people of all sequences, one sequence after the other.
         seed: of signs and errors.
     """
     smoother, rng = Smoother(sequences), np.random.default_rng(seed)
@@ -49,14 +48,14 @@ def simulated_pair(
     smoothed = [replace(s, x=p.x, v=p.v) for s, p in zip(sequences, paths, strict=True)]
     batch, error = collate(smoothed), np.sqrt(smoother.variance)
     scene, (window, person) = system.scene(batch), torch.nonzero(batch.agent, as_tuple=True)
-    turns = torch.from_numpy(np.concatenate(turn))
-    turn_destinations(scene, batch.x[0], window, person, turns)
-    disturbances = _disturbances(system, batch, scene, paths)
+    turn_destinations(scene, batch.x[0], window, person, torch.from_numpy(individuals.turn))
+    factors = individuals.factors
+    disturbances = _disturbances(system, batch, scene, factors, paths)
     kicks = [kick * rng.choice([-1.0, 1.0], (1, kick.shape[1], 1)) for kick in disturbances]
     errors = [error * rng.standard_normal(path.x.shape) for path in paths]
 
     def crowd(sign: float) -> list[Sequence]:
-        simulated_paths = _simulated(system, batch, scene, [sign * kick for kick in kicks])
+        simulated_paths = _simulated(system, batch, scene, factors, [sign * kick for kick in kicks])
         return [
             replace(s, x=x + sign * e, v=None, preferred=None)
             for s, x, e in zip(sequences, simulated_paths, errors, strict=True)
@@ -66,21 +65,29 @@ def simulated_pair(
 
 
 def _disturbances(
-    system: System, batch: Batch, scene: Scene, paths: list[Path]
+    system: System,
+    batch: Batch,
+    scene: Scene,
+    factors: dict[str, np.ndarray],
+    paths: list[Path],
 ) -> list[np.ndarray]:
     """``(K, N, 2)`` accelerations of the measured people that the model does not explain, m/s²."""
-    among_measured = _people(system, scene, batch.x, batch.v, 2 * batch.dt)
+    among_measured = _people(system, scene, batch.x, batch.v, 2 * batch.dt, factors)
     states = torch.cat([batch.x, batch.v], -1)
     explained = among_measured(np.arange(len(states)), states).numpy()
     return [path.a - explained[: len(path.x), b, : path.x.shape[1]] for b, path in enumerate(paths)]
 
 
 def _simulated(
-    system: System, batch: Batch, scene: Scene, kicks: list[np.ndarray]
+    system: System,
+    batch: Batch,
+    scene: Scene,
+    factors: dict[str, np.ndarray],
+    kicks: list[np.ndarray],
 ) -> list[np.ndarray]:
     """``(K, N, 2)`` positions of each sequence's people with all interactions, m."""
     step = batch.dt / STEPS
-    people = _people(system, scene, batch.x[:1], batch.v[:1], step)
+    people = _people(system, scene, batch.x[:1], batch.v[:1], step, factors)
     push = np.zeros(batch.x.shape)
     for b, kick in enumerate(kicks):
         push[: len(kick), b, : kick.shape[1]] = kick
@@ -98,9 +105,16 @@ def _simulated(
     return [states[: len(kick), b, : kick.shape[1], :2] for b, kick in enumerate(kicks)]
 
 
-def _people(system: System, scene: Scene, x: Tensor, v: Tensor, step: float) -> PersonAlone:
+def _people(
+    system: System,
+    scene: Scene,
+    x: Tensor,
+    v: Tensor,
+    step: float,
+    factors: dict[str, np.ndarray],
+) -> PersonAlone:
     """The people of a scene among positions and velocities ``(H, B, N, 2)``."""
     window, person = torch.nonzero(scene.agent, as_tuple=True)
-    around = Surroundings(scene, x, v, window, person, step)
+    around = Surroundings(scene, x, v, window, person, step, factors)
     vector = ParameterVector(system)
     return PersonAlone(around, system, vector.runs(vector.row[None]))

@@ -30,17 +30,24 @@ CUT = 11.0
 STRAY = 0.5
 
 
-class DesiredVelocity(NamedTuple):
-    """With what velocities people want to walk.
+class Individuals(NamedTuple):
+    """In what people differ.
 
     Attributes:
-        speed: ``(P,)`` m/s.
-        turn: ``(P,)`` by which their directions are turned to the left from those to the
+        speed: ``(P,)`` desired speeds, m/s.
+        turn: ``(P,)`` by which the desired directions are turned to the left from those to the
             destinations, rad.
+        factors: name of a parameter of the law to ``(P,)`` factors on its value.
     """
 
     speed: np.ndarray
     turn: np.ndarray
+    factors: dict[str, np.ndarray]
+
+    def of(self, person: np.ndarray) -> Individuals:
+        """Those with the numbers ``(M,)``."""
+        factors = {name: factor[person] for name, factor in self.factors.items()}
+        return Individuals(self.speed[person], self.turn[person], factors)
 
 
 class Windows:
@@ -127,16 +134,16 @@ class Windows:
         """Steps of the simulation of a window, to the start of the next one."""
         return self.sub * self.length
 
-    def around(self, system: System, desired: DesiredVelocity | None = None) -> Surroundings:
+    def around(self, system: System, people: Individuals | None = None) -> Surroundings:
         """The surroundings of the people whom ``system`` simulates.
 
         Args:
-            desired: of the P people; None: the measured preferred speeds, towards the destinations.
+            people: P people; None: with the measured preferred speeds, towards the destinations.
         """
         scene = system.scene(self.batch)
         window, person = torch.from_numpy(self.person).T
-        if desired is not None:
-            speed, turn = map(torch.from_numpy, desired)
+        if people is not None:
+            speed, turn = map(torch.from_numpy, people[:2])
             scene.preferred = torch.zeros_like(scene.preferred)
             scene.preferred[window, person, 0] = speed
             turn_destinations(scene, self.batch.x[0], window, person, turn)
@@ -146,7 +153,8 @@ class Windows:
         if force is not None and scene.wall.shape[1]:
             reach = force.r + CUT * force.B + STRAY
             scene.near = _near(scene, self.batch.x[:: 2 * self.sub], reach)
-        return Surroundings(scene, self.batch.x, self.batch.v, window, person, self.step)
+        factors = {} if people is None else people.factors
+        return Surroundings(scene, self.batch.x, self.batch.v, window, person, self.step, factors)
 
 
 def turn_destinations(

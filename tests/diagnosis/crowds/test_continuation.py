@@ -40,6 +40,10 @@ def estimated(window: float, system: Crowd) -> CrowdPopulation:
     return people.estimated(system, variances=people.initial_variances(["desired_speed", "tau"]))
 
 
+def own(people: People) -> np.ndarray:
+    return np.zeros((len(people.pairs), 0))
+
+
 def root_mean_square(difference: np.ndarray) -> float:
     return float(np.sqrt(np.mean(difference**2)))
 
@@ -48,9 +52,9 @@ def test_windows_of_a_linear_law_are_one_simulation() -> None:
     """Without walls, and without forces between people."""
     people = [people_of(window, walls=False) for window in (LONG, SHORT)]
     assert [each.windows.number.max() for each in people] == [0, 3]
-    windows = [each._linearised(law(A=0.0), [], each.desired, 0.0) for each in people]
+    windows = [each._linearised(law(A=0.0), [], each.measured) for each in people]
     expected, continued = (
-        each._continued(part, np.ones(len(each.unit)))[0]
+        each._continued(part, own(each), np.ones(len(each.unit)))[0]
         for each, part in zip(people, windows, strict=True)
     )
     assert expected.restart is not None
@@ -68,14 +72,14 @@ def test_start_of_a_later_window_does_not_change_residuals() -> None:
     batch, first = people.windows.batch, people.windows.number == 0
 
     def residual() -> np.ndarray:
-        windows = people._linearised(system, [], people.desired, 0.0)
-        return people._continued(windows, np.ones(len(people.unit)))[0].residual
+        windows = people._linearised(system, [], people.measured)
+        return people._continued(windows, own(people), np.ones(len(people.unit)))[0].residual
 
     before = residual()
-    by_itself = people.differences(people.states(system, row(system), people.desired)).position
+    by_itself = people.differences(people.states(system, row(system), people.measured)).position
     batch.x[0, ~first] += 0.01
     batch.x[-1, people.windows.number < 3] += 0.01
-    moved = people.differences(people.states(system, row(system), people.desired)).position
+    moved = people.differences(people.states(system, row(system), people.measured)).position
     change = root_mean_square(residual() - before)
     assert change < 0.1 * root_mean_square(moved - by_itself)
 

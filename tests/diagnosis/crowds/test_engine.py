@@ -22,7 +22,7 @@ from nnode.data.sequence import Sequence
 from nnode.diagnosis.crowds import simulated
 from nnode.diagnosis.crowds.engine import PAIRS, SECONDS, CrowdEngine
 from nnode.diagnosis.crowds.people import differing
-from nnode.diagnosis.crowds.windows import Windows
+from nnode.diagnosis.crowds.windows import Individuals, Windows
 from nnode.diagnosis.curves import columns_of
 from nnode.diagnosis.residuals.fit import evaluated, refine
 from nnode.diagnosis.search import converged_fit
@@ -61,11 +61,11 @@ class CodedLaw(Law):
 
 
 class Stride(IndividualEffect):
-    """The speed oscillates with the steps."""
+    """The speed oscillates with every second step."""
 
     name = "stride"
     domain = "crowd"
-    formula = "a sin(2 pi t + phase_i) along the heading"
+    formula = "a sin(pi t + phase_i) along the heading"
     source = "this test"
     strengths: ClassVar = {"a": Strength(0.0, 0.1, Interval(0.0, 5.0), "1")}
     a: Tensor
@@ -77,7 +77,7 @@ class Stride(IndividualEffect):
     def forward(self, state: State) -> Tensor:
         phase, present = self.agent_numbers(state.scene, state.x)
         clock = (state.scene.start + state.t)[:, None]
-        size = self.a * torch.sin(2 * torch.pi * clock + phase) * present
+        size = self.a * torch.sin(torch.pi * clock + phase) * present
         return size[..., None] * heading(state.velocity)
 
 
@@ -189,6 +189,25 @@ def test_rows_are_independent(engine: CrowdEngine) -> None:
         torch.testing.assert_close(residual[k], alone, rtol=1e-9, atol=1e-9)
 
 
+def test_people_have_factors_on_parameters(plain: list[Sequence]) -> None:
+    people, law = Windows(plain, SECONDS), with_speeds()
+    rows, speed = ParameterVector(law).row[None], np.full(len(people.person), 1.3)
+
+    def of_people(system: Crowd, factor: np.ndarray) -> Tensor:
+        individuals = Individuals(speed, np.zeros(len(speed)), {"terms.0.tau": factor})
+        around = people.around(system, individuals)
+        rhs = PersonAlone(around, system, ParameterVector(system).runs(rows.repeat(2, 1)))
+        start = torch.cat([people.batch.x[0], people.batch.v[0]], -1)
+        return rhs.simulated(start, people.steps)[:, 1, *people.person.T]
+
+    factor = np.where(np.arange(len(speed)) % 2, 2.0, 1.0)
+    typical, slow = (of_people(law, np.full(len(speed), each)) for each in (1.0, 2.0))
+    expected = torch.where(torch.from_numpy(factor == 2.0)[:, None], slow, typical)
+    torch.testing.assert_close(of_people(law, factor), expected, rtol=0, atol=1e-12)
+    rows[0, ParameterVector(law).names.index("terms.0.tau")] = 2 * TAU
+    torch.testing.assert_close(of_people(law, np.ones(len(speed))), slow, rtol=0, atol=1e-12)
+
+
 def test_residuals_of_true_model_are_white() -> None:
     engine = CrowdEngine(people_who_differ(1))
     engine.fit_whitening(with_speeds(), ParameterVector(with_speeds()).row)
@@ -216,8 +235,8 @@ def test_differences_between_people_and_pushes_are_estimated() -> None:
     assert push == pytest.approx(PUSH, rel=0.25)
     assert time == pytest.approx(4.0, rel=0.25)
     assert error == pytest.approx(0.005, rel=0.1)
-    assert np.log(population.desired.speed).std() == pytest.approx(SPREAD, rel=0.25)
-    assert np.median(population.desired.speed) == pytest.approx(1.3, rel=0.05)
+    assert np.log(population.people.speed).std() == pytest.approx(SPREAD, rel=0.25)
+    assert np.median(population.people.speed) == pytest.approx(1.3, rel=0.05)
     # pushes that last longer than a third of the record have no intervals
     rows = engine.variations()
     assert [rows[name]["at_bound"] for name in ("push", "push_time")] == ["", "high"]
@@ -240,7 +259,7 @@ def test_directions_that_differ_are_estimated() -> None:
     assert engine.population is not None
     for crowd in engine.simulated_engines(system, ParameterVector(system).row, 0):
         assert crowd.population is not None
-        turns = engine.population.desired.turn, crowd.population.desired.turn
+        turns = engine.population.people.turn, crowd.population.people.turn
         assert np.corrcoef(*turns)[0, 1] > 0.8
 
 
@@ -248,7 +267,7 @@ def test_estimate_of_people_converges_where_windows_are_left_out() -> None:
     """Estimates jumped by 1,000 between linearisations that left out different windows. (In other
     tables they still change by up to 110, where a window whose weight is close to a half continues
     or not.)"""
-    engine = CrowdEngine(people_who_differ(8)[:8])
+    engine = CrowdEngine(people_who_differ(8)[:8], window=2.0)
     strong = build_model({**model_options("sf"), "desired": "exit"}).double()
     ParameterVector(strong).fill_(np.array([20.0, 0.0, 30.0]))
     first = engine._people.estimated(strong)
@@ -286,8 +305,7 @@ def test_small_errors_of_a_start_hardly_change_residuals(engine: CrowdEngine) ->
 def test_relevance_of_effect_depends_on_change_of_paths(
     engine: CrowdEngine, a_x: float, relevant: bool
 ) -> None:
-    """People who drift are displaced by a_x t²/2 at most, within 2 s; positions have errors of
-    5 mm."""
+    """People who drift are displaced by a_x t²/2 at most; positions have errors of 5 mm."""
     changed, _ = extended(model(), Drift(a_x=a_x, a_y=0.0))
     assert engine.relevant(model(), changed, 1.0) is relevant
 
