@@ -30,6 +30,7 @@ def filtered(
     forced: np.ndarray,
     sigma: np.ndarray,
     keep: np.ndarray,
+    within: np.ndarray,
     variance: float,
     restart: np.ndarray,
     start: np.ndarray,
@@ -44,8 +45,9 @@ def filtered(
         columns, observed, step, forced, restart, dt: see
             :class:`~nnode.population.likelihood.Linearised`.
         sigma: ``(J + 1 + 2 O,)`` standard deviations of e, a and q. keep: the same of their
-            autocorrelations over a sampling interval, without the oscillation. variance: of white
-            errors.
+            autocorrelations over a sampling interval, without the oscillation.
+        within: ``(J,)`` variances that are added to the sum of e at both ends of an interval.
+        variance: of white errors.
         start: ``(M,)`` variances of d at restarts.
         direction: ``(S, K / A, O, A)`` unit vectors of the oscillators. omega: ``(O,)`` their
             angular frequencies, 1/s.
@@ -76,16 +78,13 @@ def filtered(
                 )
                 _predict_mean(mean, forward, keep, before)
                 _predict_spread(spread, forward, keep, half)
-                _add_innovations(spread, force, fresh)
+                _add_innovations(spread, force, fresh, within)
                 if lasting:
                     _add_error(spread, m + processes, fresh[processes])
                 _oscillate(mean, spread, oscillating, turn, fresh)
             for b in range(len(restart[block, k])):
                 if restart[first + b, k]:
-                    segment = spread[..., b]
-                    _restart(mean[..., b], segment, start, sigma[: oscillating - m])
-                    ways = direction[first + b, k]
-                    _restart_swaying(mean[..., b], segment, oscillating, ways, omega)
+                    _restart(mean[..., b], spread[..., b], start, sigma[: oscillating - m])
             for at in range(k * axes, (k + 1) * axes):
                 axis = at - k * axes
                 _fill(way, direction[block, k, :, axis])
@@ -146,24 +145,6 @@ def _restart(mean: np.ndarray, spread: np.ndarray, start: np.ndarray, sigma: np.
 
 
 @njit(**INLINE)
-def _restart_swaying(
-    mean: np.ndarray, spread: np.ndarray, oscillating: int, direction: np.ndarray, omega: np.ndarray
-) -> None:
-    """Subtract the places and speeds of the oscillators, the states from ``oscillating`` on, from
-    those of d, which restarts where the measured path of one segment sways."""
-    oscillators, axes = direction.shape
-    for o in range(oscillators):
-        for i in range(2 * axes):
-            is_speed = i >= axes
-            q = oscillating + 2 * o + is_speed
-            share = -direction[o, i % axes] * (omega[o] if is_speed else 1.0)
-            mean[i] += share * mean[q]
-            # the row, and with the changed row the column, so that the matrix remains symmetric
-            spread[i] += share * spread[q]
-            spread[:, i] += share * spread[:, q]
-
-
-@njit(**INLINE)
 def _oscillate(
     mean: np.ndarray, spread: np.ndarray, oscillating: int, turn: np.ndarray, fresh: np.ndarray
 ) -> None:
@@ -215,8 +196,11 @@ def _add_error(spread: np.ndarray, place: int, variance: float) -> None:
 
 
 @njit(**INLINE)
-def _add_innovations(spread: np.ndarray, force: np.ndarray, fresh: np.ndarray) -> None:
-    """Add the covariance of the innovations of e, of variances ``fresh``, and of d by them."""
+def _add_innovations(
+    spread: np.ndarray, force: np.ndarray, fresh: np.ndarray, within: np.ndarray
+) -> None:
+    """Add the covariance of the innovations of e, of variances ``fresh``, and of d by them and by
+    the variances ``within``."""
     m, processes = force.shape[:2]
     for p in range(processes):
         e = m + p
@@ -228,7 +212,7 @@ def _add_innovations(spread: np.ndarray, force: np.ndarray, fresh: np.ndarray) -
                 spread[e, i, b] += change
             for j in range(m):
                 for b in range(spread.shape[2]):
-                    spread[i, j, b] += force[i, p, b] * force[j, p, b] * fresh[p]
+                    spread[i, j, b] += force[i, p, b] * force[j, p, b] * (fresh[p] + within[p])
 
 
 @njit(**INLINE)

@@ -20,6 +20,7 @@ Source:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Protocol
@@ -43,7 +44,6 @@ UNITS = {
     "measurement": "m",
     "lasting_error": "m",
     "lasting_error_time": "s",
-    "start_speed": "m/s",
     "sway": "m",
     "sway_along": "m",
     "sway_frequency": "Hz",
@@ -248,24 +248,26 @@ class RestartNoise(Noise):
 
     People sway across their direction once in two steps, and along it with every step: stochastic
     oscillators are added to the positions, with the autocorrelation exp(-t / T) cos(2 pi f t), and
-    2 f in place of f along the direction. Simulated paths restart in states that sway.
+    2 f in place of f along the direction.
 
-    The parameters are the first three of :data:`NOISE`, the standard deviation of the errors of
-    smoothed speeds, m/s, and the standard deviations of the sway across and along the direction, m,
-    its frequency f, Hz, and the time T for which it lasts, s. The last four may be absent.
+    The parameters are the first three of :data:`NOISE`, and the standard deviations of the sway
+    across and along the direction, m, its frequency f, Hz, and the time T for which it lasts, s.
+    The last four may be absent.
 
     Attributes:
-        position: standard deviation of the errors of smoothed positions, m.
+        position, speed: standard deviations of the states in which paths restart, m and m/s. They
+            are wide, so that these states, which are smoothed from the samples, are not used twice.
     """
 
-    names = (*NOISE[:3], "start_speed", "sway", "sway_along", "sway_frequency", "sway_time")
+    names = (*NOISE[:3], "sway", "sway_along", "sway_frequency", "sway_time")
     position: float
+    speed: float
 
     def whitened(
         self, data: Linearised, columns: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        push, push_time, white, speed, *sway = values
-        start = np.repeat([self.position, speed], data.axes) ** 2
+        push, push_time, white, *sway = values
+        start = np.repeat([self.position, self.speed], data.axes) ** 2
         oscillation = None
         if sway:
             across, along, frequency, time = sway
@@ -313,6 +315,10 @@ def _whitened(
     if restart is None:
         restart = np.zeros((len(columns), times), dtype=bool)
     keep, omega = np.exp(-data.dt / time), np.zeros(0)
+    share, deviation = _mean_between(data.dt / push[1])
+    forced, within = data.forced[..., : len(processes)].copy(), np.zeros(len(processes))
+    forced[..., : data.axes] *= share
+    within[: data.axes] = (2 * push[0] * deviation / share) ** 2
     direction = np.zeros((len(columns), times, 0, data.axes))
     if oscillation is not None:
         assert data.heading is not None
@@ -324,9 +330,10 @@ def _whitened(
         np.ascontiguousarray(columns),
         data.observed,
         data.step,
-        np.ascontiguousarray(data.forced[..., : len(processes)]),
+        forced,
         sigma,
         keep,
+        within,
         white**2,
         restart,
         start,
@@ -337,6 +344,17 @@ def _whitened(
     if data.weight is not None:
         white_columns = white_columns * np.sqrt(data.weight)[..., None]
     return white_columns, logdet
+
+
+def _mean_between(step: float) -> tuple[float, float]:
+    """The mean of an Ornstein-Uhlenbeck process of variance 1 over an interval, at both ends of
+    which it is given: the derivative by the mean of the ends, and the standard deviation.
+
+    Args:
+        step: length of the interval in correlation times.
+    """
+    share = min(math.tanh(step / 2) / (step / 2), 1.0)
+    return share, math.sqrt(2 / step * (1 - share))
 
 
 class Whitening:

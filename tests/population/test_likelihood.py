@@ -20,8 +20,8 @@ from nnode.population.likelihood import (
 SIGMA, TAU, DT, ERROR = 0.4, 1.7, 0.2, 0.05
 #: Standard deviations of the random effects and of the starts.
 SPREAD, START = np.array([0.3, 0.7]), np.array([0.2])
-#: Standard deviation of positions where simulated paths restart, m.
-POSITION = 0.15
+#: Standard deviations of positions, m, and speeds, m/s, where simulated paths restart.
+POSITION, SPEED = 0.15, 0.3
 
 
 def example(seed: int, states: int, leader: tuple[float, float] = (0.0, 1.0)) -> Linearised:
@@ -49,6 +49,14 @@ def example(seed: int, states: int, leader: tuple[float, float] = (0.0, 1.0)) ->
     )
 
 
+def mean_covariance(number: int, step: float) -> np.ndarray:
+    """``(number, number)`` covariances of the means of an Ornstein-Uhlenbeck process of variance 1
+    over intervals, one after the other, that are ``step`` correlation times long."""
+    keep, lag = np.exp(-step), np.abs(np.subtract.outer(np.arange(number), np.arange(number)))
+    apart = (1 - keep) ** 2 / step**2 * np.exp(-step * (lag - 1))
+    return np.asarray(np.where(lag == 0, 2 / step**2 * (step - 1 + keep), apart))
+
+
 def covariance(data: Linearised, lasting: tuple[float, ...]) -> np.ndarray:
     """The dense covariance matrix of all samples of all segments.
 
@@ -67,11 +75,14 @@ def covariance(data: Linearised, lasting: tuple[float, ...]) -> np.ndarray:
         for p, (sigma, tau) in enumerate([(SIGMA, TAU), data.leader]):
             response = np.zeros((samples, samples))
             state = np.zeros((data.step.shape[-1], samples))
+            process = sigma**2 * np.exp(-lag / tau)
+            if p == 0:
+                process = sigma**2 * mean_covariance(samples, DT / tau)
             for k in range(samples - 1):
-                ends = np.eye(samples)[k] + np.eye(samples)[k + 1]
+                # of a push twice its mean over the interval
+                ends = 2 * np.eye(samples)[k] if p == 0 else np.eye(samples)[k : k + 2].sum(0)
                 state = data.step[s, k] @ state + np.outer(data.forced[s, k, :, p], ends)
                 response[k + 1] = state[0]
-            process = sigma**2 * np.exp(-lag / tau)
             matrix[block, block] += response @ process @ response.T
         if lasting:
             matrix[block, block] += lasting[0] ** 2 * np.exp(-lag / lasting[1])
@@ -179,9 +190,7 @@ def restarting(seed: int) -> Linearised:
     return replace(data, heading=heading / np.linalg.norm(heading, axis=-1, keepdims=True))
 
 
-def restarting_covariance(
-    data: Linearised, person: int, speed: float, sway: tuple[float, ...]
-) -> np.ndarray:
+def restarting_covariance(data: Linearised, person: int, sway: tuple[float, ...]) -> np.ndarray:
     """The dense covariance of a person's samples, from independent numbers of variance 1."""
     assert data.step is not None
     assert data.forced is not None
@@ -189,6 +198,9 @@ def restarting_covariance(
     assert data.heading is not None
     times, keep = len(data.restart[person]), np.exp(-DT / TAU)
     numbers = iter(np.eye(14 * times))
+    # the regression of a push's mean over an interval on the mean of its ends
+    share = 2 * TAU / DT * (1 - keep) / (1 + keep)
+    within = mean_covariance(1, DT / TAU)[0, 0] - share**2 * (1 + keep) / 2
 
     def drawn(deviations: list[float]) -> np.ndarray:
         return np.array([deviation * next(numbers) for deviation in deviations])
@@ -200,7 +212,8 @@ def restarting_covariance(
         if k:
             before = e
             e = keep * e + drawn([SIGMA * np.sqrt(1 - keep**2)] * 2)
-            d = data.step[person, k - 1] @ d + data.forced[person, k - 1] @ (before + e)
+            twice = share * (before + e) + drawn([2 * SIGMA * np.sqrt(within)] * 2)
+            d = data.step[person, k - 1] @ d + data.forced[person, k - 1] @ twice
             for number, size in enumerate(sizes):
                 angle, kept = 2 * np.pi * frequency * (number + 1) * DT, np.exp(-DT / lasts)
                 cosine, sine = np.cos(angle), np.sin(angle)
@@ -210,12 +223,7 @@ def restarting_covariance(
         ways = np.array([-along[1], along[0]]), along
         place = sum(np.outer(way, swing[0]) for way, swing in zip(ways, swings, strict=True))
         if data.restart[person, k]:
-            turning = [
-                2 * np.pi * frequency * (number + 1) * np.outer(way, swing[1])
-                for number, (way, swing) in enumerate(zip(ways, swings, strict=True))
-            ]
-            d = drawn([POSITION] * 2 + [speed] * 2) - np.concatenate([place, sum(turning)])
-            e = drawn([SIGMA] * 2)
+            d, e = drawn([POSITION] * 2 + [SPEED] * 2), drawn([SIGMA] * 2)
         rows += list(d[:2] + place)
     map_ = np.array(rows)
     random = data.by_deviation[person] * SPREAD
@@ -226,21 +234,21 @@ def restarting_covariance(
 @pytest.mark.parametrize("sway", [(), (0.3, 0.1, 0.9, 2.0)])
 @pytest.mark.parametrize("seed", range(3))
 def test_filter_with_restarts_equals_a_dense_gaussian(seed: int, sway: tuple[float, ...]) -> None:
-    data, values = restarting(seed), np.array([SIGMA, TAU, ERROR, 0.3, *sway])
-    products = RestartNoise(POSITION).products(data, values)
+    data, values = restarting(seed), np.array([SIGMA, TAU, ERROR, *sway])
+    products = RestartNoise(POSITION, SPEED).products(data, values)
     zero = np.zeros(3)
     result = marginal(data, products, SPREAD, np.zeros(0), low=zero, high=zero)
     for person in range(2):
         seen = data.observed[person]
-        matrix = restarting_covariance(data, person, 0.3, sway or (0.0, 0.0, 1.0, 1.0))
+        matrix = restarting_covariance(data, person, sway or (0.0, 0.0, 1.0, 1.0))
         gaussian = multivariate_normal(np.zeros(seen.sum()), matrix[np.ix_(seen, seen)])
         expected = gaussian.logpdf(data.residual[person, seen])
         assert result.each[person] == pytest.approx(expected, abs=1e-8)
 
 
 def test_weights_scale_whitened_samples() -> None:
-    data, noise = restarting(5), RestartNoise(POSITION)
-    values = np.array([SIGMA, TAU, ERROR, 0.3])
+    data, noise = restarting(5), RestartNoise(POSITION, SPEED)
+    values = np.array([SIGMA, TAU, ERROR])
     weight = np.repeat([1.0, 0.25, 0.5], 8)[None].repeat(2, 0)
     plain = noise.whitened(data, data.columns, values)
     weighted = noise.whitened(replace(data, weight=weight), data.columns, values)

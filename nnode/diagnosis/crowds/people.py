@@ -46,7 +46,6 @@ from nnode.population.drivers import (
     SHORT,
     SPREAD,
     START_POSITION,
-    START_SPEED,
     TOLERANCE,
 )
 from nnode.population.estimate import Variances, fit_variances
@@ -63,6 +62,10 @@ from nnode.simulation.linear import trapezoidal
 
 #: Smallest standard deviation of errors of positions, m. Simulators integrate differently.
 ERROR = 1e-3
+#: Standard deviations of the positions, m, and speeds, m/s, in which records start, relative to the
+#: smoothed ones. They are wider than sway and the errors of smoothed states, which are made of the
+#: positions that are to be explained.
+START = (0.1, 1.0)
 #: Largest difference between simulated and measured positions, m. Differences are clipped because
 #: contact forces may throw a person far away.
 LIMIT = 3.0
@@ -295,7 +298,7 @@ class People:
     @property
     def noise(self) -> RestartNoise:
         """The covariance of residuals."""
-        return RestartNoise(START_POSITION * self.error)
+        return RestartNoise(max(START[0], START_POSITION * self.error), START[1])
 
     @property
     def error(self) -> float:
@@ -316,16 +319,15 @@ class People:
         windows, number, sway = self.windows, len(random), self.gait.sway
         dt = windows.interval
         low_push, high_push, push = PUSH[2]
-        low_speed, high_speed, speed = START_SPEED
         short, long = SHORT * dt, self._duration
-        noise = np.array([push, np.clip(LASTING, short, long), self.error, speed])
-        low, high = [low_push, short, self.error, low_speed], [high_push, long, self.error]
+        noise = np.array([push, np.clip(LASTING, short, long), self.error])
+        low, high = [low_push, short, self.error], [high_push, long, self.error]
         return Variances(
             noise=np.concatenate([noise, sway]),
             spread=np.full(number, SPREAD),
             start=np.zeros(0),
             low=np.array([*low, *sway, *[LEAST_SPREAD] * number]),
-            high=np.array([*high, high_speed, *sway, *[MOST_SPREAD] * number]),
+            high=np.array([*high, *sway, *[MOST_SPREAD] * number]),
         )
 
     def estimated(

@@ -181,7 +181,6 @@ _VARIATIONS = {
     "measurement": "measurement error of positions",
     "lasting_error": "autocorrelated measurement error of positions",
     "lasting_error_time": "correlation time of this error",
-    "start_speed": "error of smoothed speeds",
     "sway": "sway from side to side",
     "sway_along": "sway along the direction of walking",
     "sway_frequency": "frequency of the sway from side to side",

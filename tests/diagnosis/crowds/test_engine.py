@@ -229,7 +229,7 @@ def test_differences_between_people_and_pushes_are_estimated() -> None:
     engine.fit_whitening(system, ParameterVector(system).row)
     population = engine.population
     assert population is not None
-    push, time, error, _ = population.variances.noise
+    push, time, error = population.variances.noise
     assert population.random == ["desired_speed", "terms.0.tau"]
     assert population.variances.spread == pytest.approx([SPREAD, SPREAD], rel=0.35)
     assert push == pytest.approx(PUSH, rel=0.25)
