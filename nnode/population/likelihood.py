@@ -315,7 +315,7 @@ def _whitened(
     if restart is None:
         restart = np.zeros((len(columns), times), dtype=bool)
     keep, omega = np.exp(-data.dt / time), np.zeros(0)
-    share, deviation = _mean_between(data.dt / push[1])
+    share, deviation = mean_between(data.dt / push[1])
     forced, within = data.forced[..., : len(processes)].copy(), np.zeros(len(processes))
     forced[..., : data.axes] *= share
     within[: data.axes] = (2 * push[0] * deviation / share) ** 2
@@ -346,7 +346,7 @@ def _whitened(
     return white_columns, logdet
 
 
-def _mean_between(step: float) -> tuple[float, float]:
+def mean_between(step: float) -> tuple[float, float]:
     """The mean of an Ornstein-Uhlenbeck process of variance 1 over an interval, at both ends of
     which it is given: the derivative by the mean of the ends, and the standard deviation.
 

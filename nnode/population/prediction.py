@@ -9,10 +9,10 @@ are jointly normal (see :mod:`nnode.population.likelihood`), with the covariance
 
     V = Z Omega Z' + H S H' + sigma^2 R C R' + sigma_e^2 R_e C_e R_e'
 
-of true positions, where R is the linear response to pushes at the sampling times and C their
-correlation; R_e and C_e are those of the errors of leaders' paths. The prediction is the normal
-distribution of x given the known samples, to whose covariance that of their errors is added.
-Vehicles ahead move as measured.
+of true positions, where R is the linear response to pushes at the sampling times, and to the rest
+of their means between them, and C their correlation; R_e and C_e are those of the errors of
+leaders' paths. The prediction is the normal distribution of x given the known samples, to whose
+covariance that of their errors is added. Vehicles ahead move as measured.
 
 Source: Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, section 2.2.
 """
@@ -28,7 +28,7 @@ from nnode.model.system import System
 from nnode.population.drivers import full_names, initial_variances
 from nnode.population.estimate import fit_deviations
 from nnode.population.followers import Followers, Paths
-from nnode.population.likelihood import NOISE, Linearised, PushNoise
+from nnode.population.likelihood import NOISE, Linearised, PushNoise, mean_between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,11 +106,14 @@ def _covariance(
     columns = np.concatenate([data.by_deviation[f] * spread, data.start[f] * start], -1)
     covariance: np.ndarray = columns @ columns.T
     for p, (sigma, tau) in enumerate(data.processes(*noise[:2])):
-        response = np.zeros((samples, data.step.shape[-1], samples))
+        share, deviation = mean_between(data.dt / tau) if p < data.axes else (1.0, 0.0)
+        # to the process at the samples, and to the rest of its means between them
+        response = np.zeros((samples, data.step.shape[-1], 2 * samples - 1))
         for k in range(samples - 1):
             response[k + 1] = data.step[f, k] @ response[k]
-            response[k + 1, :, k : k + 2] += data.forced[f, k, :, p, None]
-        positions = sigma * response[:, 0]
+            response[k + 1, :, k : k + 2] += share * data.forced[f, k, :, p, None]
+            response[k + 1, :, samples + k] = 2 * deviation * data.forced[f, k, :, p]
+        positions, rest = np.split(sigma * response[:, 0], [samples], 1)
         correlation = np.exp(-np.abs(time[:, None] - time) / tau)
-        covariance += positions @ correlation @ positions.T
+        covariance += positions @ correlation @ positions.T + rest @ rest.T
     return covariance

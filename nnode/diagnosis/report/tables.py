@@ -210,8 +210,9 @@ def drivers_table(d: Diagnosis) -> TableBlock:
         f"Standard deviations between {agents} and over time, estimated together with the law. "
         f"No differences between {agents} were found, or sought, in parameters that are not "
         "listed. The process noise acts on speeds (laws of first order) or accelerations (second "
-        f"order). *Posterior variance*: of the parameter of a {agent}, relative to the variance "
-        f"between {agents} (median).",
+        "order). Measurement errors and sway that were estimated before have no interval. "
+        f"*Posterior variance*: of the parameter of a {agent}, relative to the variance between "
+        f"{agents} (median).",
     )
 
 
