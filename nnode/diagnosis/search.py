@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.diagnosis import thresholds
@@ -37,6 +38,8 @@ log = logging.getLogger(__name__)
 EXACT = 1e-6
 #: At most so many effects are calibrated in a round, and so many with refitted variances.
 RIVALS, LIKELY = 5, 3
+#: Ends of periods within a sequence are tried so many seconds apart.
+APART = 1.0
 
 
 @dataclass
@@ -207,8 +210,9 @@ def _with_likeliest_ends(engine: FollowersEngine, fit: Fit, name: str) -> Fit:
     """The fit of a model with a period, or a likelier one, an end of which lies within a sequence.
 
     Where an end lies between sequences, drivers of the nearest ones are estimated as slower or
-    faster, and with these drivers the cost does not show that the end lies within. Drivers are
-    therefore estimated again, with the end in the middle of each of the two sequences.
+    faster and their pushes as stronger, and the cost does not show that the end lies within.
+    Drivers are therefore estimated again, with the end at the place in each of the two sequences
+    that costs least by usual variances.
     """
     place, spans = place_of(fit.system, name), [(s.time[0], s.time[-1]) for s in engine.sequences]
     index = [fit.names.index(f"terms.{place}.{end}") for end in ("a", "b")]
@@ -220,10 +224,12 @@ def _with_likeliest_ends(engine: FollowersEngine, fit: Fit, name: str) -> Fit:
             max((span for span in spans if span[1] <= value), default=None),
             min((span for span in spans if span[0] >= value), default=None),
         ]
-        populations = [engine.population]
+        populations, usual = [engine.population], engine.with_usual_variances(fit.system)
         for low, high in filter(None, nearest):
-            row = fit.row.copy()
-            row[k] = (low + high) / 2
+            rows = np.repeat(fit.row[None], round((high - low) / APART) + 1, 0)
+            rows[:, k] = np.linspace(low, high, len(rows))
+            costs = (usual.residuals(fit.system, torch.from_numpy(rows)) ** 2).sum(1)
+            row = rows[int(costs.nan_to_num(torch.inf).argmin())]
             if row[index[0]] < row[index[1]]:
                 with suppress(SimulationError):
                     moved = engine.population_of(with_parameters(fit.system, row))

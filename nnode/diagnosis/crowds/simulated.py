@@ -11,8 +11,10 @@ Source: Wu 1986 (signs of residuals).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Sequence as Many
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -29,6 +31,9 @@ from nnode.simulation.numpy import simulated
 
 #: Simulation steps per sampling interval.
 STEPS = 2
+
+#: People among positions and velocities ``(H, B, N, 2)``, with a step, s.
+Among = Callable[[Tensor, Tensor, float], PersonAlone]
 
 
 def simulated_pair(
@@ -49,13 +54,13 @@ def simulated_pair(
     batch, error = collate(smoothed), np.sqrt(smoother.variance)
     scene, (window, person) = system.scene(batch), torch.nonzero(batch.agent, as_tuple=True)
     turn_destinations(scene, batch.x[0], window, person, torch.from_numpy(individuals.turn))
-    factors = individuals.factors
-    disturbances = _disturbances(system, batch, scene, factors, paths)
+    people = partial(_people, system, scene, individuals.factors)
+    disturbances = _disturbances(people, batch, paths)
     kicks = [kick * rng.choice([-1.0, 1.0], (1, kick.shape[1], 1)) for kick in disturbances]
     errors = [error * rng.standard_normal(path.x.shape) for path in paths]
 
     def crowd(sign: float) -> list[Sequence]:
-        simulated_paths = _simulated(system, batch, scene, factors, [sign * kick for kick in kicks])
+        simulated_paths = _simulated(people, batch, [sign * kick for kick in kicks])
         return [
             replace(s, x=x + sign * e, v=None, preferred=None)
             for s, x, e in zip(sequences, simulated_paths, errors, strict=True)
@@ -64,30 +69,18 @@ def simulated_pair(
     return crowd(1.0), crowd(-1.0)
 
 
-def _disturbances(
-    system: System,
-    batch: Batch,
-    scene: Scene,
-    factors: dict[str, np.ndarray],
-    paths: list[Path],
-) -> list[np.ndarray]:
+def _disturbances(people: Among, batch: Batch, paths: list[Path]) -> list[np.ndarray]:
     """``(K, N, 2)`` accelerations of the measured people that the model does not explain, m/s²."""
-    among_measured = _people(system, scene, batch.x, batch.v, 2 * batch.dt, factors)
+    among_measured = people(batch.x, batch.v, 2 * batch.dt)
     states = torch.cat([batch.x, batch.v], -1)
     explained = among_measured(np.arange(len(states)), states).numpy()
     return [path.a - explained[: len(path.x), b, : path.x.shape[1]] for b, path in enumerate(paths)]
 
 
-def _simulated(
-    system: System,
-    batch: Batch,
-    scene: Scene,
-    factors: dict[str, np.ndarray],
-    kicks: list[np.ndarray],
-) -> list[np.ndarray]:
+def _simulated(people: Among, batch: Batch, kicks: list[np.ndarray]) -> list[np.ndarray]:
     """``(K, N, 2)`` positions of each sequence's people with all interactions, m."""
     step = batch.dt / STEPS
-    people = _people(system, scene, batch.x[:1], batch.v[:1], step, factors)
+    reacting = people(batch.x[:1], batch.v[:1], step)
     push = np.zeros(batch.x.shape)
     for b, kick in enumerate(kicks):
         push[: len(kick), b, : kick.shape[1]] = kick
@@ -95,8 +88,8 @@ def _simulated(
     def rate(t: float, y: np.ndarray) -> np.ndarray:
         k = min(int(t / batch.dt + 1e-6), batch.n_samples - 2)
         share, states = t / batch.dt - k, torch.from_numpy(y)
-        people.around.replace_others(states)
-        acceleration = people(np.array([round(2 * t / step)]), states[None])[0].numpy()
+        reacting.around.replace_others(states)
+        acceleration = reacting(np.array([round(2 * t / step)]), states[None])[0].numpy()
         kick = (1 - share) * push[k] + share * push[k + 1]
         return np.concatenate([y[..., 2:], acceleration + kick], -1)
 
@@ -108,10 +101,10 @@ def _simulated(
 def _people(
     system: System,
     scene: Scene,
+    factors: dict[str, np.ndarray],
     x: Tensor,
     v: Tensor,
     step: float,
-    factors: dict[str, np.ndarray],
 ) -> PersonAlone:
     """The people of a scene among positions and velocities ``(H, B, N, 2)``."""
     window, person = torch.nonzero(scene.agent, as_tuple=True)
