@@ -85,8 +85,8 @@ ROUNDS, MOST_ROUNDS, CLOSE = 3, 8, 0.05
 CHUNK = 100_000
 #: Difference of the logarithm of desired speeds, and of directions (rad), for derivatives.
 DIFFERENCE = 1e-3
-#: Smallest desired speed, m/s.
-SLOWEST = 0.05
+#: Smallest desired speed, m/s, and smallest value of a parameter that differs between people.
+SLOWEST, TINY = 0.05, 1e-12
 #: Names of the desired speed and of its direction among the quantities in which people differ.
 DESIRED_SPEED, DESIRED_DIRECTION = "desired_speed", "desired_direction"
 
@@ -658,7 +658,8 @@ def _admissible(system: System, random: list[str], typical: float) -> np.ndarray
     for name in [name for name in random if name not in limits]:
         value, bound = float(system.get_parameter(name).detach()), system.bounds()[name]
         with np.errstate(divide="ignore"):
-            limits[name] = [np.log(end / value) for end in (bound.low, bound.high)]
+            # of a parameter that is 0, all factors are admissible
+            limits[name] = [np.log(end / max(value, TINY)) for end in (bound.low, bound.high)]
     return np.array([limits[name] for name in random]).reshape(-1, 2).T
 
 
