@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 
 from nnode.calibrate.parameters import ParameterVector, with_parameters
 from nnode.diagnosis import thresholds
@@ -24,7 +23,7 @@ from nnode.diagnosis.residuals.fit import FINE, ROUGH, Fit, refine
 from nnode.diagnosis.residuals.variables import Variable
 from nnode.diagnosis.statistics.bias import SimulatedFits, mean_scores, simulated_fits
 from nnode.diagnosis.statistics.paired import compare, heldout, j_test, presence_pvalue
-from nnode.diagnosis.statistics.profile import refined_edges
+from nnode.diagnosis.statistics.profile import refined_edges, residuals_at
 from nnode.diagnosis.statistics.score import Score, Screen, Trace, traces
 from nnode.errors import SimulationError
 from nnode.model.effects import Effect
@@ -226,10 +225,10 @@ def _with_likeliest_ends(engine: FollowersEngine, fit: Fit, name: str) -> Fit:
         ]
         populations, usual = [engine.population], engine.with_usual_variances(fit.system)
         for low, high in filter(None, nearest):
-            rows = np.repeat(fit.row[None], round((high - low) / APART) + 1, 0)
-            rows[:, k] = np.linspace(low, high, len(rows))
-            costs = (usual.residuals(fit.system, torch.from_numpy(rows)) ** 2).sum(1)
-            row = rows[int(costs.nan_to_num(torch.inf).argmin())]
+            at = np.linspace(low, high, round((high - low) / APART) + 1)
+            costs = (residuals_at(usual, fit, k, at) ** 2).sum(1)
+            row = fit.row.copy()
+            row[k] = at[np.nan_to_num(costs, nan=np.inf).argmin()]
             if row[index[0]] < row[index[1]]:
                 with suppress(SimulationError):
                     moved = engine.population_of(with_parameters(fit.system, row))

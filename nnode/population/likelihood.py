@@ -52,6 +52,23 @@ UNITS = {
 }
 
 
+class Process(NamedTuple):
+    """An Ornstein-Uhlenbeck process that acts on a path.
+
+    Its mean between two samples is the mean of both times ``share``, plus an independent number.
+
+    Attributes:
+        sigma: standard deviation. time: correlation time, s.
+        share: 1 for a process that is linear between samples.
+        rest: standard deviation of the independent number, as a share of ``sigma``.
+    """
+
+    sigma: float
+    time: float
+    share: float
+    rest: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
     """Samples of S segments of D agents, linearised; K samples at most.
@@ -106,11 +123,11 @@ class Linearised:
         """``(S, K, Q)`` Z, by the agent's deviations."""
         return self.fixed[..., self.random]
 
-    def processes(self, push: float, push_time: float) -> list[tuple[float, float]]:
-        """Standard deviation and correlation time of each process that acts, in the order of
-        :attr:`forced`: of the pushes, and of the error of the leader's path if there is one."""
-        pushes = [(push, push_time)] * self.axes
-        return [*pushes, self.leader] if self.leader[0] > 0 else pushes
+    def processes(self, push: float, push_time: float) -> list[Process]:
+        """The processes that act, in the order of :attr:`forced`: the pushes, and the error of the
+        leader's path if there is one."""
+        pushes = [Process(push, push_time, *_mean_between(self.dt / push_time))] * self.axes
+        return [*pushes, Process(*self.leader, 1.0, 0.0)] if self.leader[0] > 0 else pushes
 
     @cached_property
     def columns(self) -> np.ndarray:
@@ -309,16 +326,13 @@ def _whitened(
     """
     assert data.step is not None
     assert data.forced is not None
-    processes = data.processes(*push)
-    sigma, time = np.array([*processes, lasting]).T
+    processes = np.array(data.processes(*push))
+    sigma, time = np.concatenate([processes[:, :2], [lasting]]).T
+    share, rest = processes[:, 2:].T
     restart, times = data.restart, data.step.shape[1] + 1
     if restart is None:
         restart = np.zeros((len(columns), times), dtype=bool)
     keep, omega = np.exp(-data.dt / time), np.zeros(0)
-    share, deviation = mean_between(data.dt / push[1])
-    forced, within = data.forced[..., : len(processes)].copy(), np.zeros(len(processes))
-    forced[..., : data.axes] *= share
-    within[: data.axes] = (2 * push[0] * deviation / share) ** 2
     direction = np.zeros((len(columns), times, 0, data.axes))
     if oscillation is not None:
         assert data.heading is not None
@@ -330,10 +344,10 @@ def _whitened(
         np.ascontiguousarray(columns),
         data.observed,
         data.step,
-        forced,
+        np.ascontiguousarray(data.forced[..., : len(processes)] * share),
         sigma,
         keep,
-        within,
+        (2 * processes[:, 0] * rest / share) ** 2,
         white**2,
         restart,
         start,
@@ -346,9 +360,9 @@ def _whitened(
     return white_columns, logdet
 
 
-def mean_between(step: float) -> tuple[float, float]:
-    """The mean of an Ornstein-Uhlenbeck process of variance 1 over an interval, at both ends of
-    which it is given: the derivative by the mean of the ends, and the standard deviation.
+def _mean_between(step: float) -> tuple[float, float]:
+    """The mean of an Ornstein-Uhlenbeck process of variance 1 over an interval, given its values at
+    both ends: the derivative by the mean of these values, and the standard deviation.
 
     Args:
         step: length of the interval in correlation times.

@@ -28,7 +28,7 @@ from nnode.model.system import System
 from nnode.population.drivers import full_names, initial_variances
 from nnode.population.estimate import fit_deviations
 from nnode.population.followers import Followers, Paths
-from nnode.population.likelihood import NOISE, Linearised, PushNoise, mean_between
+from nnode.population.likelihood import NOISE, Linearised, PushNoise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,15 +105,14 @@ def _covariance(
     time = data.dt * np.arange(samples)
     columns = np.concatenate([data.by_deviation[f] * spread, data.start[f] * start], -1)
     covariance: np.ndarray = columns @ columns.T
-    for p, (sigma, tau) in enumerate(data.processes(*noise[:2])):
-        share, deviation = mean_between(data.dt / tau) if p < data.axes else (1.0, 0.0)
+    for p, process in enumerate(data.processes(*noise[:2])):
         # to the process at the samples, and to the rest of its means between them
         response = np.zeros((samples, data.step.shape[-1], 2 * samples - 1))
         for k in range(samples - 1):
             response[k + 1] = data.step[f, k] @ response[k]
-            response[k + 1, :, k : k + 2] += share * data.forced[f, k, :, p, None]
-            response[k + 1, :, samples + k] = 2 * deviation * data.forced[f, k, :, p]
-        positions, rest = np.split(sigma * response[:, 0], [samples], 1)
-        correlation = np.exp(-np.abs(time[:, None] - time) / tau)
+            response[k + 1, :, k : k + 2] += process.share * data.forced[f, k, :, p, None]
+            response[k + 1, :, samples + k] = 2 * process.rest * data.forced[f, k, :, p]
+        positions, rest = np.split(process.sigma * response[:, 0], [samples], 1)
+        correlation = np.exp(-np.abs(time[:, None] - time) / process.time)
         covariance += positions @ correlation @ positions.T + rest @ rest.T
     return covariance

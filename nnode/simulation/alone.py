@@ -137,17 +137,17 @@ class PersonAlone:
             self._kernel = compiled(WalkSource(law))
             self.of_law = frozenset(name for name, _, _ in law.owned.values())
             values = parameter_values(laws, law, parameters) | settings_of(laws, law)
-            columns = [
-                torch.as_tensor(value, dtype=torch.float64).detach().expand(self.number)
-                for value in values.values()
-            ]
-            table = torch.stack(columns, 1).numpy() if columns else np.zeros((self.number, 1))
+            names = {symbol: name for symbol, (name, _, _) in law.owned.items()}
+            alike = np.ones(len(around.window))
             # a row for every person of every run, one run after the other
-            self._law = table.repeat(len(around.window), 0)
-            for column, symbol in enumerate(values):
-                name = law.owned[symbol][0] if symbol in law.owned else ""
-                if name in around.factors:
-                    self._law[:, column] *= np.tile(around.factors[name], self.number)
+            columns = [
+                np.outer(
+                    torch.as_tensor(value, dtype=torch.float64).detach().expand(self.number),
+                    around.factors.get(names.get(symbol, ""), alike),
+                ).ravel()
+                for symbol, value in values.items()
+            ]
+            self._law = np.stack(columns or [np.zeros(self.number * len(alike))], 1)
             effects = list(takewhile(_is_formula, terms[len(laws) :]))
         self._runs = [
             {name: value[r] for name, value in parameters.items()} for r in range(self.number)

@@ -57,6 +57,14 @@ def mean_covariance(number: int, step: float) -> np.ndarray:
     return np.asarray(np.where(lag == 0, 2 / step**2 * (step - 1 + keep), apart))
 
 
+def mean_given_ends(step: float) -> tuple[float, float]:
+    """The regression of such a mean on the mean of both ends of its interval, and the variance that
+    remains."""
+    keep = np.exp(-step)
+    share = 2 / step * (1 - keep) / (1 + keep)
+    return share, mean_covariance(1, step)[0, 0] - share**2 * (1 + keep) / 2
+
+
 def covariance(data: Linearised, lasting: tuple[float, ...]) -> np.ndarray:
     """The dense covariance matrix of all samples of all segments.
 
@@ -198,9 +206,7 @@ def restarting_covariance(data: Linearised, person: int, sway: tuple[float, ...]
     assert data.heading is not None
     times, keep = len(data.restart[person]), np.exp(-DT / TAU)
     numbers = iter(np.eye(14 * times))
-    # the regression of a push's mean over an interval on the mean of its ends
-    share = 2 * TAU / DT * (1 - keep) / (1 + keep)
-    within = mean_covariance(1, DT / TAU)[0, 0] - share**2 * (1 + keep) / 2
+    share, within = mean_given_ends(DT / TAU)
 
     def drawn(deviations: list[float]) -> np.ndarray:
         return np.array([deviation * next(numbers) for deviation in deviations])

@@ -127,6 +127,14 @@ def refined_edges(engine: Engine, fit: Fit, name: str) -> Fit:
     return fit
 
 
+def residuals_at(engine: Engine, fit: Fit, index: int, at: np.ndarray) -> np.ndarray:
+    """``(T, n)`` residuals with one parameter at ``(T,)`` other places."""
+    rows = np.repeat(fit.row[None], len(at), 0)
+    rows[:, index] = at
+    trials: np.ndarray = engine.residuals(fit.system, torch.from_numpy(rows)).numpy()
+    return trials
+
+
 # -- parts ---------------------------------------------------------------------------------------
 
 
@@ -150,9 +158,7 @@ def _rises(engine: Engine, fit: Fit, index: int, at: np.ndarray) -> np.ndarray:
     rises = np.full(len(at), np.inf)
     if not len(at):
         return rises
-    rows = np.repeat(fit.row[None], len(at), 0)
-    rows[:, index] = at
-    trials = engine.residuals(fit.system, torch.from_numpy(rows)).numpy()
+    trials = residuals_at(engine, fit, index, at)
     finite = np.isfinite(trials).all(1)
     free = fit.free.copy()
     free[index] = False

@@ -17,6 +17,7 @@ from nnode.diagnosis.crowds.gait import (
 )
 from nnode.diagnosis.crowds.people import Gait, People
 from nnode.diagnosis.crowds.windows import Windows
+from tests.population.test_likelihood import mean_given_ends
 
 
 def sequences(sway: float, every: int = 1) -> list[Sequence]:
@@ -53,9 +54,7 @@ def test_likelihood_of_windows_in_which_people_walk_straight_on() -> None:
     push, lasts, error = variances.noise
     times, dt = people.windows.length, windows.dt
     step, forced, keep = windows.step[0, 0], windows.forced[0, 0], np.exp(-dt / lasts)
-    # the regression of a push's mean over an interval on the mean of its ends
-    share = 2 * lasts / dt * (1 - keep) / (1 + keep)
-    within = 2 * (lasts / dt) ** 2 * (dt / lasts - 1 + keep) - share**2 * (1 + keep) / 2
+    share, within = mean_given_ends(dt / lasts)
     # the state of one coordinate (position, speed, push) as a sum of independent numbers
     numbers = iter(np.eye(3 + 2 * (times - 1)))
     start = (people.noise.position, people.noise.speed, push)
