@@ -4,13 +4,13 @@ Every case is ``--platoons`` platoons of ``--vehicles`` vehicles for 30 s at 5 H
 ``idm`` or ``fvdm``, in which one effect is hidden or none, or two with ``--pairs``. Drivers'
 parameters are log-normal (``lin``: v0; ``idm``: T and v0; ``fvdm``: s_c and v0) with a standard
 deviation of ``--spread`` %, pushes last 4 s, and positions are measured with errors of ``--error``
-m. ``--nature`` departs from this. With ``--nothing``, nothing is hidden in any case, and with
-``--effects`` one of the named effects in every case. Paths are
-integrated here by Euler's method; everything else is the package's public interface. The cases of a
-run are fixed by its seed. The table has a row per case; the last lines count right and false
-answers, with exact intervals of 95 %. Laws are not compared before a diagnosis; with ``--default``
-they are, as in every diagnosis by default. ``--compare`` only compares laws. ``--calibrate`` only
-calibrates, with nothing hidden; the last lines count intervals that contain the true value.
+m. ``--nature`` and ``--push`` depart from this. With ``--nothing``, nothing is hidden in any case,
+and with ``--effects`` one of the named effects in every case. Paths are integrated here by Euler's
+method; everything else is the package's public interface. The cases of a run are fixed by its seed.
+The table has a row per case; the last lines count right and false answers, with exact intervals of
+95 %. Laws are not compared before a diagnosis; with ``--default`` they are, as in every diagnosis
+by default. ``--compare`` only compares laws. ``--calibrate`` only calibrates, with nothing hidden;
+the last lines count intervals that contain the true value.
 """
 
 from __future__ import annotations
@@ -112,6 +112,7 @@ def platoons(
     vehicles: int = 6,
     error: float = 0.06,
     nature: str = "plain",
+    push: float | None = None,
 ) -> pd.DataFrame:
     """A tidy table of measured positions, m.
 
@@ -120,7 +121,9 @@ def platoons(
         spread: standard deviation of the logarithms of drivers' parameters.
         number: of platoons. vehicles: in each. error: of measured positions, m.
         nature: one of :data:`NATURES`.
+        push: standard deviation of pushes; None: that of :data:`PUSH`.
     """
+    deviation = PUSH[law] if push is None else push
     rng, shape = np.random.default_rng(seed), (number, vehicles - 1)
     size, root = (2, *shape), np.sqrt(2.0)
     if nature == "skewed":
@@ -150,20 +153,20 @@ def platoons(
         past = [*past, (x, v.copy())][-delay - 1 :]
         if nature == "moods":
             mood = _next(mood, rng.normal(size=shape), STEP, 30.0)
-        push = PUSH[law] * pushes.present()
+        pushed = deviation * pushes.present()
         clock = START * np.arange(number)[:, None] + k * STEP
         wish = drivers.v0 * np.exp(0.08 * mood) * drivers.slowed(x[:, 1:], clock)
         wanted = drivers.wanted(*past[0], wish)
         # laws of second order begin with the acceleration of the first moment
         slow = wanted if k == 0 and law != "lin" else slow + STEP / lag * (wanted - slow)
         if law == "lin":
-            after = np.maximum(slow + push, 0.0)
+            after = np.maximum(slow + pushed, 0.0)
             for i, ahead in enumerate([lead, *after.T[:-1]]):  # views, which have their responses
                 after[:, i] += drivers.response(ahead - slow[:, i])
             v = np.column_stack([lead, after])
             x = x + STEP * v
         else:
-            after = np.maximum(v[:, 1:] + STEP * np.clip(slow + push, -8.0, 5.0), 0.0)
+            after = np.maximum(v[:, 1:] + STEP * np.clip(slow + pushed, -8.0, 5.0), 0.0)
             x = x + STEP * np.column_stack([lead, (v[:, 1:] + after) / 2])
             v = np.column_stack([lead, after])
         pushes.advance()
@@ -341,7 +344,7 @@ def cases(
     Args:
         pairs: two effects are hidden at once.
         effects: hidden in all cases, of every law those that it can have; None: half of the cases.
-        given: ``number``, ``vehicles``, ``error`` and ``nature`` of :func:`platoons`.
+        given: ``number``, ``vehicles``, ``error``, ``nature`` and ``push`` of :func:`platoons`.
     """
     chosen = []
     for k in range(total):
@@ -450,8 +453,9 @@ def estimate_row(
 def _variations(case: dict[str, Any]) -> dict[str, float]:
     """The true standard deviations of drivers' parameters, %, and of pushes, and their time, s."""
     names = {"lin": ["v0"], "idm": ["v0", "T"], "fvdm": ["v0", "s_c"]}[case["law"]]
+    push = case.get("push")
     return dict.fromkeys(names, 100 * case["spread"]) | {
-        "push": PUSH[case["law"]],
+        "push": PUSH[case["law"]] if push is None else push,
         "push_time": LASTS,
     }
 
@@ -482,6 +486,7 @@ def main() -> None:
     parser.set_defaults(work="diagnose")
     parser.add_argument("--nothing", action="store_true", help="nothing hidden in any case")
     parser.add_argument("--nature", default="plain", choices=NATURES)
+    parser.add_argument("--push", type=float, help="standard deviation of pushes, m/s or m/s²")
     parser.add_argument("--laws", nargs="+", default=["lin", "idm"], choices=list(HIDDEN))
     parser.add_argument("--table", type=Path, default=Path("runs/benchmark_drivers.csv"))
     given = parser.parse_args()
@@ -499,6 +504,7 @@ def main() -> None:
         pairs=given.pairs,
         effects=given.effects,
         nature=given.nature,
+        push=given.push,
     )
     if given.work == "calibrate" or given.nothing:
         chosen = [case | {"effect": "none"} for case in chosen]
