@@ -112,7 +112,7 @@ def platoons(
     vehicles: int = 6,
     error: float = 0.06,
     nature: str = "plain",
-    push: float | None = None,
+    strength: float | None = None,
 ) -> pd.DataFrame:
     """A tidy table of measured positions, m.
 
@@ -121,9 +121,8 @@ def platoons(
         spread: standard deviation of the logarithms of drivers' parameters.
         number: of platoons. vehicles: in each. error: of measured positions, m.
         nature: one of :data:`NATURES`.
-        push: standard deviation of pushes; None: that of :data:`PUSH`.
+        strength: standard deviation of pushes; None: that of :data:`PUSH`.
     """
-    deviation = PUSH[law] if push is None else push
     rng, shape = np.random.default_rng(seed), (number, vehicles - 1)
     size, root = (2, *shape), np.sqrt(2.0)
     if nature == "skewed":
@@ -153,20 +152,20 @@ def platoons(
         past = [*past, (x, v.copy())][-delay - 1 :]
         if nature == "moods":
             mood = _next(mood, rng.normal(size=shape), STEP, 30.0)
-        pushed = deviation * pushes.present()
+        push = _strength(law, strength) * pushes.present()
         clock = START * np.arange(number)[:, None] + k * STEP
         wish = drivers.v0 * np.exp(0.08 * mood) * drivers.slowed(x[:, 1:], clock)
         wanted = drivers.wanted(*past[0], wish)
         # laws of second order begin with the acceleration of the first moment
         slow = wanted if k == 0 and law != "lin" else slow + STEP / lag * (wanted - slow)
         if law == "lin":
-            after = np.maximum(slow + pushed, 0.0)
+            after = np.maximum(slow + push, 0.0)
             for i, ahead in enumerate([lead, *after.T[:-1]]):  # views, which have their responses
                 after[:, i] += drivers.response(ahead - slow[:, i])
             v = np.column_stack([lead, after])
             x = x + STEP * v
         else:
-            after = np.maximum(v[:, 1:] + STEP * np.clip(slow + pushed, -8.0, 5.0), 0.0)
+            after = np.maximum(v[:, 1:] + STEP * np.clip(slow + push, -8.0, 5.0), 0.0)
             x = x + STEP * np.column_stack([lead, (v[:, 1:] + after) / 2])
             v = np.column_stack([lead, after])
         pushes.advance()
@@ -310,6 +309,11 @@ class Pushes:
             self._process = _next(self._process, shock, STEP, LASTS)
 
 
+def _strength(law: str, given: float | None) -> float:
+    """The standard deviation of pushes, m/s or m/s²."""
+    return PUSH[law] if given is None else given
+
+
 def _next(now: np.ndarray, shock: np.ndarray, step: float, lasts: float) -> np.ndarray:
     """The next value, ``step`` s later, of what lasts for some s and has a standard deviation of 1.
 
@@ -344,7 +348,7 @@ def cases(
     Args:
         pairs: two effects are hidden at once.
         effects: hidden in all cases, of every law those that it can have; None: half of the cases.
-        given: ``number``, ``vehicles``, ``error``, ``nature`` and ``push`` of :func:`platoons`.
+        given: ``number``, ``vehicles``, ``error``, ``nature`` and ``strength`` of :func:`platoons`.
     """
     chosen = []
     for k in range(total):
@@ -453,9 +457,8 @@ def estimate_row(
 def _variations(case: dict[str, Any]) -> dict[str, float]:
     """The true standard deviations of drivers' parameters, %, and of pushes, and their time, s."""
     names = {"lin": ["v0"], "idm": ["v0", "T"], "fvdm": ["v0", "s_c"]}[case["law"]]
-    push = case.get("push")
     return dict.fromkeys(names, 100 * case["spread"]) | {
-        "push": PUSH[case["law"]] if push is None else push,
+        "push": _strength(case["law"], case.get("strength")),
         "push_time": LASTS,
     }
 
@@ -504,7 +507,7 @@ def main() -> None:
         pairs=given.pairs,
         effects=given.effects,
         nature=given.nature,
-        push=given.push,
+        strength=given.push,
     )
     if given.work == "calibrate" or given.nothing:
         chosen = [case | {"effect": "none"} for case in chosen]
